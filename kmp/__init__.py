@@ -1,0 +1,15 @@
+"""Kernelized movement primitives: robot skills learned from few demonstrations, driven by inputs of any dimension.
+
+"The paper" in this package is Huang, Rozo, Silverio, Caldwell: Non-parametric Imitation Learning of Robot Motor Skills,
+ICRA 2019; the covariance is from their Kernelized Movement Primitives, IJRR 2019 ("IJRR 2019").
+
+Symbols: s an input (I,), xi an output (O,), (s_n, mu_n, Sigma_n) the N reference points, k the kernel with
+parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, O) the fitted weights.
+"""
+
+from kmp.gaussians import Gaussians
+from kmp.gmm import GaussianMixture
+from kmp.kernel import GaussianKernel
+from kmp.primitive import KMP
+
+__all__ = ["KMP", "GaussianKernel", "GaussianMixture", "Gaussians"]

@@ -1,0 +1,118 @@
+"""The joint distribution of inputs and outputs in the demonstrations, and the reference drawn from it.
+
+The paper, section II-A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import logsumexp
+
+from kmp.checks import Array, frozen, numbers, positive
+from kmp.gaussians import Gaussians
+
+_TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
+_ITERATIONS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture:
+    """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l): weights (K,), means (K, I+O), covariances (K, I+O, I+O). Read-only."""
+
+    weights: Array
+    means: Array
+    covariances: Array
+
+    def __post_init__(self) -> None:
+        weights = numbers("weights", self.weights, "K")
+        if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
+            raise ValueError(f"weights: {weights} given; needed are numbers of sum 1, none below 0.")
+        numbers("means", self.means, len(weights), "I+O")
+        components = Gaussians(self.means, self.covariances)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "means", components.mean)
+        object.__setattr__(self, "covariances", components.covariance)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Unpickled arrays come back writeable.
+        self.__dict__.update({name: frozen(array) for name, array in state.items()})
+
+    @classmethod
+    def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
+        """The mixture of full covariances that EM finds from a k-means start; samples (M, I+O), the inputs first.
+
+        `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2 where the unit is the
+        metre. The same seed gives the same mixture, whatever the number of threads.
+        """
+        data = numbers("samples", samples, "M", "I+O")
+        positive("regularization", regularization)
+        if components < 1:
+            raise ValueError(f"components is {components}, and must be at least 1.")
+        if len(data) < components:
+            raise ValueError(
+                f"{len(data)} samples given for {components} components: "
+                f"give at least {components} samples, or fewer components."
+            )
+        # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
+        from sklearn.mixture import GaussianMixture as Estimator  # noqa: PLC0415
+        from threadpoolctl import threadpool_limits  # noqa: PLC0415
+
+        with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
+            found = Estimator(
+                components,
+                covariance_type="full",
+                init_params="kmeans",
+                random_state=seed,
+                reg_covar=regularization,
+                tol=_TOLERANCE,
+                max_iter=_ITERATIONS,
+            ).fit(data)
+        covariances = (found.covariances_ + found.covariances_.swapaxes(1, 2)) / 2
+        return cls(found.weights_, found.means_, covariances)
+
+    def regress(self, inputs: ArrayLike) -> Gaussians:
+        """xi | s at each input (N, I), by Gaussian mixture regression: the conditional mixture's mean and covariance.
+
+        The covariance follows the law of total variance: the components' own, and that of their means about the mean.
+        """
+        s = numbers("inputs", inputs, "N", "I")
+        i = self._checked_dimensions(s.shape[1])
+        to_input = s[:, None, :] - self.means[:, :i]  # (N, K, I)
+        root = np.linalg.cholesky(self.covariances[:, :i, :i])  # (K, I, I)
+        white = np.linalg.solve(root, to_input.transpose(1, 2, 0))  # (K, I, N)
+        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        with np.errstate(divide="ignore"):  # a component of weight 0 has no share
+            log_share = np.log(self.weights) - 0.5 * (log_det + (white**2).sum(axis=1).T)  # (N, K)
+        share = np.exp(log_share - logsumexp(log_share, axis=1, keepdims=True))
+
+        across = self.covariances[:, :i, i:]  # (K, I, O)
+        gain = np.linalg.solve(self.covariances[:, :i, :i], across)  # (K, I, O)
+        means = self.means[:, i:] + np.einsum("nki,kio->nko", to_input, gain)
+        within = self.covariances[:, i:, i:] - across.transpose(0, 2, 1) @ gain  # (K, O, O)
+        mean = np.einsum("nk,nko->no", share, means)
+        spread = means - mean[:, None, :]
+        covariance = np.einsum("nk,kop->nop", share, within) + np.einsum("nk,nko,nkp->nop", share, spread, spread)
+        return Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2)
+
+    def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
+        """Inputs (count, I) drawn from the marginal P(s), I = `dimensions`: the reference's, if not driven by time."""
+        if count < 1:
+            raise ValueError(f"count is {count}, and must be at least 1.")
+        i = self._checked_dimensions(dimensions)
+        random = np.random.default_rng(seed)
+        component = random.choice(len(self.weights), size=count, p=self.weights / self.weights.sum())
+        root = np.linalg.cholesky(self.covariances[:, :i, :i])[component]  # (count, I, I)
+        drawn = self.means[component, :i] + (root @ random.standard_normal((count, i, 1)))[:, :, 0]
+        return frozen(np.asarray(drawn))
+
+    def _checked_dimensions(self, inputs: int) -> int:
+        total = self.means.shape[1]
+        if not 1 <= inputs < total:
+            raise ValueError(
+                f"{inputs} input dimensions given; this mixture of {total} dimensions in all takes 1 to {total - 1}."
+            )
+        return inputs

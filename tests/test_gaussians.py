@@ -1,0 +1,124 @@
+"""Normal distributions as a value: what is refused, and the rules of affine maps and products."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import kmp
+from kmp import Gaussians
+
+properties = settings(max_examples=20, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def some(count, outputs, seed):
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(count, outputs, outputs))
+    return Gaussians(random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs))
+
+
+def test_the_package_exports_what_it_names():
+    assert sorted(kmp.__all__) == ["GaussianKernel", "GaussianMixture", "Gaussians", "KMP"]
+    assert all(hasattr(kmp, name) for name in kmp.__all__)
+
+
+def test_the_arrays_are_read_only_copies():
+    mean = np.zeros((2, 3))
+    value = Gaussians(mean, np.tile(np.eye(3), (2, 1, 1)))
+    mean[0, 0] = 9
+    assert value.mean[0, 0] == 0
+    for array in (
+        value.mean,
+        value.covariance,
+        value.take(slice(1)).mean,
+        pickle.loads(pickle.dumps(value)).covariance,
+    ):
+        assert not array.flags.writeable
+
+
+def test_no_distribution_at_all_is_a_legal_value():
+    assert len(Gaussians(np.empty((0, 3)), np.empty((0, 3, 3)))) == 0
+
+
+def test_a_covariance_given_symmetric_is_kept_bit_for_bit():
+    value = some(5, 3, 1)
+    assert np.array_equal(Gaussians(value.mean, value.covariance).covariance, value.covariance)
+
+
+@pytest.mark.parametrize(
+    ("mean", "covariance", "says"),
+    [
+        (np.zeros(3), np.eye(3)[None], r"mean: shape \(3,\) given, \(N, O\) needed\."),
+        (np.zeros((2, 3)), np.eye(3)[None], r"covariance: shape \(1, 3, 3\) given, \(2, 3, 3\) needed\."),
+        (np.array([[0, np.nan]]), np.eye(2)[None], r"mean\[0, 1\] is nan, and every number must be finite\."),
+        (np.zeros((1, 2)), np.array([[[np.inf, 0], [0, 1]]]), r"covariance\[0, 0, 0\] is inf"),
+        (
+            np.zeros((2, 2)),
+            np.array([np.eye(2), [[1, 0.5], [0.25, 1]]]),
+            r"covariance\[1\] is not symmetric: .* by up to 0\.25\. Give \(C \+ C\^T\) / 2",
+        ),
+        (
+            np.zeros((2, 2)),
+            np.array([np.eye(2), np.diag([1, -0.5])]),
+            r"covariance\[1\] is not positive definite: its smallest eigenvalue is -0\.5, .* Add a small variance",
+        ),
+        (
+            np.zeros((1, 2)),
+            np.zeros((1, 2, 2)),
+            r"covariance\[0\] is not positive definite: its smallest eigenvalue is 0,",
+        ),
+    ],
+)
+def test_what_is_no_distribution_is_refused_with_its_place_and_the_remedy(mean, covariance, says):
+    with pytest.raises(ValueError, match=says):
+        Gaussians(mean, covariance)
+
+
+@properties
+@given(seeds)
+def test_an_affine_map_and_its_inverse_cancel(seed):
+    value, random = some(4, 3, seed), np.random.default_rng(seed)
+    rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    offset = random.normal(size=3)
+    back = value.affine(rotation, offset).affine(rotation.T, -rotation.T @ offset)
+    np.testing.assert_allclose(back.mean, value.mean, atol=1e-12)
+    np.testing.assert_allclose(back.covariance, value.covariance, atol=1e-12)
+
+
+def test_an_affine_map_may_lower_the_dimension():
+    value = some(4, 3, 0)
+    plane = value.affine(np.eye(3)[:2], [1, 2])
+    np.testing.assert_allclose(plane.mean, value.mean[:, :2] + [1, 2])
+    np.testing.assert_allclose(plane.covariance, value.covariance[:, :2, :2])
+
+
+def test_an_affine_map_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"matrix: shape \(2, 2\) given, \(P, 3\) needed"):
+        some(1, 3, 0).affine(np.eye(2), np.zeros(2))
+    with pytest.raises(ValueError, match=r"offset: shape \(2,\) given, \(3,\) needed"):
+        some(1, 3, 0).affine(np.eye(3), np.zeros(2))
+
+
+@properties
+@given(seeds)
+def test_a_product_does_not_depend_on_the_order_and_is_surer_than_its_factors(seed):
+    a, b, c = some(3, 2, seed), some(3, 2, seed + 1), some(3, 2, seed + 2)
+    product = a.product(b, c)
+    other = c.product(a).product(b)
+    np.testing.assert_allclose(product.mean, other.mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(product.covariance, other.covariance, rtol=1e-7, atol=1e-9)
+    assert (np.linalg.eigvalsh(a.covariance - product.covariance) > 0).all()
+
+
+def test_a_product_with_itself_keeps_the_mean_and_halves_the_covariance():
+    a = some(3, 2, 7)
+    np.testing.assert_allclose(a.product(a).mean, a.mean)
+    np.testing.assert_allclose(a.product(a).covariance, a.covariance / 2)
+
+
+def test_a_product_of_unlike_shapes_is_refused():
+    with pytest.raises(ValueError, match=r"product: means of shape \(2, 2\) given, \(3, 2\) needed"):
+        some(3, 2, 0).product(some(2, 2, 0))

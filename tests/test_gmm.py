@@ -1,0 +1,165 @@
+"""The mixture: regression against sampling and the textbook, determinism, refusals."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
+
+from kmp import GaussianMixture
+
+properties = settings(max_examples=15, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def mixture(seed, components=3, dimensions=4):
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(components, dimensions, dimensions))
+    weights = random.uniform(0.2, 1, size=components)
+    return GaussianMixture(
+        weights / weights.sum(),
+        random.normal(size=(components, dimensions)),
+        root @ root.swapaxes(1, 2) + 0.1 * np.eye(dimensions),
+    )
+
+
+def demonstrations(seed=0):
+    random = np.random.default_rng(seed)
+    t = np.tile(np.linspace(0, 2, 100), 5)
+    path = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    return np.column_stack([t, path + 0.02 * random.normal(size=path.shape)])
+
+
+def test_em_finds_two_clusters_where_they_are():
+    random = np.random.default_rng(0)
+    samples = np.concatenate([random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))])
+    found = GaussianMixture.fit(samples, components=2, seed=0)
+    left, right = np.argsort(found.means[:, 0])
+    np.testing.assert_allclose(found.means[[left, right]], [[0, 0], [5, 1]], atol=0.1)
+    np.testing.assert_allclose(found.weights[[left, right]], [0.75, 0.25], atol=1e-3)
+    np.testing.assert_allclose(found.covariances[right], np.diag([0.09, 0.01]), atol=0.03)
+
+
+def test_the_same_seed_gives_the_same_bits():
+    a, b = (GaussianMixture.fit(demonstrations(), components=5, seed=3) for _ in range(2))
+    assert np.array_equal(a.means, b.means)
+    assert np.array_equal(a.covariances, b.covariances)
+    assert np.array_equal(a.sample_inputs(9, dimensions=1, seed=4), b.sample_inputs(9, dimensions=1, seed=4))
+    assert not np.array_equal(a.sample_inputs(9, dimensions=1, seed=4), a.sample_inputs(9, dimensions=1, seed=5))
+
+
+def test_regularization_bounds_the_variance_of_repeated_samples():
+    found = GaussianMixture.fit(np.tile([[1.0, 2.0]], (10, 1)), components=1, seed=0, regularization=1e-4)
+    np.testing.assert_allclose(found.covariances[0], 1e-4 * np.eye(2), atol=1e-12)
+
+
+def test_regression_follows_the_demonstrations():
+    t = np.linspace(0.1, 1.9, 30)[:, None]
+    reference = GaussianMixture.fit(demonstrations(), components=8, seed=0).regress(t)
+    np.testing.assert_allclose(reference.mean, np.hstack([np.sin(3 * t), np.cos(2 * t)]), atol=0.08)
+
+
+def test_regression_with_one_component_is_the_conditional_normal():
+    one = mixture(0, components=1, dimensions=5)
+    s = np.array([[0.3, -0.2]])
+    a, b, c = one.covariances[0][:2, :2], one.covariances[0][:2, 2:], one.covariances[0][2:, 2:]
+    reference = one.regress(s)
+    np.testing.assert_allclose(reference.mean[0], one.means[0, 2:] + b.T @ np.linalg.inv(a) @ (s[0] - one.means[0, :2]))
+    np.testing.assert_allclose(reference.covariance[0], c - b.T @ np.linalg.inv(a) @ b)
+
+
+@properties
+@given(seeds)
+def test_regression_is_the_first_two_moments_of_the_conditional_mixture(seed):
+    mix = mixture(seed)
+    s = np.random.default_rng(seed).normal(size=2)
+    share = np.array(
+        [
+            w * multivariate_normal(m[:2], c[:2, :2]).pdf(s)
+            for w, m, c in zip(mix.weights, mix.means, mix.covariances, strict=True)
+        ]
+    )
+    share /= share.sum()
+    first, second = np.zeros(2), np.zeros((2, 2))
+    for h, m, c in zip(share, mix.means, mix.covariances, strict=True):
+        gain = c[2:, :2] @ np.linalg.inv(c[:2, :2])
+        mean = m[2:] + gain @ (s - m[:2])
+        first += h * mean
+        second += h * (c[2:, 2:] - gain @ c[:2, 2:] + np.outer(mean, mean))
+    reference = mix.regress(s[None])
+    np.testing.assert_allclose(reference.mean[0], first, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(reference.covariance[0], second - np.outer(first, first), rtol=1e-6, atol=1e-8)
+
+
+def test_regression_far_away_is_still_finite_and_positive_definite():
+    reference = mixture(1).regress(np.array([[1e4, -1e4]]))
+    assert np.isfinite(reference.mean).all()
+    assert (np.linalg.eigvalsh(reference.covariance) > 0).all()
+
+
+def test_a_component_of_no_weight_has_no_say():
+    mix = mixture(2)
+    without = GaussianMixture(
+        np.append(mix.weights, 0),
+        np.vstack([mix.means, mix.means[:1] + 1]),
+        np.concatenate([mix.covariances, mix.covariances[:1]]),
+    )
+    s = np.zeros((1, 2))
+    np.testing.assert_allclose(without.regress(s).mean, mix.regress(s).mean)
+
+
+def test_sampled_inputs_have_the_moments_of_the_marginal():
+    mix = mixture(5)
+    drawn = mix.sample_inputs(40_000, dimensions=2, seed=0)
+    mean = mix.weights @ mix.means[:, :2]
+    spread = mix.means[:, :2] - mean
+    covariance = np.einsum("k,kij->ij", mix.weights, mix.covariances[:, :2, :2]) + (mix.weights * spread.T) @ spread
+    assert drawn.shape == (40_000, 2)
+    np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.05)
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, rtol=0.05, atol=0.05)
+
+
+def test_the_arrays_are_read_only_after_a_pickle_too():
+    for mix in (mixture(0), pickle.loads(pickle.dumps(mixture(0)))):
+        assert not any(array.flags.writeable for array in (mix.weights, mix.means, mix.covariances))
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (
+            lambda: GaussianMixture.fit(np.zeros((2, 3)), components=5, seed=0),
+            "2 samples given for 5 components: give at least 5 samples",
+        ),
+        (
+            lambda: GaussianMixture.fit(np.zeros((2, 3)), components=0, seed=0),
+            "components is 0, and must be at least 1",
+        ),
+        (
+            lambda: GaussianMixture.fit(np.zeros(3), components=1, seed=0),
+            r"samples: shape \(3,\) given, \(M, I\+O\) needed",
+        ),
+        (lambda: GaussianMixture.fit([[0, np.nan]], components=1, seed=0), r"samples\[0, 1\] is nan"),
+        (
+            lambda: GaussianMixture.fit([[0.0, 1.0]], components=1, seed=0, regularization=0),
+            "regularization is 0, and must be finite",
+        ),
+        (lambda: mixture(0).regress(np.zeros((1, 4))), "4 input dimensions given; this mixture of 4 .* takes 1 to 3"),
+        (lambda: mixture(0).regress(np.zeros(2)), r"inputs: shape \(2,\) given, \(N, I\) needed"),
+        (lambda: mixture(0).sample_inputs(1, dimensions=0, seed=0), "0 input dimensions given"),
+        (lambda: mixture(0).sample_inputs(0, dimensions=2, seed=0), "count is 0, and must be at least 1"),
+        (
+            lambda: GaussianMixture([0.5, 0.4], np.zeros((2, 1)), np.ones((2, 1, 1))),
+            "needed are numbers of sum 1, none below 0",
+        ),
+        (
+            lambda: GaussianMixture([1.0], np.zeros((2, 1)), np.ones((2, 1, 1))),
+            r"means: shape \(2, 1\) given, \(1, I\+O\)",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_what_could(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()

@@ -1,0 +1,368 @@
+"""The primitive: equations (8) and (9) against a naive solution, derivatives, adaptation, and what is kept of it."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import block_diag
+
+from kmp import KMP, GaussianKernel, Gaussians
+
+properties = settings(max_examples=15, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+kernel = GaussianKernel(0.5)
+
+
+def database(seed=0, count=30, inputs=4, outputs=3):
+    random = np.random.default_rng(seed)
+    root = 0.1 * random.normal(size=(count, outputs, outputs))
+    covariance = root @ root.swapaxes(1, 2) + 1e-4 * np.eye(outputs)
+    return random.normal(size=(count, inputs)), Gaussians(random.normal(size=(count, outputs)), covariance)
+
+
+def skill(seed=0, lambda_mean=2.0, lambda_covariance=None, prior_mean=None, **size):
+    inputs, reference = database(seed, **size)
+    return KMP.fit(
+        inputs,
+        reference,
+        kernel=kernel,
+        lambda_mean=lambda_mean,
+        lambda_covariance=lambda_covariance,
+        prior_mean=prior_mean,
+    )
+
+
+def via(seed, count, inputs=4, outputs=3, std=1e-4):
+    random = np.random.default_rng(seed)
+    points = Gaussians(random.normal(size=(count, outputs)), np.tile(std**2 * np.eye(outputs), (count, 1, 1)))
+    return random.normal(size=(count, inputs)), points
+
+
+def naive(inputs, reference, query, *, lambda_mean, lambda_covariance, prior_mean):
+    """Equations (8), (9) and the covariance of the IJRR paper, written down as they stand."""
+    o = reference.mean.shape[1]
+    unit = np.eye(o)
+    big = np.kron(np.exp(-kernel.ell * ((inputs[:, None] - inputs) ** 2).sum(axis=2)), unit)
+    row = np.kron(np.exp(-kernel.ell * ((query - inputs) ** 2).sum(axis=1))[None], unit)
+    sigma = block_diag(*reference.covariance)
+    alpha = np.linalg.solve(big + lambda_mean * sigma, (reference.mean - prior_mean).ravel())
+    explained = row @ np.linalg.solve(big + lambda_covariance * sigma, row.T)
+    return prior_mean + row @ alpha, len(inputs) / lambda_covariance * (unit - explained)
+
+
+def same_bits(a, b, queries):
+    one, direction = queries[0], np.ones(queries.shape[1])
+    return all(
+        np.array_equal(x, y)
+        for x, y in [
+            (a.mean(queries), b.mean(queries)),
+            (a.mean(queries[:1]), b.mean(queries[:1])),
+            (a.jacobian(one), b.jacobian(one)),
+            (a.curvature(one, direction), b.curvature(one, direction)),
+            (a.predict(queries[:1]).covariance, b.predict(queries[:1]).covariance),
+            (a.predict(queries).covariance, b.predict(queries).covariance),
+        ]
+    )
+
+
+@properties
+@given(seeds, st.sampled_from([1, 2, 3]), st.sampled_from([None, 5.0]), st.booleans())
+def test_mean_and_covariance_are_those_of_the_naive_solution(seed, outputs, lambda_covariance, adapted):
+    prior = np.arange(outputs) + 0.5
+    primitive = skill(seed, lambda_covariance=lambda_covariance, prior_mean=prior, outputs=outputs)
+    if adapted:
+        primitive = primitive.adapt(*via(seed, 3, outputs=outputs, std=0.01), tolerance=1.5)
+    queries = np.random.default_rng(seed + 1).normal(size=(4, 4))
+    together = primitive.predict(queries)
+    for n, query in enumerate(queries):
+        mean, covariance = naive(
+            primitive.inputs,
+            primitive.reference,
+            query,
+            lambda_mean=2.0,
+            lambda_covariance=lambda_covariance or 2.0,
+            prior_mean=prior,
+        )
+        alone = primitive.predict(query[None])
+        for found in (together.mean[n], alone.mean[0], primitive.mean(queries)[n]):
+            np.testing.assert_allclose(found, mean, atol=1e-8)
+        for found in (together.covariance[n], alone.covariance[0]):
+            np.testing.assert_allclose(found, covariance, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_predict_has_the_very_mean_of_mean(count):
+    queries = np.random.default_rng(0).normal(size=(count, 4))
+    primitive = skill()
+    assert np.array_equal(primitive.predict(queries).mean, primitive.mean(queries))
+    assert primitive.predict(queries).covariance.shape == (count, 3, 3)
+
+
+def test_many_queries_are_predicted_in_batches_as_in_one():
+    queries = np.random.default_rng(0).normal(size=(600, 4))
+    primitive = skill()
+    found = primitive.predict(queries)
+    for n in (0, 255, 256, 511, 512, 599):
+        np.testing.assert_allclose(found.covariance[n], primitive.predict(queries[n : n + 1]).covariance[0], rtol=1e-9)
+
+
+@properties
+@given(seeds)
+def test_the_jacobian_agrees_with_finite_differences(seed):
+    primitive, h = skill(seed), 1e-5
+    s = np.random.default_rng(seed + 1).normal(size=4)
+    steps = h * np.eye(4)
+    numeric = (primitive.mean(s + steps) - primitive.mean(s - steps)).T / (2 * h)
+    assert primitive.jacobian(s).shape == (3, 4)
+    scale = np.abs(primitive.weights).max()
+    np.testing.assert_allclose(primitive.jacobian(s), numeric, rtol=1e-6, atol=1e-8 * max(1, scale))
+
+
+@properties
+@given(seeds)
+def test_the_curvature_agrees_with_finite_differences_of_the_jacobian(seed):
+    primitive, h = skill(seed), 1e-5
+    random = np.random.default_rng(seed + 1)
+    s, v = random.normal(size=4), random.normal(size=4)
+    numeric = (primitive.jacobian(s + h * v) - primitive.jacobian(s - h * v)) @ v / (2 * h)
+    scale = np.abs(primitive.weights).max()
+    np.testing.assert_allclose(primitive.curvature(s, v), numeric, rtol=1e-5, atol=1e-7 * max(1, scale))
+
+
+@properties
+@given(seeds, st.sampled_from([0.001, 0.1, 1.0]))
+def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed, spread):
+    random = np.random.default_rng(seed)
+    inputs = spread * random.normal(size=(20, 2))
+    primitive = KMP.fit(
+        inputs,
+        Gaussians(random.normal(size=(20, 2)), np.tile(1e-14 * np.eye(2), (20, 1, 1))),
+        kernel=kernel,
+        lambda_mean=1.0,
+    )
+    predictions = [primitive.predict(inputs), *(primitive.predict(s[None]) for s in inputs)]
+    for covariance in (p.covariance for p in predictions):
+        assert np.array_equal(covariance, covariance.swapaxes(1, 2))
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_far_away_the_mean_is_the_prior_and_the_covariance_the_whole():
+    far = np.full((1, 4), 50.0)
+    prediction = skill(prior_mean=[1, 2, 3]).predict(far)
+    np.testing.assert_array_equal(prediction.mean, [[1, 2, 3]])
+    np.testing.assert_allclose(prediction.covariance[0], 30 / 2.0 * np.eye(3))
+    np.testing.assert_array_equal(skill().mean(far), [[0, 0, 0]])
+
+
+def test_repeated_inputs_are_legal_and_give_the_same_as_their_mean_with_half_the_covariance():
+    inputs, reference = database(count=8)
+    twice = KMP.fit(
+        np.tile(inputs, (2, 1)),
+        Gaussians(
+            np.concatenate([reference.mean + 0.1, reference.mean - 0.1]), np.tile(reference.covariance, (2, 1, 1))
+        ),
+        kernel=kernel,
+        lambda_mean=2.0,
+    )
+    once = KMP.fit(inputs, Gaussians(reference.mean, reference.covariance / 2), kernel=kernel, lambda_mean=2.0)
+    queries = np.random.default_rng(1).normal(size=(5, 4))
+    np.testing.assert_allclose(twice.mean(queries), once.mean(queries), atol=1e-8)
+
+
+def test_via_points_of_small_variance_are_met():
+    for seed in range(10):
+        inputs, points = via(seed, 3, std=1e-5)
+        adapted = skill(seed).adapt(inputs, points, tolerance=0.5)
+        np.testing.assert_allclose(adapted.mean(inputs), points.mean, atol=1e-5)
+
+
+def test_a_via_point_far_from_the_others_leaves_the_rest_as_it_was():
+    primitive = skill()
+    adapted = primitive.adapt(np.full((1, 4), 9.0), via(0, 1)[1], tolerance=0.1)
+    queries = np.random.default_rng(3).normal(size=(5, 4))
+    np.testing.assert_allclose(adapted.mean(queries), primitive.mean(queries), atol=1e-9)
+
+
+def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
+    primitive = skill()
+    inputs = np.stack([primitive.inputs[7] + 0.01, np.full(4, 9.0)])
+    adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
+    assert list(adapted.replaced) == [7]
+    assert len(adapted.inputs) == 31
+    np.testing.assert_array_equal(adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs]))
+    np.testing.assert_array_equal(adapted.via_inputs, inputs)
+    assert adapted.base is primitive
+    assert primitive.base is primitive
+    assert len(primitive.via_points) == 0
+
+
+def test_only_the_nearest_of_the_points_within_the_tolerance_is_replaced():
+    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
+    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2).replaced) == [0]
+
+
+def test_the_tolerance_itself_is_not_near_enough():
+    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
+    point = Gaussians([[5.0]], [[[1e-6]]])
+    assert len(primitive.adapt([[0.25]], point, tolerance=0.25).replaced) == 0
+    assert list(primitive.adapt([[0.25]], point, tolerance=0.26).replaced) == [0]
+    assert list(primitive.adapt([[0.5]], point, tolerance=1).replaced) == [0, 1]
+
+
+@properties
+@given(seeds, st.floats(0, 3))
+def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
+    primitive = skill(seed)
+    inputs, points = via(seed, 5, std=0.01)
+    inputs[4] = inputs[3] + 0.05
+    order = np.random.default_rng(seed).permutation(5)
+    together = primitive.adapt(inputs, points, tolerance=tolerance)
+    shuffled = primitive.adapt(inputs[order], points.take(order), tolerance=tolerance)
+    singly = primitive
+    for n in range(5):
+        singly = singly.adapt(inputs[n : n + 1], points.take(slice(n, n + 1)), tolerance=tolerance)
+    queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
+    assert np.array_equal(together.replaced, shuffled.replaced)
+    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
+    np.testing.assert_allclose(
+        shuffled.predict(queries).covariance, together.predict(queries).covariance, rtol=1e-6, atol=1e-7
+    )
+    assert same_bits(singly, together, queries)
+
+
+@properties
+@given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
+def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, tolerance):
+    adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
+    fitted = KMP.fit(
+        adapted.inputs, adapted.reference, kernel=kernel, lambda_mean=2.0, lambda_covariance=lambda_covariance
+    )
+    queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
+    np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
+    np.testing.assert_allclose(
+        adapted.predict(queries).covariance, fitted.predict(queries).covariance, rtol=1e-6, atol=1e-7
+    )
+
+
+def test_every_point_of_the_base_may_be_replaced():
+    primitive = skill(count=2)
+    points = via(0, 2)[1]
+    adapted = primitive.adapt(primitive.inputs, points, tolerance=0.1)
+    np.testing.assert_array_equal(adapted.inputs, primitive.inputs)
+    np.testing.assert_allclose(adapted.mean(adapted.inputs), points.mean, atol=1e-4)
+
+
+def test_adapting_the_base_to_nothing_gives_the_base():
+    primitive = skill()
+    adapted = primitive.adapt(*via(0, 2), tolerance=1)
+    assert adapted.base.adapt(*via(0, 0), tolerance=1) is primitive
+
+
+def test_adapting_leaves_the_primitive_as_it_was():
+    primitive, queries = skill(), np.random.default_rng(0).normal(size=(3, 4))
+    before = primitive.predict(queries)
+    primitive.adapt(*via(0, 2), tolerance=1)
+    assert np.array_equal(primitive.predict(queries).covariance, before.covariance)
+    assert np.array_equal(primitive.mean(queries), before.mean)
+
+
+@pytest.mark.parametrize("lambda_covariance", [None, 6.0])
+@pytest.mark.parametrize("count", [0, 3])
+def test_saved_arrays_give_the_primitive_back_bit_for_bit(tmp_path, lambda_covariance, count):
+    primitive = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3]).adapt(
+        *via(1, count), tolerance=1.5
+    )
+    np.savez(tmp_path / "skill.npz", note=np.array("left alone"), **primitive.to_arrays())
+    with np.load(tmp_path / "skill.npz") as arrays:
+        again = KMP.from_arrays(arrays)
+    queries = np.random.default_rng(2).normal(size=(5, 4))
+    assert same_bits(primitive, again, queries)
+    assert same_bits(primitive.base, again.base, queries)
+    more = via(9, 2)
+    assert same_bits(primitive.adapt(*more, tolerance=1), again.adapt(*more, tolerance=1), queries)
+
+
+def test_saved_weights_are_used_and_not_fitted_again():
+    saved = skill().adapt(*via(0, 2), tolerance=0).to_arrays()
+    again = KMP.from_arrays(saved | {"base_weights": np.ones((30, 3)), "weights": np.full((32, 3), 2.0)})
+    np.testing.assert_array_equal(again.base.weights, np.ones((30, 3)))
+    np.testing.assert_array_equal(again.weights, np.full((32, 3), 2.0))
+
+
+def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
+    primitive, queries = skill().adapt(*via(1, 2), tolerance=1), np.random.default_rng(2).normal(size=(5, 4))
+    primitive.predict(queries)
+    again = pickle.loads(pickle.dumps(primitive))
+    assert same_bits(primitive, again, queries)
+    for one in (primitive, again, again.base):
+        arrays = [
+            one.inputs,
+            one.weights,
+            one.replaced,
+            one.prior_mean,
+            one.reference.mean,
+            one.via_inputs,
+            *one._whitener,
+        ]
+        assert not any(array.flags.writeable for array in arrays)
+
+
+def test_threads_may_share_a_primitive():
+    primitive, queries = skill(count=60), np.random.default_rng(2).normal(size=(64, 1, 4))
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(primitive.predict, queries))
+    fresh = skill(count=60)
+    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(found, queries, strict=True))
+
+
+INPUTS, REFERENCE = database(count=3)
+TWINS = Gaussians(np.zeros((2, 1)), np.full((2, 1, 1), 1e-20))
+ARRAYS = skill().adapt(*via(0, 2), tolerance=1.5).to_arrays()
+
+
+def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
+    return KMP.fit(inputs, reference, kernel=kernel, lambda_mean=lambda_mean, **options)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: fit(lambda_mean=0), "lambda_mean is 0, and must be finite and above 0"),
+        (lambda: fit(lambda_covariance=-1), "lambda_covariance is -1, and must be finite and above 0"),
+        (lambda: fit(prior_mean=[1, 2]), r"prior_mean: shape \(2,\) given, \(3,\) needed"),
+        (lambda: fit(inputs=np.zeros(3)), r"inputs: shape \(3,\) given, \(N, I\) needed"),
+        (lambda: fit(inputs=np.full((3, 4), np.inf)), r"inputs\[0, 0\] is inf, and every number must be finite"),
+        (lambda: fit(inputs=INPUTS[:2]), "3 normals over 3 outputs given for 2 inputs; 2 over 3 needed"),
+        (lambda: fit(inputs=np.empty((0, 4))), "inputs: no reference point given, at least 1 needed"),
+        (
+            lambda: fit(inputs=[[1.0], [1.0]], reference=TWINS),
+            r"not positive definite to working precision at point 1, with lambda 1",
+        ),
+        (lambda: fit().mean(np.zeros(4)), r"queries: shape \(4,\) given, \(M, 4\) needed"),
+        (lambda: fit().predict(np.zeros((1, 3))), r"queries: shape \(1, 3\) given, \(M, 4\) needed"),
+        (lambda: fit().jacobian(np.zeros((1, 4))), r"query: shape \(1, 4\) given, \(4,\) needed"),
+        (lambda: fit().curvature(np.zeros(4), np.zeros(3)), r"direction: shape \(3,\) given, \(4,\) needed"),
+        (lambda: fit().adapt(*via(0, 1), tolerance=-1), "tolerance is -1, and must not be below 0"),
+        (lambda: fit().adapt(*via(0, 1), tolerance=np.nan), "tolerance is nan"),
+        (lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1), r"inputs: shape \(1, 2\) given, \(V, 4\) needed"),
+        (
+            lambda: fit().adapt(*via(0, 1, outputs=2), tolerance=1),
+            "1 normals over 2 outputs given for 1 inputs; 1 over 3 needed",
+        ),
+        (
+            lambda: KMP.from_arrays({"ell": np.array(1.0)}),
+            "The primitive's arrays lack base_inputs, base_mean, .* Needed are",
+        ),
+        (lambda: KMP.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
+        (
+            lambda: KMP.from_arrays(ARRAYS | {"replaced": np.array([99])}),
+            r"replaced: \[99\] given, ascending indices of the 30 base",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_what_could(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()
