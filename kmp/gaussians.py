@@ -82,9 +82,7 @@ class Gaussians:
     @staticmethod
     def concatenated(parts: Sequence[Gaussians]) -> Gaussians:
         """All distributions of the parts, in order."""
-        return Gaussians.trusted(
-            np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
-        )
+        return Gaussians.trusted(np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts]))
 
 
 def _symmetric(covariance: Array) -> Array:
@@ -99,8 +97,7 @@ def _check_covariances(name: str, covariance: Array) -> None:
     lopsided = np.abs(covariance - covariance.swapaxes(1, 2)).max(axis=(1, 2))
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
         raise ValueError(
-            f"{name}[{n}] is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}. "
-            "Give (C + C^T) / 2 if that is what is meant."
+            f"{name}[{n}] is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}. Give (C + C^T) / 2 if that is what is meant."
         )
     smallest = np.linalg.eigvalsh(covariance)[:, 0]
     for n in np.flatnonzero(smallest <= covariance.shape[1] * _MACHINE * size)[:1]:

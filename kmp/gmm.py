@@ -53,10 +53,7 @@ class GaussianMixture:
         if components < 1:
             raise ValueError(f"components is {components}, and must be at least 1.")
         if len(data) < components:
-            raise ValueError(
-                f"{len(data)} samples given for {components} components: "
-                f"give at least {components} samples, or fewer components."
-            )
+            raise ValueError(f"{len(data)} samples given for {components} components: give at least {components} samples, or fewer components.")
         # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
         from sklearn.mixture import GaussianMixture as Estimator  # noqa: PLC0415
         from threadpoolctl import threadpool_limits  # noqa: PLC0415
@@ -112,7 +109,5 @@ class GaussianMixture:
     def _checked_dimensions(self, inputs: int) -> int:
         total = self.means.shape[1]
         if not 1 <= inputs < total:
-            raise ValueError(
-                f"{inputs} input dimensions given; this mixture of {total} dimensions in all takes 1 to {total - 1}."
-            )
+            raise ValueError(f"{inputs} input dimensions given; this mixture of {total} dimensions in all takes 1 to {total - 1}.")
         return inputs

@@ -361,10 +361,7 @@ _ARRAYS = (
 
 def _check_pairs(inputs: Array, points: Gaussians, outputs: int) -> None:
     if points.mean.shape != (len(inputs), outputs):
-        raise ValueError(
-            f"{len(points)} normals over {points.outputs} outputs given for {len(inputs)} inputs; "
-            f"{len(inputs)} over {outputs} needed."
-        )
+        raise ValueError(f"{len(points)} normals over {points.outputs} outputs given for {len(inputs)} inputs; {len(inputs)} over {outputs} needed.")
 
 
 def _positive(covariance: Array) -> Array:

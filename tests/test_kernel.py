@@ -47,9 +47,7 @@ def test_one_query_gives_what_many_give(seed, ell):
     s, inputs = random.normal(size=2), random.normal(size=(5, 2))
     offsets = s - inputs
     np.testing.assert_allclose(kernel.value_at(offsets), kernel(s[None], inputs)[0], rtol=1e-12)
-    np.testing.assert_allclose(
-        kernel.slope_at(offsets)[:, None] * offsets, kernel.gradient(s[None], inputs)[0], rtol=1e-12, atol=1e-300
-    )
+    np.testing.assert_allclose(kernel.slope_at(offsets)[:, None] * offsets, kernel.gradient(s[None], inputs)[0], rtol=1e-12, atol=1e-300)
 
 
 @properties

@@ -161,9 +161,7 @@ def test_repeated_inputs_are_legal_and_give_the_same_as_their_mean_with_half_the
     inputs, reference = database(count=8)
     twice = KMP.fit(
         np.tile(inputs, (2, 1)),
-        Gaussians(
-            np.concatenate([reference.mean + 0.1, reference.mean - 0.1]), np.tile(reference.covariance, (2, 1, 1))
-        ),
+        Gaussians(np.concatenate([reference.mean + 0.1, reference.mean - 0.1]), np.tile(reference.covariance, (2, 1, 1))),
         kernel=kernel,
         lambda_mean=2.0,
     )
@@ -227,9 +225,7 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     assert np.array_equal(together.replaced, shuffled.replaced)
     np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
-    np.testing.assert_allclose(
-        shuffled.predict(queries).covariance, together.predict(queries).covariance, rtol=1e-6, atol=1e-7
-    )
+    np.testing.assert_allclose(shuffled.predict(queries).covariance, together.predict(queries).covariance, rtol=1e-6, atol=1e-7)
     assert same_bits(singly, together, queries)
 
 
@@ -237,14 +233,10 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
 @given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
 def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, tolerance):
     adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
-    fitted = KMP.fit(
-        adapted.inputs, adapted.reference, kernel=kernel, lambda_mean=2.0, lambda_covariance=lambda_covariance
-    )
+    fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, lambda_mean=2.0, lambda_covariance=lambda_covariance)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
-    np.testing.assert_allclose(
-        adapted.predict(queries).covariance, fitted.predict(queries).covariance, rtol=1e-6, atol=1e-7
-    )
+    np.testing.assert_allclose(adapted.predict(queries).covariance, fitted.predict(queries).covariance, rtol=1e-6, atol=1e-7)
 
 
 def test_every_point_of_the_base_may_be_replaced():
@@ -272,9 +264,7 @@ def test_adapting_leaves_the_primitive_as_it_was():
 @pytest.mark.parametrize("lambda_covariance", [None, 6.0])
 @pytest.mark.parametrize("count", [0, 3])
 def test_saved_arrays_give_the_primitive_back_bit_for_bit(tmp_path, lambda_covariance, count):
-    primitive = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3]).adapt(
-        *via(1, count), tolerance=1.5
-    )
+    primitive = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3]).adapt(*via(1, count), tolerance=1.5)
     np.savez(tmp_path / "skill.npz", note=np.array("left alone"), **primitive.to_arrays())
     with np.load(tmp_path / "skill.npz") as arrays:
         again = KMP.from_arrays(arrays)

@@ -1,0 +1,94 @@
+"""What a client of the daemon needs: a Zenoh session that announces nothing, and its requests as plain calls."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import zenoh
+
+from service import wire
+from service.config import ExplainedError
+
+
+class UnreachableError(ExplainedError, OSError):
+    """No Zenoh session, or nobody answers."""
+
+
+class RefusedError(ExplainedError, ValueError):
+    """The daemon's answer to a request that it did not carry out."""
+
+
+def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), timeout_s: float = 10.0) -> zenoh.Session:
+    """An open Zenoh session between named endpoints, without scouting. Close it. Raises UnreachableError."""
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": int(timeout_s * 1000),
+        "connect/exit_on_failure": True,
+        "listen/exit_on_failure": True,
+        "adminspace/enabled": bool(listen),
+    }
+    try:
+        for name, value in settings.items():
+            config.insert_json5(name, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        reason = str(error).split(" at ")[0]
+        if connect and "connect" in reason:
+            raise UnreachableError(f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?") from None
+        raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
+
+
+def endpoints(session: zenoh.Session) -> tuple[str, ...]:
+    """The endpoints at which a session really listens, with the ports that it was given."""
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=5.0):
+        if reply.ok is not None:
+            return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
+    return ()
+
+
+class Client:
+    """A running daemon's requests as calls. Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers."""
+
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
+        self._session = session
+        self._cell = cell
+        self._timeout_s = timeout_s
+
+    def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
+        """The reply to one request; `request` is anything that becomes JSON."""
+        payload = wire.encode_json({} if request is None else request)
+        for reply in self._session.get(wire.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
+            if reply.ok is not None:
+                answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
+                return answer
+            text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else "no reason given"
+            if text != "Timeout":
+                raise RefusedError(text)
+        raise UnreachableError(f"nobody answers on {wire.key(self._cell, suffix)}: is the daemon running there, and is the cell's name right?")
+
+    def status(self) -> dict[str, Any]:
+        """What `<cell>/status` carries."""
+        return self.ask("status")
+
+    def add(self, points: Iterable[wire.ViaPoint], *, tolerance: float = 0.05) -> dict[str, Any]:
+        """Teaches places; returns once they are in force."""
+        return self.ask("via_points", wire.Add(tuple(points), tolerance))
+
+    def wait_until_ready(self, *, timeout_s: float = 15.0) -> dict[str, Any]:
+        """The status, once a daemon answers on this cell."""
+        end = time.monotonic() + timeout_s
+        while True:
+            try:
+                return self.status()
+            except UnreachableError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.05)

@@ -1,0 +1,245 @@
+"""The daemon: a thin shell that fills the controller's inbox from Zenoh and hands each frame to whoever cares."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from service import wire
+from service.client import endpoints, open_session
+from service.clock import SPIN_NS, Deadlines, Window, ask_for_real_time
+from service.config import Settings
+from service.controller import Controller, run
+from service.frame import FRAME, SIDES, STAGES, TIMING, Cause, Event, Flag, Frame, Mode, Reason, Tick, blank
+from service.requests import Pending, PlacesFile, Requests
+from service.scribe import Scribe
+from service.skill import Skill, SkillError
+from service.workshop import Workshop
+
+log = logging.getLogger("thirdhand")
+LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+DECIMATION = 5  # ticks to one tool/target and one tool/setpoint
+STOP_TIMEOUT_S = 3.0
+DECODERS = {"hands/left": wire.decode_pose, "hands/right": wire.decode_pose, "joints/state": wire.decode_joints}
+
+
+class Daemon:
+    """One cell's loop and all around it. `serve` runs until it is asked to stop, then stops the arm and closes everything."""
+
+    def __init__(self, settings: Settings, skill: Skill, *, workshop: Workshop, skills: Path, scribe: Scribe) -> None:
+        self._settings = settings
+        self._scribe = scribe
+        self._stop = threading.Event()
+        self._ended = threading.Event()
+        self._controller = Controller(settings, skill)
+        self._frame: Frame = blank(FRAME)
+        self._frame["reason"] = Reason.ARM_NOT_READY
+        self._malformed: Counter[str] = Counter()
+        self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
+        self._realtime = False
+        self._late_ns = self._began_ns = 0
+        self._laps: list[tuple[str, int]] = []
+        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen)
+        self.endpoints = endpoints(self._session) if settings.network.listen else ()
+        self._subscribers = [
+            (kind, decode, self._session.declare_subscriber(wire.key(settings.cell, kind), RingChannel(1)))
+            for kind, decode in DECODERS.items()
+            if kind != "joints/state" or settings.arm.source == "state"
+        ]
+        self._publishers = {
+            suffix: self._session.declare_publisher(
+                wire.key(settings.cell, suffix),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+            for suffix in ("joints/command", "tool/target", "tool/setpoint", "status")
+        }
+        self._requests = Requests(
+            self._session, settings, skill, workshop=workshop, skills=skills, status=self.status, note=self.note, keep=scribe.keep
+        )
+        self._clock = Deadlines(settings.rate_hz)
+
+    def stop(self, *_: Any) -> None:
+        """Asks the loop to stop the arm and end. Safe in a signal handler."""
+        self._stop.set()
+
+    def note(self, text: str) -> None:
+        """A line for the log and for the recording."""
+        log.info(text)
+        self._scribe.note("requests", text, time.time_ns())
+
+    def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> None:
+        """Runs the loop until `stop`, `announce`d once requests are answered; then everything is flushed and closed."""
+        reporter = threading.Thread(target=self._report, name="status", daemon=True)
+        try:
+            self._scribe.start(skill=self._controller.skill.to_bytes(), state=self._controller.state)
+            reporter.start()
+            announce(self)
+            self._realtime = ask_for_real_time()
+            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._realtime else 0)
+            run(self._controller, self._ticks(), (self._publish, self._hand_over), self._lap)
+        finally:
+            self._ended.set()
+            if reporter.is_alive():
+                reporter.join(2)
+            self._requests.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+            self._scribe.close(timeout_s=20)
+
+    # --- the loop: every line below costs each tick ---
+
+    def _ticks(self) -> Iterator[Tick]:
+        inbox: list[Event] = []
+        stop_by: float | None = None
+        while True:
+            index, self._late_ns = self._clock.wait()
+            self._began_ns = time.perf_counter_ns()
+            self._laps = []
+            inbox = [event for kind, decode, subscriber in self._subscribers if (event := self._receive(kind, decode, subscriber))]
+            while self._requests.inbox:
+                inbox.append(self._requests.inbox.popleft().taken(index))
+            if self._stop.is_set():
+                if stop_by is None:
+                    stop_by = time.monotonic() + STOP_TIMEOUT_S
+                    inbox.append(Pending(Event("hold", wire.encode_string("{}"), None)).event)
+                elif not self._frame["joint_velocities"].any() or time.monotonic() > stop_by:
+                    return
+            yield Tick(index, tuple(inbox))
+
+    def _receive(self, kind: str, decode: Any, subscriber: Any) -> Event | None:
+        """The newest message on one channel, if it is one."""
+        sample = subscriber.try_recv()
+        if sample is None:
+            return None
+        payload = sample.payload.to_bytes()
+        try:
+            if len(payload) > LARGEST_MESSAGE:
+                raise wire.WireError(f"{len(payload)} bytes")
+            return Event(kind, payload, decode(payload))
+        except wire.WireError:
+            self._malformed[kind] += 1
+            return None
+
+    def _lap(self, stage: str) -> None:
+        self._laps.append((stage, time.perf_counter_ns()))
+
+    def _publish(self, tick: Tick, frame: Frame) -> None:
+        now_ns = time.time_ns()
+        stamp_ns = self._clock.time_ns(tick.index)
+        attachment = wire.encode_attachment(wire.Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
+        if frame["commanded"]:
+            self._publishers["joints/command"].put(
+                wire.encode_command(stamp_ns, frame["joints"].tolist(), frame["joint_velocities"].tolist()), attachment=attachment
+            )
+        if tick.index % DECIMATION == 0:
+            self._publishers["tool/target"].put(encode_target(stamp_ns, frame), attachment=attachment)
+            self._publishers["tool/setpoint"].put(encode_setpoint(stamp_ns, frame), attachment=attachment)
+
+    def _hand_over(self, tick: Tick, frame: Frame) -> None:
+        self._frame = frame
+        timing = blank(TIMING)
+        timing["tick"], timing["time_ns"], timing["missed"] = tick.index, self._clock.time_ns(tick.index), self._clock.missed
+        timing["lateness_us"] = self._late_ns / 1e3
+        before = self._began_ns
+        for stage, at in self._laps:
+            timing["stages_us"][STAGES.index(stage)] = (at - before) / 1e3
+            before = at
+        if any(event.kind[:5] == "hands" for event in tick.inbox):
+            timing["latency_us"] = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e3
+            self._latency.add(float(timing["latency_us"]) / 1e3)
+        timing["work_us"] = (time.perf_counter_ns() - self._began_ns) / 1e3
+        self._lateness.add(self._late_ns / 1e3)
+        self._work.add(float(timing["work_us"]))
+        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._controller.skill.to_bytes())
+
+    # --- beside the loop ---
+
+    def _report(self) -> None:
+        """Publishes the status, says what changed, and keeps the scribe alive, ten times a second."""
+        said: tuple[str, str] | None = None
+        while not self._ended.wait(0.1):
+            status = self.status()
+            payload = wire.encode_json(status)
+            self._publishers["status"].put(payload)
+            self._scribe.note("status", payload.decode(), time.time_ns())
+            self._scribe.supervise()
+            if (status.mode, status.reason) != said:
+                said = (status.mode, status.reason)
+                log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
+
+    def status(self) -> wire.Status:
+        """What is, now."""
+        frame, clock = self._frame, self._clock
+        reason = Reason(int(frame["reason"]))
+        skill = self._controller.skill
+        rejected = {cause.name.lower(): int(count) for cause, count in zip(Cause, frame["rejected"], strict=True) if count}
+        return wire.Status(
+            cell=self._settings.cell,
+            mode=Mode(int(frame["mode"])).name.lower(),
+            reason="" if reason is Reason.NONE else reason.name.lower(),
+            flags=tuple(str(flag.name).lower() for flag in Flag(int(frame["flags"]))),
+            tick=int(frame["tick"]),
+            rate_hz=clock.rate_hz(),
+            missed=clock.missed,
+            realtime=self._realtime,
+            skill=skill.name,
+            places=tuple(place.name for place in skill.places),
+            rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},
+            hand_age_ms={
+                side: round(float(age) * self._settings.period_s * 1e3, 1) for side, age in zip(SIDES, frame["hand_ages"], strict=True) if age >= 0
+            },
+            lateness_us=self._lateness.percentiles(),
+            work_us=self._work.percentiles(),
+            latency_ms=self._latency.percentiles(),
+            scribe=self._scribe.status(),
+            endpoints=self.endpoints,
+            version=version("thirdhand"),
+        )
+
+
+def encode_target(stamp_ns: int, frame: Frame) -> bytes:
+    """The frame's target as CDR bytes of `tool/target`."""
+    covariance = [0.0] * 36
+    for i, row in enumerate(frame["covariance"].tolist()):
+        covariance[6 * i : 6 * i + 3] = row
+    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
+    return wire.encode_pose_with_covariance(wire.PoseWithCovarianceStamped(stamp_ns, wire.BASE, position, orientation, tuple(covariance)))
+
+
+def encode_setpoint(stamp_ns: int, frame: Frame) -> bytes:
+    """The frame's setpoint as CDR bytes of `tool/setpoint`."""
+    return wire.encode_pose(wire.PoseStamped(stamp_ns, wire.BASE, tuple(frame["setpoint"].tolist()), tuple(frame["orientation"].tolist())))
+
+
+def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
+    """The skill in a file, with the places that were taught to it before. Raises SkillError."""
+    skill = workshop.load(path)
+    try:
+        saved = PlacesFile(settings).read(skill)
+    except SkillError as error:
+        log.warning("%s", error)
+        return skill
+    return workshop.adapt(skill, saved[0], tolerance=saved[1]) if saved and saved[0] != skill.places else skill
+
+
+def serve(settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]) -> None:
+    """The daemon from start to end: SIGINT and SIGTERM ask it to stop. Raises SkillError and UnreachableError before it starts."""
+    workshop = Workshop()
+    try:
+        daemon = Daemon(settings, load_skill(workshop, skill_path, settings), workshop=workshop, skills=skills, scribe=scribe)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, daemon.stop)
+        daemon.serve(announce)
+    finally:
+        workshop.close()

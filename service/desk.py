@@ -1,0 +1,197 @@
+"""The scribe's own process, `python -m service.desk DESCRIPTOR`: takes messages from a socket, writes the recording, feeds the viewer.
+
+It ends when the other side of the socket is closed or dead, with everything written that it was told.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from service.frame import STATE, Record
+from service.recording import URDF, Recorder
+from service.scribe import HEAD, LARGEST_MESSAGE, NOTE, Task, unpack
+
+if TYPE_CHECKING:
+    from service.viewer import Viewer
+
+QUEUED = 10_000  # messages; then the socket fills, and then the loop counts losses
+FLUSH_S = 0.5  # what a kill can lose
+DRAW_FLUSH_S = 2.0
+POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
+
+
+class Desk:
+    """What the process does with what it is told. A failure ends what it happened in, is reported, and spares the rest."""
+
+    def __init__(self, task: Task, skill: bytes | None, source: socket.socket) -> None:
+        self._task, self._source = task, source
+        self._recorder: Recorder | None = None
+        self._record_to = task.recording
+        self._viewer: Viewer | None = None
+        if task.rrd is not None or task.live_port is not None:
+            from service.viewer import Viewer  # half a second that a scribe without viewer need not spend
+
+            rrd = None if task.rrd is None else Path(task.rrd)
+            self._viewer = Viewer(cell=task.settings.cell, urdf=URDF, rrd=rrd, live_port=task.live_port, settings=task.settings)
+        if skill is not None:
+            self._begin(skill, None if task.state is None else np.frombuffer(task.state, STATE)[0])
+        self._report()
+
+    def _tell(self, report: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):
+            self._source.send(json.dumps(report).encode(), socket.MSG_DONTWAIT)
+
+    def _report(self) -> None:
+        """Says what went wrong and where things are written."""
+        viewer = self._viewer
+        while viewer is not None and viewer.problems:
+            self._tell({"error": viewer.problems.pop(0)})
+        self._tell({"recording": self._record_to, "rrd": viewer and viewer.rrd, "live": viewer and viewer.url})
+
+    def _record(self, act: Callable[[], None]) -> None:
+        """Does one thing for the recording, which ends at the first failure."""
+        try:
+            act()
+        except OSError as error:
+            self._tell({"error": f"recording to {self._record_to} ended: {error}"})
+            recorder, self._recorder, self._record_to = self._recorder, None, None
+            if recorder is not None:
+                with contextlib.suppress(OSError):
+                    recorder.close()
+            self._report()
+
+    def _begin(self, skill: bytes, state: Record | None) -> None:
+        if self._record_to is not None:
+            self._record(lambda: self._open(skill, state))
+
+    def _open(self, skill: bytes, state: Record | None) -> None:
+        self._recorder = Recorder(str(self._record_to), settings=self._task.settings, skill=skill, state=state, time_ns=time.time_ns())
+
+    def take(self, message: bytes, skills: list[bytes]) -> None:
+        """Writes and draws one message."""
+        if message[0] == NOTE:
+            key, text = json.loads(message[HEAD.size :])
+            self._note(key, text, HEAD.unpack_from(message)[4])
+            return
+        told = unpack(message, skills)
+        time_ns = int(told.timing["time_ns"])
+        if self._recorder is None and told.skill is not None:
+            self._begin(told.skill, None)
+        if told.lost:
+            self._note("log", f"{told.lost} ticks before tick {told.tick.index} are not recorded", time_ns)
+        recorder = self._recorder
+        if recorder is not None:
+            self._record(
+                lambda: recorder.write(told.tick, told.frame, time_ns=time_ns, timing=told.timing, state=told.state, skill=told.skill, lost=told.lost)
+            )
+        if self._viewer is not None:
+            self._viewer.add(told.frame, time_ns, told.timing)
+
+    def _note(self, key: str, text: str, time_ns: int) -> None:
+        recorder = self._recorder
+        if recorder is not None:
+            self._record(lambda: recorder.note(key, text, time_ns))
+        if self._viewer is not None and key != "status":
+            self._viewer.log(text, "WARN" if key == "log" else "INFO", time_ns)
+
+    def flush_recording(self) -> None:
+        """Hands what was recorded to the system."""
+        if self._recorder is not None:
+            self._record(self._recorder.flush)
+
+    def flush_drawing(self) -> None:
+        """Hands what was drawn to the system."""
+        if self._viewer is not None:
+            self._viewer.flush()
+            if self._viewer.problems:
+                self._report()
+
+    def close(self) -> None:
+        """Ends both files."""
+        if self._recorder is not None:
+            self._record(self._recorder.close)
+        if self._viewer is not None:
+            self._viewer.close()
+        self._report()
+
+
+def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
+    """The next message and the files that came along; no bytes: the other side is gone."""
+    while True:
+        try:
+            size, ancillary, _, _ = source.recvmsg_into([buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT)
+            break
+        except BlockingIOError:
+            time.sleep(POLL_S)
+    files = []
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            for (fd,) in struct.iter_unpack("=i", data):
+                with open(fd, "rb") as file:
+                    file.seek(0)
+                    files.append(file.read())
+    return bytes(memoryview(buffer)[:size]), files
+
+
+def _work(source: socket.socket) -> None:
+    """Writes what comes until the other side is gone."""
+    buffer = bytearray(LARGEST_MESSAGE)
+    first, skills = _receive(source, buffer)
+    task = msgspec.json.decode(first, type=Task)
+    waiting: deque[tuple[bytes, list[bytes]]] = deque()
+    ended = threading.Event()
+
+    def read() -> None:
+        with contextlib.suppress(ConnectionError):
+            while (received := _receive(source, buffer))[0]:
+                waiting.append(received)
+                while len(waiting) >= QUEUED:
+                    time.sleep(POLL_S)
+        ended.set()
+
+    desk = Desk(task, skills[0] if skills else None, source)
+    threading.Thread(target=read, name="socket", daemon=True).start()
+    flushed = drawn = time.monotonic()
+    over = False
+    while not over:
+        over = ended.wait(0.05) and not waiting
+        now = time.monotonic()
+        while waiting and time.monotonic() - now < FLUSH_S / 2:
+            desk.take(*waiting.popleft())
+        if now - flushed > FLUSH_S:
+            desk.flush_recording()
+            flushed = now
+        if now - drawn > DRAW_FLUSH_S:
+            desk.flush_drawing()
+            drawn = now
+    desk.close()
+
+
+def main() -> None:
+    """Serves the socket whose descriptor is the only argument."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # it ends when the socket does, with all that was told
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.nice(5)
+    with socket.socket(fileno=int(sys.argv[1])) as source:
+        _work(source)
+
+
+if __name__ == "__main__":
+    main()

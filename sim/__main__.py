@@ -1,0 +1,107 @@
+"""`python -m sim`: the bench as a process, on Zenoh, in real time."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import msgspec
+
+from service.client import endpoints, open_session
+from service.config import ENDPOINT
+from sim.bench import Bench
+from sim.hands import HandScript
+from sim.live import BenchError, Dropout, Live, Report, run
+from sim.scene import Scene, SceneError
+
+EXAMPLE = """example:
+  thirdhand serve &
+  python -m sim --once --json report.json
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="python -m sim",
+        description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the soldering scene "
+        "over and over (with --once: once). Progress goes to standard error, reports to --json.",
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument(
+        "--connect", metavar="EP", action="append", default=[], help=f"Zenoh endpoint of the service; may be repeated (default: {ENDPOINT})"
+    )
+    p.add_argument("--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated")
+    p.add_argument("--cell", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    p.add_argument("--scene", metavar="FILE", type=Path, help="TOML file with places [x, y, z] in metres; the nominal scene otherwise")
+    p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
+    p.add_argument("--once", action="store_true", help="end after one run; its report goes to standard output unless --json says otherwise")
+    p.add_argument("--json", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
+    p.add_argument("--duration", metavar="S", type=float, default=float("inf"), help="end after so many seconds")
+    p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
+    p.add_argument("--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)")
+    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="of the hands, 1 is as demonstrated")
+    p.add_argument("--offset-mm", metavar="MM", type=float, default=8.0, help="scatter of the places, std per axis (default: %(default)s)")
+    p.add_argument("--tremor-mm", metavar="MM", type=float, default=0.5, help="tremor of the hands, rms per axis (default: %(default)s)")
+    p.add_argument("--noise-mm", metavar="MM", type=float, default=0.5, help="noise of the tracker, std per axis (default: %(default)s)")
+    p.add_argument("--dropout", metavar=("START", "DURATION"), type=float, nargs=2, help="seconds of the script while one hand is not seen")
+    p.add_argument("--dropout-hand", choices=("left", "right"), default="left", help="which one (default: %(default)s)")
+    return p
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    p = parser()
+    args = p.parse_args(arguments)
+    if not (args.connect or args.listen):
+        args.connect = [ENDPOINT]
+    if not 30 <= args.hands_rate <= 500:
+        p.error(f"--hands-rate {args.hands_rate}: 30 to 500 accepted")
+    if not 0.05 <= args.speed <= 20:
+        p.error(f"--speed {args.speed}: 0.05 to 20 accepted")
+    if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
+        p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    dropout = Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
+    live = Live(cell=args.cell, hands_hz=args.hands_rate, once=args.once, duration_s=args.duration, wait_s=args.wait, dropout=dropout)
+    target = args.json or ("-" if args.once else None)
+
+    def report(result: Report) -> None:
+        line = msgspec.json.encode(result).decode() + "\n"
+        if target == "-":
+            sys.stdout.write(line)
+            sys.stdout.flush()
+        elif target:
+            with Path(target).open("a", encoding="utf-8") as file:
+                file.write(line)
+
+    try:
+        scene = Scene.load(args.scene) if args.scene else Scene()
+        script = HandScript(
+            scene,
+            seed=scene.seed if args.seed is None else args.seed,
+            speed=args.speed,
+            offset_std=args.offset_mm / 1000,
+            tremor_rms=args.tremor_mm / 1000,
+            noise_std=args.noise_mm / 1000,
+        )
+        if target and target != "-":
+            Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
+        with Bench(script) as bench, open_session(connect=args.connect, listen=args.listen) as session:
+            if args.listen:
+                print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
+            run(bench, session, live, stop=stop, report=report)
+    except (SceneError, BenchError, OSError) as error:
+        print(f"python -m sim: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""The bench: arm, hands and things in step with a script, and whether the task succeeds. No network, no clock: `step` is one period.
+
+bench = Bench(HandScript(Scene(), seed=1))
+bench.begin()
+while not bench.finished:
+    seen = bench.step(q, dq)
+"""
+
+from __future__ import annotations
+
+import math
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from service.config import Settings
+from sim.hands import Hands, HandScript
+from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION
+from sim.world import BOARD_FROM_TOOL, LEVEL, Pose, Vector, World, carried_by, seen_from
+
+BRAKE_AFTER_S = 0.020  # without a command
+TAIL_S = 0.5  # watched after the script's end
+STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
+
+
+class Event(msgspec.Struct, frozen=True):
+    """How one event went: whether the tool was there, its smallest distance [mm], and when: first near enough, or nearest [s of the script]."""
+
+    reached: bool
+    error_mm: float
+    time_s: float
+
+
+class Events(msgspec.Struct, frozen=True):
+    """The three events of a run."""
+
+    handover: Event
+    grasp: Event
+    carry: Event
+
+    @property
+    def success(self) -> bool:
+        """Whether the board was taken, the glass grasped, and held over the board."""
+        return self.handover.reached and self.grasp.reached and self.carry.reached
+
+
+class Observation(NamedTuple):
+    """The bench after a step: steps done, seconds since the script began (0 before), joints [rad, rad/s], tool [m, m/s], hands."""
+
+    tick: int
+    time_s: float
+    joints: Vector
+    joint_velocities: Vector
+    tool: Pose
+    tool_velocity: Vector
+    hands: Hands
+
+
+class _Watch:
+    """The smallest distance within the window of one event."""
+
+    def __init__(self) -> None:
+        self.nearest, self.nearest_s, self.reached_s = math.inf, 0.0, math.nan
+
+    def see(self, distance: float, time_s: float, *, counts: bool = True) -> bool:
+        """Take one distance [m]; true at the first one that is near enough."""
+        if distance < self.nearest:
+            self.nearest, self.nearest_s = distance, time_s
+        first = counts and distance <= GRASP_DISTANCE and math.isnan(self.reached_s)
+        if first:
+            self.reached_s = time_s
+        return first
+
+    def event(self) -> Event:
+        reached = not math.isnan(self.reached_s)
+        return Event(reached, round(1000 * self.nearest, 3), round(self.reached_s if reached else self.nearest_s, 3))
+
+
+class Bench:
+    """The arm at its posture with the board in its tool, the hands at the script's start, waiting for `begin`."""
+
+    def __init__(self, script: HandScript, *, posture: Vector | None = None, rate_hz: int = 500) -> None:
+        self.script = script
+        self.scene = script.scene
+        self.period_s = 1.0 / rate_hz
+        self.world = World(self.scene, posture=posture or Settings().arm.posture, rate_hz=rate_hz)
+        self.tick = 0
+        self._ticks_since_begin = 0
+        self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
+        self._since_command = 0
+        self._still = 0
+        self._lay_out()
+        self._observation = self._observe()
+        self._still_at = self._observation.tool.position
+        self._command = (self._observation.joints, (0.0,) * len(self._observation.joints))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _lay_out(self) -> None:
+        """Everything back to where a run begins."""
+        scene, world = self.scene, self.world
+        self._watches = (_Watch(), _Watch(), _Watch())
+        self.closed = 0  # events whose window is over
+        world.put(world.glass, Pose(scene.glass, LEVEL))
+        world.put(world.iron, Pose(scene.iron, LEVEL))
+        # What is held: by which holder, and how it lies in its hand.
+        self._held: dict[int, tuple[int, Pose]] = {world.board: (world.arm, Pose(BOARD_FROM_TOOL, LEVEL))}
+
+    def begin(self) -> None:
+        """Start the script: hands move from the next step on."""
+        self._lay_out()
+        self._ticks_since_begin, self._direction = 0, 1
+
+    def turn_back(self) -> None:
+        """Let the hands go back the way they came, which keeps them where the skill knows the way; then `begin` can follow."""
+        self._ticks_since_begin = min(self._ticks_since_begin, math.ceil(self.script.duration_s / self.period_s))
+        self._direction = -1
+
+    @property
+    def time_s(self) -> float:
+        """Seconds of the script [s]; 0 before it begins."""
+        return self._ticks_since_begin * self.period_s
+
+    @property
+    def finished(self) -> bool:
+        """Whether the script and the tail after it are over."""
+        return self._direction == 1 and self.time_s >= self.script.duration_s + TAIL_S
+
+    @property
+    def back(self) -> bool:
+        """Whether the hands have come back to their start."""
+        return self._direction == -1 and self._ticks_since_begin == 0
+
+    @property
+    def still_s(self) -> float:
+        """For how long the tool has stayed within 5 mm [s]."""
+        return self._still * self.period_s
+
+    def observe(self) -> Observation:
+        """What the last step left."""
+        return self._observation
+
+    def step(self, position: Vector | None = None, velocity: Vector | None = None) -> Observation:
+        """The bench one period later, after a command of seven joints [rad, rad/s], or none."""
+        self._follow(position, velocity)
+        self.world.step()
+        self.tick += 1
+        self._ticks_since_begin = max(0, self._ticks_since_begin + self._direction)
+        seen = self._observe()
+        self._still += 1
+        if math.dist(seen.tool.position, self._still_at) > STILL_WITHIN:
+            self._still, self._still_at = 0, seen.tool.position
+        self._handle(seen)
+        if self._direction == 1:
+            self._watch(seen)
+        self._observation = seen
+        return seen
+
+    def _follow(self, position: Vector | None, velocity: Vector | None) -> None:
+        if position is not None:
+            self._command = (position, velocity or (0.0,) * len(position))
+            self._since_command = 0
+        else:
+            # Two clocks beat: a period without a command is ordinary, and the arm goes on as commanded until it is too long.
+            self._since_command += 1
+            age_s = self._since_command * self.period_s
+            if self._since_command == round(BRAKE_AFTER_S / self.period_s):
+                self._command = (self._observation.joints, (0.0,) * len(self._observation.joints))
+            position, velocity = self._command
+            position = tuple(q + age_s * dq for q, dq in zip(position, velocity, strict=True))
+        self.world.follow(position, self._command[1])
+
+    def _observe(self) -> Observation:
+        joints, velocities = self.world.joints()
+        tool, speed = self.world.tool()
+        return Observation(self.tick, self.time_s, joints, velocities, tool, speed, self.script.truth(self.time_s))
+
+    def _handle(self, seen: Observation) -> None:
+        """Move the hands, and what anyone holds."""
+        world = self.world
+        holders = {
+            world.arm: seen.tool,
+            world.left: Pose(tuple(seen.hands.left.position), HAND_ORIENTATION),
+            world.right: Pose(tuple(seen.hands.right.position), HAND_ORIENTATION),
+        }
+        world.put(world.left, holders[world.left])
+        world.put(world.right, holders[world.right])
+        for thing, (holder, grip) in self._held.items():
+            world.put(thing, carried_by(holders[holder], grip))
+        self._holders = holders
+
+    def _take(self, thing: int, holder: int) -> None:
+        self._held[thing] = (holder, seen_from(self._holders[holder], self.world.pose(thing)))
+
+    def _watch(self, seen: Observation) -> None:
+        """Let the events happen, by nearness in the rests after the motions."""
+        world, scene = self.world, self.scene
+        script_s = self.script.clock.at(seen.time_s)[0]
+        tool = np.array(seen.tool.position)
+        first, second, third = scene.dwells
+        handover, grasp, carry = self._watches
+        if first[0] <= script_s <= first[1] and handover.see(_distance(tool, seen.hands.left.position), seen.time_s):
+            self._take(world.board, world.left)
+        if second[0] <= script_s <= second[1]:
+            if grasp.see(_distance(tool, scene.glass), seen.time_s):
+                self._take(world.glass, world.arm)
+            if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= GRASP_DISTANCE:
+                self._take(world.iron, world.right)
+            if self._held.get(world.board, (0,))[0] == world.left:
+                del self._held[world.board]
+        if third[0] <= script_s:
+            carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
+        self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
+
+    def events(self) -> Events:
+        """How the run went, so far as it went: an event that was not watched yet has an infinite distance."""
+        return Events(*(watch.event() for watch in self._watches))
+
+    def close(self) -> None:
+        """End the simulation."""
+        self.world.close()
+
+
+def _distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    return float(np.linalg.norm(np.subtract(a, b)))

@@ -1,0 +1,157 @@
+"""The soldering scene: where things lie, how long each phase lasts, and the three places taught to the service.
+
+Frame `base`: metres, z up, the arm's base plate at the origin, the table top at z = 0. The user sits at +x and faces -x, so left is -y.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from service import wire
+from service.config import path_first
+
+Point = tuple[float, float, float]
+Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
+
+TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] where the tool holds the glass, seen from the soldering place
+RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] where the right hand holds the iron, seen from the soldering place
+GRASP_DISTANCE = 0.03  # [m] within it, a thing can be taken over or is held where it is wanted
+# The tool's +z points 45° forward and down, its y axis stays level: a turn of 135° about y (x y z w).
+TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radians(67.5)))
+# Both hands point at the robot, palms down: half a turn about z.
+HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
+
+MOST_MOVED = 0.15  # [m] from the nominal place: beyond it the arm cannot reach every scene
+LOWEST = {  # [m] above the table
+    "robot_start": 0.05,
+    "handover": 0.05,
+    "glass": 0.05,
+    "soldering": 0.05,
+    "iron": 0.05,
+    "solder": 0.01,  # nobody's tool goes there
+    "left_start": 0.05,
+    "right_start": 0.05,
+}
+
+
+class SceneError(ValueError):
+    """A scene that cannot be played: names the place, what was given and what is accepted."""
+
+
+class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One soldering scene: places [m, frame `base`] and durations [s]."""
+
+    robot_start: Point = (0.45, -0.05, 0.35)
+    handover: Point = (0.62, -0.28, 0.30)
+    glass: Point = (0.50, 0.38, 0.16)  # the handle of the magnifying glass
+    soldering: Point = (0.75, 0.0, 0.06)  # where the board is soldered
+    iron: Point = (0.90, 0.42, 0.10)
+    solder: Point = (0.88, 0.22, 0.015)
+    left_start: Point = (0.98, -0.32, 0.06)
+    right_start: Point = (0.98, 0.32, 0.06)
+    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)  # board to the left hand; glass; work over the board
+    dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)  # the hands rest after each phase
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
+
+    def __post_init__(self) -> None:
+        for name, lowest in LOWEST.items():
+            given: Point = getattr(self, name)
+            nominal: Point = Scene.__struct_defaults__[Scene.__struct_fields__.index(name)]
+            moved = math.dist(given, nominal)
+            if not moved <= MOST_MOVED + 1e-9:
+                raise ValueError(
+                    f"{name}: {list(given)} lies {100 * moved:.1f} cm from the nominal {list(nominal)}; up to {100 * MOST_MOVED:.0f} cm is reachable"
+                )
+            if given[2] < lowest:
+                raise ValueError(f"{name}: {list(given)} lies {100 * given[2]:.1f} cm above the table; at least {100 * lowest:.0f} cm is needed")
+
+    @property
+    def right_final(self) -> Point:
+        """Where the right hand holds the iron at the end [m]."""
+        return _add(self.soldering, RIGHT_FROM_OBJECT)
+
+    @property
+    def carry(self) -> Point:
+        """Where the tool holds the glass over the board [m]."""
+        return _add(self.soldering, TOOL_FROM_OBJECT)
+
+    @property
+    def segments(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end of each of the three motions, in script time [s]."""
+        begin, out = 0.0, []
+        for phase, dwell in zip(self.phases_s, self.dwells_s, strict=True):
+            out.append((begin, begin + phase))
+            begin += phase + dwell
+        return tuple(out)
+
+    @property
+    def dwells(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end of the rest after each motion, in script time [s]."""
+        return tuple((end, end + dwell) for (_, end), dwell in zip(self.segments, self.dwells_s, strict=True))
+
+    @property
+    def duration_s(self) -> float:
+        """Script time from the first motion to the end of the last rest [s]."""
+        return self.dwells[-1][1]
+
+    def places(self) -> tuple[wire.ViaPoint, ...]:
+        """The three taught places, each a flat neighbourhood of 3 cm: handover, glass and soldering."""
+        s = self
+        return (
+            _place("handover", left=s.handover, right=s.right_start, tool=s.handover, follow="left"),
+            _place("glass", left=s.soldering, right=s.iron, tool=s.glass),
+            _place("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
+        )
+
+    @staticmethod
+    def load(path: Path) -> Scene:
+        """The scene in a TOML file, the nominal one where the file says nothing. Raises SceneError."""
+        try:
+            return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
+        except (OSError, UnicodeDecodeError) as error:
+            raise SceneError(f"cannot read scene {path}: {error}") from None
+        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"{path}: {error}") from None
+        except msgspec.ValidationError as error:
+            known = ", ".join(Scene.__struct_fields__)
+            hint = f"; known are {known}" if "unknown field" in str(error) else ""
+            raise SceneError(f"{path}: {path_first(error)}{hint}") from None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the request that teaches a scene's places. The exit code: 0, 1 on failure, 2 on bad usage."""
+    p = argparse.ArgumentParser(
+        prog="python -m sim.scene",
+        description="The places of a scene as a `via_points` request.",
+        epilog="example:\n  python -m sim.scene my-scene.toml | thirdhand via-points add --file -",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("scene", metavar="FILE", nargs="?", type=Path, help="TOML file with places [x, y, z] in metres; the nominal scene otherwise")
+    args = p.parse_args(arguments)
+    try:
+        scene = Scene.load(args.scene) if args.scene else Scene()
+    except SceneError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(wire.encode_json(wire.Add(scene.places())).decode())
+    return 0
+
+
+def _add(a: Point, b: Point) -> Point:
+    # Rounded to 1 µm, so that taught places read as they were meant.
+    return (round(a[0] + b[0], 6), round(a[1] + b[1], 6), round(a[2] + b[2], 6))
+
+
+def _place(name: str, *, left: Point, right: Point, tool: Point, follow: str = "none") -> wire.ViaPoint:
+    return wire.ViaPoint(name=name, left=left, right=right, tool=tool, std=0.001, radius=0.03, follow=follow)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

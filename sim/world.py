@@ -1,0 +1,169 @@
+"""The bodies around the arm in PyBullet: table, board, magnifying glass, iron, solder and two hands. Headless, one step at a time.
+
+Only the arm is dynamic, and only the table stops it. Things that are held are moved with their holder: there is no grip to tune, and contact with
+what the arm grasps would push it away by centimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import pybullet
+
+from service.arm import URDF
+from service.wire import JOINT_NAMES
+from sim.scene import HAND_ORIENTATION, Scene
+
+Vector = tuple[float, ...]
+TOOL_LINK = "tool_plate"
+ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule's own axis is z
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+BOARD_FROM_TOOL = (0.0, 0.0, 0.03)  # [m] in front of the tool plate
+GREEN, STEEL, WOOD, SKIN, BLUE = (
+    (0.1, 0.5, 0.2, 1.0),
+    (0.7, 0.7, 0.75, 1.0),
+    (0.75, 0.6, 0.4, 1.0),
+    (0.9, 0.7, 0.6, 1.0),
+    (0.2, 0.4, 0.8, 1.0),
+)
+
+
+class Pose(NamedTuple):
+    """Position [m] and quaternion x y z w."""
+
+    position: Vector
+    orientation: Vector
+
+
+class World:
+    """The simulated bench: an arm that follows joint commands, and bodies that are put where they are wanted."""
+
+    def __init__(self, scene: Scene, *, posture: Vector, rate_hz: int) -> None:
+        self._id: int = pybullet.connect(pybullet.DIRECT)
+        pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=self._id)
+        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._id)
+        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self._id)
+        self.arm: int = pybullet.loadURDF(str(URDF), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._id)
+        count = pybullet.getNumJoints(self.arm, physicsClientId=self._id)
+        joints = [pybullet.getJointInfo(self.arm, j, physicsClientId=self._id) for j in range(count)]
+        index = {info[1].decode(): info[0] for info in joints}
+        self._tool = next(info[0] for info in joints if info[12].decode() == TOOL_LINK)
+        self._joints = [index[name] for name in JOINT_NAMES]
+        self._efforts = [joints[j][10] for j in self._joints]  # [N m]
+        # With the velocity fed forward, this much of a position error is made up in one step.
+        self._position_gains, self._velocity_gains = [0.3] * len(JOINT_NAMES), [1.0] * len(JOINT_NAMES)
+        for joint, angle in zip(self._joints, posture, strict=True):
+            pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self._id)
+        self.follow(posture, (0.0,) * len(JOINT_NAMES))
+        self._furnish(scene)
+
+    def _furnish(self, scene: Scene) -> None:
+        self._box((0.45, 0.60, 0.02), (0.80, 0.0, -0.02), WOOD, solid=True)
+        for at in (scene.soldering, scene.glass, scene.iron):  # what things rest on
+            self._box((0.03, 0.03, at[2] / 2), (at[0], at[1], at[2] / 2), WOOD)
+        self.board = self._box((0.04, 0.025, 0.001), self.tool()[0].position, GREEN)
+        self.glass = self._cylinder(0.05, 0.006, scene.glass, STEEL)
+        self.iron = self._cylinder(0.008, 0.18, scene.iron, BLUE)
+        self.solder = self._cylinder(0.02, 0.03, scene.solder, STEEL)
+        self.left = self._hand(scene.left_start)
+        self.right = self._hand(scene.right_start)
+
+    def _box(self, half: Vector, at: Vector, colour: Vector, *, solid: bool = False) -> int:
+        look = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=colour, physicsClientId=self._id)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._id) if solid else -1
+        return self._body(look, shape, Pose(at, LEVEL))
+
+    def _cylinder(self, radius: float, length: float, at: Vector, colour: Vector) -> int:
+        look = pybullet.createVisualShape(pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=colour, physicsClientId=self._id)
+        return self._body(look, -1, Pose(at, LEVEL))
+
+    def _hand(self, at: Vector) -> int:
+        # A capsule from the palm back along the forearm; its shape is there to measure distances, and pushes nothing.
+        back = (-0.12, 0.0, 0.0)
+        look = pybullet.createVisualShape(
+            pybullet.GEOM_CAPSULE,
+            radius=0.04,
+            length=0.24,
+            rgbaColor=SKIN,
+            visualFramePosition=back,
+            visualFrameOrientation=ALONG_X,
+            physicsClientId=self._id,
+        )
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_CAPSULE,
+            radius=0.04,
+            height=0.24,
+            collisionFramePosition=back,
+            collisionFrameOrientation=ALONG_X,
+            physicsClientId=self._id,
+        )
+        hand = self._body(look, shape, Pose(at, HAND_ORIENTATION))
+        pybullet.setCollisionFilterGroupMask(hand, -1, 0, 0, physicsClientId=self._id)
+        return hand
+
+    def _body(self, look: int, shape: int, pose: Pose) -> int:
+        body: int = pybullet.createMultiBody(
+            baseMass=0.0,
+            baseCollisionShapeIndex=shape,
+            baseVisualShapeIndex=look,
+            basePosition=pose.position,
+            baseOrientation=pose.orientation,
+            physicsClientId=self._id,
+        )
+        return body
+
+    def follow(self, position: Vector, velocity: Vector) -> None:
+        """Set where the seven motors go: [rad] with [rad/s] fed forward."""
+        pybullet.setJointMotorControlArray(
+            self.arm,
+            self._joints,
+            pybullet.POSITION_CONTROL,
+            targetPositions=position,
+            targetVelocities=velocity,
+            forces=self._efforts,
+            positionGains=self._position_gains,
+            velocityGains=self._velocity_gains,
+            physicsClientId=self._id,
+        )
+
+    def step(self) -> None:
+        """One period of physics."""
+        pybullet.stepSimulation(physicsClientId=self._id)
+
+    def joints(self) -> tuple[Vector, Vector]:
+        """Position [rad] and velocity [rad/s] of the seven joints in chain order."""
+        states = pybullet.getJointStates(self.arm, self._joints, physicsClientId=self._id)
+        return tuple(state[0] for state in states), tuple(state[1] for state in states)
+
+    def tool(self) -> tuple[Pose, Vector]:
+        """The tool plate's pose and velocity [m/s]."""
+        state = pybullet.getLinkState(self.arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id)
+        return Pose(state[4], state[5]), state[6]
+
+    def pose(self, body: int) -> Pose:
+        """Where a body is."""
+        return Pose(*pybullet.getBasePositionAndOrientation(body, physicsClientId=self._id))
+
+    def put(self, body: int, pose: Pose) -> None:
+        """Put a body somewhere."""
+        pybullet.resetBasePositionAndOrientation(body, pose.position, pose.orientation, physicsClientId=self._id)
+
+    def clearance(self, body: int, *, within: float = 2.0) -> float:
+        """Smallest distance between the arm and a body with a shape [m]; `within` when there is more."""
+        near = pybullet.getClosestPoints(self.arm, body, within, physicsClientId=self._id)
+        return min((float(point[8]) for point in near), default=within)
+
+    def close(self) -> None:
+        """End the simulation."""
+        pybullet.disconnect(physicsClientId=self._id)
+
+
+def seen_from(holder: Pose, thing: Pose) -> Pose:
+    """The thing's pose in its holder's frame."""
+    return Pose(*pybullet.multiplyTransforms(*pybullet.invertTransform(*holder), *thing))
+
+
+def carried_by(holder: Pose, grip: Pose) -> Pose:
+    """Where a thing is whose pose in its holder's frame is `grip`."""
+    return Pose(*pybullet.multiplyTransforms(*holder, *grip))

@@ -1,0 +1,93 @@
+"""A daemon as a process, and a client's session to it, for tests that go through Zenoh."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from tests_paths import ROOT
+
+from service import wire
+from service.client import Client, open_session
+
+LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
+
+
+def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.CompletedProcess[str]:
+    """A `thirdhand` command, run to its end."""
+    command = [sys.executable, "-m", "service", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more)
+
+
+class Daemon:
+    """A running `thirdhand serve` and a client's session to it."""
+
+    def __init__(self, process: subprocess.Popen[str], endpoint: str, session: zenoh.Session) -> None:
+        self.process, self.endpoint, self.session = process, endpoint, session
+        self.client = Client(session)
+
+    def until(self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0) -> dict[str, Any]:
+        """The first status of which something is true."""
+        end = time.monotonic() + timeout_s
+        while not what(status := self.client.status()):
+            assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
+        return status
+
+    def end(self) -> int:
+        """The exit code after being asked to stop."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(30)
+
+
+@contextlib.contextmanager
+def serving(folder: Path, *arguments: str) -> Iterator[Daemon]:
+    """A daemon of its own, with its files in a folder, on a free port."""
+    config = folder / "cell.toml"
+    config.write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = {json.dumps(str(folder / "state"))}\n')
+    command = [sys.executable, "-m", "service", "serve", "--config", str(config), *arguments]
+    with (folder / "serve.log").open("a") as log, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("listening on "), (folder / "serve.log").read_text()
+            endpoint = line.split()[2]
+            with open_session(connect=[endpoint]) as session:
+                yield Daemon(process, endpoint, session)
+        finally:
+            process.kill()
+
+
+class Tracker:
+    """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not seen."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.left: tuple[float, float, float] | None = LEFT
+        self.right: tuple[float, float, float] | None = RIGHT
+        self._publishers = {side: session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")}
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self) -> None:
+        while not self._end.wait(0.01):
+            stamp_ns = time.time_ns()
+            for side, position in (("left", self.left), ("right", self.right)):
+                if position is not None:
+                    pose = wire.PoseStamped(stamp_ns, wire.BASE, position, (0.0, 0.0, 0.0, 1.0))
+                    self._publishers[side].put(wire.encode_pose(pose))
+
+    def __enter__(self) -> Tracker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()

@@ -1,0 +1,123 @@
+"""Settings: safe defaults, and errors that name the field and what is accepted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from service import config
+from service.config import Settings, SettingsError, load, parse
+
+
+def refusal(text: str) -> str:
+    """The words in which a configuration is refused."""
+    with pytest.raises(SettingsError) as caught:
+        parse(text, origin="cell.toml")
+    return str(caught.value)
+
+
+def test_an_empty_file_gives_the_defaults() -> None:
+    assert parse("", origin="cell.toml") == Settings()
+
+
+def test_the_defaults_pass_their_own_validation() -> None:
+    assert msgspec.convert(msgspec.to_builtins(Settings()), Settings) == Settings()
+
+
+def test_the_period_is_the_inverse_of_the_rate() -> None:
+    assert Settings().period_s == pytest.approx(0.002)
+    assert parse("rate_hz = 1000", origin="cell.toml").period_s == pytest.approx(0.001)
+
+
+def test_limits_may_be_lowered() -> None:
+    given = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
+    assert given.joints.velocity[6] == 0.5
+    assert given.tool.max_speed == 0.3
+
+
+@pytest.mark.parametrize("name", ["a", "bench", "lab/bench2", "a/b/c", "Wärmebank", "cell-1_x.y"])
+def test_a_cell_may_hold_slashes(name: str) -> None:
+    assert parse(f'cell = "{name}"', origin="cell.toml").cell == name
+
+
+@pytest.mark.parametrize("name", ["", "/", "a/", "/a", "a//b", "*", "a/*/b", "a/**", "a$*", "a?", "a#", "a b", r"a\n", r"a\u0000b", "..", "a/../b"])
+def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
+    assert refusal(f'cell = "{name}"').startswith("cell.toml: $.cell: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "accepted"),
+    [
+        ("rate_hz = 1001", "$.rate_hz", "<= 1000"),
+        ("rate_hz = 49", "$.rate_hz", ">= 50"),
+        ("rate_hz = 100.5", "$.rate_hz", "`int`"),
+        ("rats = 1", "rats", "rate_hz"),
+        ("[hands]\nunits = 'mm'", "$.hands", "unit"),
+        ("[hands]\nunit = 'inch'", "$.hands.unit", "mm"),
+        ("[hands]\nstale_ms = 0", "$.hands.stale_ms", "> 0"),
+        ("[hands]\nstale_ms = nan", "$.hands.stale_ms", "> 0"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0]", "$.hands.base_from_tracker", "7"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "hands.base_from_tracker", "1 needed (x y z w)"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "hands.base_from_tracker", "1 needed (x y z w)"),
+        ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "tool.plate_from_tool", "1 needed (x y z w)"),
+        ("[tool]\nmax_speed = -1", "$.tool.max_speed", "> 0"),
+        ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "joints.velocity[0]", "1.5"),
+        ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "joints.velocity[0]", "1.5"),
+        ("[joints]\njerk = [1, 1, 0, 1, 1, 1, 1]", "joints.jerk[2]", "500"),
+        ("[joints]\nlower = [-3, -1, -1, 0, -1, -1, -1]", "joints.lower[0]", "-2.6"),
+        ("[joints]\nupper = [1, 1, 1, 3.2, 1, 1, 1]", "joints.upper[3]", "3.1"),
+        ("[joints]\nupper = [-2.6, 1, 1, 3, 1, 1, 1]", "joints.lower[0]", "less than joints.upper[0] = -2.6"),
+        ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "arm.posture[5]", "-1.5707 to 1.5707 accepted"),
+        ("[arm]\nsource = 'guess'", "$.arm.source", "assumed"),
+        ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "`array`"),
+        ("[files]\nrecord = 3", "$.files.record", "`str`"),
+    ],
+)
+def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, accepted: str) -> None:
+    message = refusal(text)
+    assert message.startswith("cell.toml: ")
+    assert path in message
+    assert accepted in message.split(path, 1)[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, nan]", "hands.base_from_tracker"),
+        ("[hands]\nbase_from_tracker = [nan, 0, 0, 0, 0, 0, 1]", "hands.base_from_tracker"),
+        ("[tool]\nplate_from_tool = [inf, 0, 0, 0, 0, 0, 1]", "tool.plate_from_tool"),
+        ("[hands]\nstale_ms = inf", "hands.stale_ms"),
+        ("[arm]\nsilent_ms = inf", "arm.silent_ms"),
+        ("[tool]\nmax_speed = inf", "tool.max_speed"),
+        ("[reach]\nmin_z = nan", "reach.min_z"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused(text: str, path: str) -> None:
+    assert path in refusal(text)
+
+
+def test_a_reach_without_room_is_refused() -> None:
+    assert "reach.inner" in refusal("[reach]\ninner = 0.9\nouter = 0.5")
+
+
+def test_a_toml_error_is_told_with_its_place() -> None:
+    assert refusal("rate_hz = 500\nhands = [").startswith("cell.toml: ")
+    assert "line 2" in refusal("rate_hz = 500\nhands = = 3\n")
+
+
+def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    file = tmp_path / "cell.toml"
+    file.write_text('cell = "lab/bench2"\n[hands]\nunit = "mm"\n', encoding="utf-8")
+    assert (load(file).cell, load(file).hands.unit) == ("lab/bench2", "mm")
+    file.write_bytes(b'cell = "\xff"')
+    with pytest.raises(SettingsError, match="cannot read configuration"):
+        load(file)
+    with pytest.raises(SettingsError, match="nowhere.toml"):
+        load(tmp_path / "nowhere.toml")
+
+
+def test_the_path_comes_first_where_a_message_has_one() -> None:
+    assert config.path_first(ValueError("Expected `int` - at `$.a.b`")) == "$.a.b: Expected `int`"
+    assert config.path_first(ValueError("plain")) == "plain"

@@ -1,0 +1,125 @@
+"""Replay: the golden session and what was recorded are decided alike, bit for bit, from any state and with any number of BLAS threads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_in_process import ASSUMED, ticks_of
+
+from service.controller import Controller, run
+from service.frame import Frame, Mode, Reason, Tick
+from service.recording import Recorder, Recording
+from service.replay import replay
+from service.skill import Skill
+from sim.golden import refresh
+from sim.hands import HandScript
+from sim.scene import Scene
+
+RECORDINGS = Path(__file__).parent.parent / "recordings"
+GOLDEN = RECORDINGS / "golden.mcap"
+
+
+def command(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "service", "replay", *arguments],
+        capture_output=True, text=True, timeout=110, check=False, env=os.environ | environment, cwd=RECORDINGS.parent,
+    )  # fmt: skip
+
+
+def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked_for() -> None:
+    done = command(str(GOLDEN), OPENBLAS_NUM_THREADS="2", OMP_NUM_THREADS="2", MKL_NUM_THREADS="2")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
+
+
+def test_the_golden_session_replays_from_a_state_in_its_middle() -> None:
+    result = replay(GOLDEN, after=6000)
+    assert result.close
+    assert 3000 < result.ticks < 5000
+
+
+def test_the_golden_session_holds_what_it_is_meant_to() -> None:
+    seen = np.array([step.frame for step in Recording.open(GOLDEN).steps() if step.frame is not None])
+    reasons = {Reason(r) for r in np.unique(seen["reason"])}
+    assert {Reason.NONE, Reason.STALE_HAND, Reason.OPERATOR, Reason.FAR_FROM_DEMONSTRATIONS} <= reasons
+    assert (seen["mode"] != Mode.FAULT).all()
+    assert (seen["rejected"][-1] > 0).sum() >= 4
+    assert (np.diff(seen["tick"]) > 1).any()
+    assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 15e6
+
+
+@pytest.fixture(scope="module")
+def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short session, with states, recorded in process."""
+    path = tmp_path_factory.mktemp("recorded") / "short.mcap"
+    taught = skill.adapted(Scene().places(), tolerance=0.05)
+    controller = Controller(ASSUMED, taught)
+    with Recorder(path, settings=ASSUMED, skill=taught.to_bytes(), state=controller.state) as recorder:
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            recorder.write(tick, frame, time_ns=tick.index * 2_000_000, state=controller.state if tick.index % 250 == 0 else None)
+
+        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:1000], [keep])
+    return path
+
+
+def test_what_was_recorded_replays_identically(recorded: Path) -> None:
+    result = replay(recorded)
+    assert result.exact
+    assert result.text() == "1000 ticks, 1000 frames identical"
+
+
+def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:
+    recording = Recording.open(recorded)
+    steps = list(recording.steps())
+    path = tmp_path / "changed.mcap"
+    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
+        for tick, step in zip(list(ticks_of(HandScript(Scene(), seed=4)))[:1000], steps[1:], strict=True):
+            frame = step.frame.copy()
+            if step.tick == 600:
+                frame["joints"][2] += 1e-9
+            recorder.write(tick, frame, time_ns=step.tick * 2_000_000)
+    result = replay(path)
+    assert not result.exact
+    assert result.close
+    assert "first difference at tick 600: joints by 1e-09" in result.text()
+    assert command(str(path)).returncode == 0
+    exact = command(str(path), "--exact")
+    assert exact.returncode == 1
+    assert "first difference at tick 600" in exact.stdout
+
+
+def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Path) -> None:
+    recording = Recording.open(recorded)
+    steps = list(recording.steps())
+    ticks = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
+    path = tmp_path / "gap.mcap"
+    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
+        for tick, step in zip(ticks, steps[1:], strict=True):
+            if not 400 <= tick.index < 500:
+                recorder.write(tick, step.frame, time_ns=step.tick * 2_000_000, state=step.state, lost=100 if tick.index == 500 else 0)
+    result = replay(path)
+    assert result.exact
+    assert result.gaps == 1
+    assert result.ticks == 899
+
+
+def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "again.mcap"
+    path.write_bytes(recorded.read_bytes())
+    assert refresh(path) == {}
+    assert replay(path).exact
+
+
+def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
+    done = command(str(RECORDINGS / "demonstration-1.mcap"))
+    assert done.returncode == 1
+    assert "not a recording of thirdhand" in done.stderr
+    done = command(str(tmp_path / "missing.mcap"))
+    assert done.returncode == 1
+    assert "missing.mcap" in done.stderr
