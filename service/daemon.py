@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import signal
 import threading
@@ -43,7 +44,7 @@ class Daemon:
         self._ended = threading.Event()
         self._controller = Controller(settings, skill)
         self._frame: Frame = blank(FRAME)
-        self._frame["reason"] = Reason.ARM_NOT_READY
+        self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._realtime = False
@@ -91,6 +92,7 @@ class Daemon:
             run(self._controller, self._ticks(), (self._publish, self._hand_over), self._lap)
         finally:
             self._ended.set()
+            gc.unfreeze()  # what was kept from the collector may go
             if reporter.is_alive():
                 reporter.join(2)
             self._requests.close()
@@ -174,7 +176,7 @@ class Daemon:
             self._publishers["status"].put(payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
             self._scribe.supervise()
-            if (status.mode, status.reason) != said:
+            if status.tick >= 0 and (status.mode, status.reason) != said:
                 said = (status.mode, status.reason)
                 log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
 
@@ -236,10 +238,13 @@ def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
 def serve(settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]) -> None:
     """The daemon from start to end: SIGINT and SIGTERM ask it to stop. Raises SkillError and UnreachableError before it starts."""
     workshop = Workshop()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         daemon = Daemon(settings, load_skill(workshop, skill_path, settings), workshop=workshop, skills=skills, scribe=scribe)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in before:
             signal.signal(number, daemon.stop)
         daemon.serve(announce)
     finally:
         workshop.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)

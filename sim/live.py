@@ -21,6 +21,7 @@ from sim.hands import Array
 from sim.scene import Scene
 
 SETTLE_S = (0.5, 2.5)  # at least and at most, from the first command to the script's begin
+STOP_S = 0.5  # between the last hands and the end
 STILL_S = 0.25  # of rest is settled
 
 
@@ -210,12 +211,20 @@ def _play(bench: Bench, bridge: Bridge, live: Live, *, stop: threading.Event, re
             if bench.finished:
                 report(_report(bench, commands, hands=bridge.hands_sent - sent_before, skipped=deadlines.missed - missed_before))
                 if live.once:
+                    _let_stop(bench, bridge, deadlines)
                     return
                 say("the hands go back")
                 bench.turn_back()
                 running, ready_s = False, math.inf
         if ready_s == math.inf and bench.back:
             ready_s = now_s
+
+
+def _let_stop(bench: Bench, bridge: Bridge, deadlines: Deadlines) -> None:
+    """Without hands the service stops the arm; an arm that vanished before that would be a fault."""
+    for _ in range(round(STOP_S / bench.period_s)):
+        deadlines.wait()
+        bridge.publish_joints(bench.step(*bridge.commands.take()))
 
 
 def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int) -> Report:
