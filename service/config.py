@@ -53,7 +53,7 @@ class Arm(Section, frozen=True):
     """The arm: where its joint states come from, its posture when none come, and when following it is a fault."""
 
     source: Literal["state", "assumed"] = "state"
-    posture: Joints7 = (-0.0897, 0.1988, 0.0, 2.2545, 0.0, -0.1, 0.0)  # [rad] the null space's and the assumed one
+    posture: Joints7 = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] the null space's and the assumed one
     fault_error_rad: Positive = 0.1
     silent_ms: Positive = 100.0
 

@@ -82,7 +82,7 @@ class Smoother:
         try:
             if self._ruckig.calculate(question, path) not in (Result.Working, Result.Finished):
                 return None
-        except RuckigError:
+        except (RuckigError, ValueError):  # the latter where its result has no name
             return None
         reached = np.array(path.at_time(self._period_s))
         return reached if np.isfinite(reached).all() else None
