@@ -64,12 +64,18 @@ class Intake:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         transition, noise = self._motion(ticks)
         state["tick"] += ticks
+        means, covariances = state["filters"], state["filter_covariances"]
+        fresh = (self.is_fresh(state, 0), self.is_fresh(state, 1))
+        if all(fresh):
+            means[:] = transition @ means
+            covariances[:] = transition @ covariances @ transition.T + noise
+            return
         for side in (0, 1):
-            if self.is_fresh(state, side):
-                state["filters"][side] = transition @ state["filters"][side]
-                state["filter_covariances"][side] = transition @ state["filter_covariances"][side] @ transition.T + noise
+            if fresh[side]:
+                means[side] = transition @ means[side]
+                covariances[side] = transition @ covariances[side] @ transition.T + noise
             else:
-                state["filters"][side, 1:] = 0.0
+                means[side, 1:] = 0.0
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""

@@ -36,8 +36,8 @@ def demonstrated(count: int, *, late: int = 0) -> list[Demonstrated]:
 
 
 def quickly(taught: Sequence[Demonstrated]) -> Skill:
-    """A coarse skill, learned in half a second."""
-    return learn(taught, name="coarse", components=6, points=80)
+    """A coarse skill of two demonstrations, learned in no time."""
+    return learn(taught, name="coarse", components=5, points=60)
 
 
 def error_m(skill: Skill, held_out: Sequence[Demonstrated]) -> float:
@@ -58,13 +58,18 @@ def with_hands(place: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> V
 
 @pytest.fixture(scope="module")
 def taught() -> list[Demonstrated]:
-    """Six demonstrations to learn from and three to hold out."""
-    return demonstrated(9)
+    """Four demonstrations to learn from and three to hold out."""
+    return demonstrated(7)
 
 
 @pytest.fixture(scope="module")
 def learned(taught: list[Demonstrated]) -> Skill:
-    return learn(taught[:6], name="soldering")
+    return learn(taught[:4], name="soldering")
+
+
+@pytest.fixture(scope="module")
+def coarse(taught: list[Demonstrated]) -> Skill:
+    return quickly(taught[:2])
 
 
 @pytest.fixture(scope="module")
@@ -76,25 +81,21 @@ def adapted(learned: Skill) -> Skill:
 
 
 def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(learned: Skill, taught: list[Demonstrated]) -> None:
-    assert error_m(learned, taught[6:]) < 0.035
+    assert error_m(learned, taught[4:]) < 0.035
 
 
-def test_learning_is_deterministic(taught: list[Demonstrated]) -> None:
-    assert quickly(taught[:2]).to_bytes() == quickly(taught[:2]).to_bytes()
+def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstrated]) -> None:
+    assert quickly(taught[:2]).to_bytes() == coarse.to_bytes()
 
 
-def test_what_a_skill_was_learned_from_can_be_told(learned: Skill, taught: list[Demonstrated]) -> None:
-    assert learned.learned_from != quickly(taught[:2]).learned_from
-    assert quickly(taught[:2]).learned_from == quickly(taught[:2]).learned_from
-
-
-def test_a_tool_that_lags_is_put_in_phase(taught: list[Demonstrated]) -> None:
-    prompt, late = quickly(taught[:2]), quickly(demonstrated(2, late=LATE))
-    assert error_m(late, taught[6:]) < error_m(prompt, taught[6:]) + 0.002
+def test_a_tool_that_lags_is_put_in_phase(coarse: Skill, taught: list[Demonstrated]) -> None:
+    late = quickly(demonstrated(2, late=LATE))
+    assert error_m(late, taught[4:]) < error_m(coarse, taught[4:]) + 0.006
+    assert late.learned_from != coarse.learned_from
 
 
 def test_the_box_holds_the_demonstrated_tool_with_a_margin(learned: Skill, taught: list[Demonstrated]) -> None:
-    tool = np.concatenate([one.tool[:, :3] for one in taught[:6]])
+    tool = np.concatenate([one.tool[:, :3] for one in taught[:4]])
     np.testing.assert_allclose(learned.box, [tool.min(axis=0) - 0.25, tool.max(axis=0) + 0.25])
     far = np.array([9.0, 0.0, -9.0])
     np.testing.assert_array_equal(learned.clamp(far), [learned.box[1, 0], 0.0, learned.box[0, 2]])
@@ -166,7 +167,7 @@ def test_hands_at_rest_ask_for_no_motion(adapted: Skill) -> None:
 
 def test_a_prediction_is_rounded_and_its_covariance_is_one(learned: Skill, taught: list[Demonstrated]) -> None:
     random = np.random.default_rng(2)
-    prediction = learned.predict(taught[7].hands[300].reshape(2, 3), random.normal(size=(2, 3)), random.normal(size=(2, 3)))
+    prediction = learned.predict(taught[5].hands[300].reshape(2, 3), random.normal(size=(2, 3)), random.normal(size=(2, 3)))
     for value in prediction[:3]:
         np.testing.assert_array_equal(value, np.round(value, 6))
     np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)
@@ -225,7 +226,7 @@ def test_a_trip_through_a_file_changes_no_bit(learned: Skill, places: tuple[ViaP
     assert back.to_bytes() == sent.to_bytes()
     assert back.digest == sent.digest
     assert (back.name, back.places, back.tolerance, back.threshold) == (sent.name, sent.places, 0.04, sent.threshold)
-    queries = taught[8].hands[::50]
+    queries = taught[6].hands[::50]
     for one, other in zip(
         (sent.primitive.mean(queries), sent.primitive.predict(queries).covariance, sent.primitive.jacobian(queries[3])),
         (back.primitive.mean(queries), back.primitive.predict(queries).covariance, back.primitive.jacobian(queries[3])),
