@@ -55,8 +55,8 @@ class GaussianMixture:
         if len(data) < components:
             raise ValueError(f"{len(data)} samples given for {components} components: give at least {components} samples, or fewer components.")
         # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
-        from sklearn.mixture import GaussianMixture as Estimator  # noqa: PLC0415
-        from threadpoolctl import threadpool_limits  # noqa: PLC0415
+        from sklearn.mixture import GaussianMixture as Estimator
+        from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
             found = Estimator(

@@ -65,10 +65,11 @@ class Smoother:
             wanted_velocity.append(float(velocity[i]) + approach)
         speed = math.hypot(*wanted_velocity)
         slow_down = min(1.0, SPEED_SHARE * self._max_speed / speed) if speed > 0 else 1.0
-        limited = slow_down < 1.0
+        limited = slowed = slow_down < 1.0
         ahead = []
         for i in range(3):
-            asked = float(acceleration[i]) + w * (slow_down * wanted_velocity[i] - v[i])
+            # at the speed limit what the target does beyond it is not followed
+            asked = (0.0 if slowed else float(acceleration[i])) + w * (slow_down * wanted_velocity[i] - v[i])
             wanted_acceleration = min(push, max(-push, asked))
             limited |= wanted_acceleration != asked
             u = min(jerk, max(-jerk, 3 * w * (wanted_acceleration - a[i])))
