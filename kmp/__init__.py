@@ -12,13 +12,16 @@ from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel, VelocityKernel
 from kmp.primitive import KMP, Uncertainty
+from kmp.references import Frame, LocalKMP, superposed
 from kmp.storage import Stored, load, save
 
 __all__ = [
     "KMP",
+    "Frame",
     "GaussianKernel",
     "GaussianMixture",
     "Gaussians",
+    "LocalKMP",
     "RankReached",
     "Stored",
     "Uncertainty",
@@ -26,4 +29,5 @@ __all__ = [
     "ViaPointMissed",
     "load",
     "save",
+    "superposed",
 ]
