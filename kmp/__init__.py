@@ -11,6 +11,7 @@ from kmp.checks import RankReached, ViaPointMissed
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel, VelocityKernel
+from kmp.orientation import OrientationKMP
 from kmp.primitive import KMP, Uncertainty
 from kmp.references import Frame, LocalKMP, superposed
 from kmp.storage import Stored, load, save
@@ -22,6 +23,7 @@ __all__ = [
     "GaussianMixture",
     "Gaussians",
     "LocalKMP",
+    "OrientationKMP",
     "RankReached",
     "Stored",
     "Uncertainty",
