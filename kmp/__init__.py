@@ -8,6 +8,7 @@ parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, 
 """
 
 from kmp.checks import RankReached, ViaPointMissed
+from kmp.correlation import Correlation, Improvement, improve
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel, VelocityKernel
@@ -18,10 +19,12 @@ from kmp.storage import Stored, load, save
 
 __all__ = [
     "KMP",
+    "Correlation",
     "Frame",
     "GaussianKernel",
     "GaussianMixture",
     "Gaussians",
+    "Improvement",
     "LocalKMP",
     "OrientationKMP",
     "RankReached",
@@ -29,6 +32,7 @@ __all__ = [
     "Uncertainty",
     "VelocityKernel",
     "ViaPointMissed",
+    "improve",
     "load",
     "save",
     "superposed",
