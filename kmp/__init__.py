@@ -15,6 +15,7 @@ from kmp.kernel import GaussianKernel, VelocityKernel
 from kmp.orientation import OrientationKMP
 from kmp.primitive import KMP, Uncertainty
 from kmp.references import Frame, LocalKMP, superposed
+from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 
 __all__ = [
@@ -25,14 +26,17 @@ __all__ = [
     "GaussianMixture",
     "Gaussians",
     "Improvement",
+    "Learned",
     "LocalKMP",
     "OrientationKMP",
     "RankReached",
+    "Score",
     "Stored",
     "Uncertainty",
     "VelocityKernel",
     "ViaPointMissed",
     "improve",
+    "learn",
     "load",
     "save",
     "superposed",
