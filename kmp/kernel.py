@@ -123,13 +123,17 @@ class GaussianKernel:
         """k(s, s_n): (N, I) -> (N,)."""
         if self._stretch is not None:
             offsets = offsets * self._stretch
-        return np.asarray(np.exp(-self._scalar * np.vecdot(offsets, offsets)))
+        value = np.vecdot(offsets, offsets)
+        value *= -self._scalar
+        return np.exp(value, value)
 
     row_at = value_at
 
     def slope_at(self, offsets: Array) -> Array:
         """What each offset is multiplied by to give dk(s, s_n)/ds, but for ell if that is an array: (N, I) -> (N,)."""
-        return np.asarray(-2 * self._scalar * self.value_at(offsets))
+        value = self.value_at(offsets)
+        value *= -2 * self._scalar
+        return value
 
     def curvature_at(self, offsets: Array, direction: Array) -> Array:
         """d^2 k(s + t v, s_n)/dt^2 at t = 0 along the direction v: (N, I), (I,) -> (N,)."""

@@ -119,7 +119,7 @@ class KMP:
         """xi(s) at queries (M, I): (M, O). Equation (8). One query alone may differ by rounding from it in a set."""
         s = self._checked(queries)
         if len(s) == 1:
-            return self._mean_of(self.kernel.row_at(s - self.solution.centres))
+            return self._mean_of(self.kernel.row_at(s - self._centres))
         return (self.kernel(s, self.solution.centres) @ self._weights).reshape(len(s), self.outputs) + self.problem.prior_mean
 
     def predict(self, queries: ArrayLike) -> Gaussians:
@@ -131,7 +131,7 @@ class KMP:
         s = self._checked(queries)
         solution = self.solution
         if len(s) == 1:
-            row = self.kernel.row_at(s - solution.centres)
+            row = self.kernel.row_at(s - self._centres)
             mean = self._mean_of(row)
             unexplained = solution.unexplained_one(row)[None]
         else:
@@ -158,7 +158,7 @@ class KMP:
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs]. Equation (8), derived."""
-        offsets = self._checked_one("query", query) - self.solution.centres
+        offsets = self._checked_one("query", query) - self._centres
         return self.kernel.jacobian_of(offsets, self._weight_rows)
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
@@ -166,7 +166,7 @@ class KMP:
 
         Where v is the velocity of the input, this is the part of the output's acceleration that the velocity makes.
         """
-        offsets = self._checked_one("query", query) - self.solution.centres
+        offsets = self._checked_one("query", query) - self._centres
         return self.kernel.curvature_of(offsets, self._checked_one("direction", direction), self._weights)
 
     def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> KMP:
@@ -286,6 +286,14 @@ class KMP:
         return error_bound(self.solution, self.inputs, self.reference, self.reference.mean - self.mean(self.inputs))
 
     @cached_property
+    def _prior(self) -> Array:
+        return self.problem.prior_mean
+
+    @cached_property
+    def _centres(self) -> Array:
+        return self.solution.centres
+
+    @cached_property
     def _weights(self) -> Array:
         return self.solution.weights.reshape(-1, self.outputs // self.kernel.channels)
 
@@ -298,7 +306,7 @@ class KMP:
         centres = self.solution.centres
         return Features.of(self.kernel, centres, rank=len(centres), tolerance=_LEFT)[0]
 
-    @property
+    @cached_property
     def _dimensions(self) -> int:
         return int(self.own_inputs.shape[1])
 
@@ -333,7 +341,7 @@ class KMP:
         return KMP(self.kernel, self.problem, own, via_points, frozen(replaced), origin=self, solution=solution)
 
     def _mean_of(self, row: Array) -> Array:
-        return (row @ self._weights).reshape(1, -1) + self.problem.prior_mean
+        return np.asarray((row @ self._weights).ravel() + self._prior)[None]
 
     def _checked(self, queries: ArrayLike) -> Array:
         s = np.asarray(queries, dtype=np.float64)
