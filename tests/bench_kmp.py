@@ -9,6 +9,7 @@ needs there and then for the work that cannot be avoided. The multiples leave a 
 import resource
 import time
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def mixture():
     for _ in range(5):
         places = PLACES + 0.008 * random.normal(size=PLACES.shape)
         u = np.linspace(0, 1, 333)[:, None]
-        ways = [a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5) for a, b in zip(places, places[1:], strict=False)]
+        ways = [a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5) for a, b in pairwise(places)]
         demonstrations.append(np.concatenate(ways) + 0.001 * random.normal(size=(999, I + O)))
     return GaussianMixture.fit(np.concatenate(demonstrations), components=10, seed=0)
 
