@@ -125,7 +125,7 @@ class GaussianKernel:
             offsets = offsets * self._stretch
         value = np.vecdot(offsets, offsets)
         value *= -self._scalar
-        return np.exp(value, value)
+        return np.asarray(np.exp(value, value))
 
     row_at = value_at
 

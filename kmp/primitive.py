@@ -29,6 +29,7 @@ _SMALL = 1500  # N O up to which the dense solution is the faster one
 _LARGE = 6000  # N O beyond which the dense solution takes seconds and 300 MB
 _RANK = 400
 _TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
+_ROUNDING = 1e-12  # share that rounding may leave, whatever was asked for
 _LEFT = 1e-10  # the same, for the uncertainty that is distance from the data
 
 
@@ -101,7 +102,8 @@ class KMP:
         if representation == "dense" or (representation == "auto" and size <= _SMALL):
             return cls.of_base(s, reference, problem, Dense(kernel, problem, s, reference).solved())
         features, left = Features.of(kernel, s, rank=rank, tolerance=rank_tolerance)
-        enough = left <= rank_tolerance or len(features.pivots) < rank
+        reached = len(features.pivots) >= rank
+        enough = left <= max(rank_tolerance if reached else 100 * rank_tolerance, _ROUNDING)
         if representation == "auto" and not enough and size <= _LARGE:
             return cls.of_base(s, reference, problem, Dense(kernel, problem, s, reference).solved())
         self = cls.of_base(s, reference, problem, LowRank.fit(features, problem, s, reference).solved())
@@ -120,7 +122,10 @@ class KMP:
         s = self._checked(queries)
         if len(s) == 1:
             return self._mean_of(self.kernel.row_at(s - self._centres))
-        return (self.kernel(s, self.solution.centres) @ self._weights).reshape(len(s), self.outputs) + self.problem.prior_mean
+        mean = (self.kernel(s, self._centres) @ self._weights).reshape(len(s), self.outputs) + self._prior
+        for n in np.flatnonzero(np.isnan(mean[:, 0]))[:1]:
+            raise ValueError(f"queries[{n}]: {s[n]} given, and every number must be finite.")
+        return mean
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals. The mean is that of `mean`, bit for bit.
@@ -159,7 +164,7 @@ class KMP:
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs]. Equation (8), derived."""
         offsets = self._checked_one("query", query) - self._centres
-        return self.kernel.jacobian_of(offsets, self._weight_rows)
+        return _finite(self.kernel.jacobian_of(offsets, self._weight_rows))
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,), direction v (I,): (O,). Equation (8), derived twice.
@@ -283,7 +288,8 @@ class KMP:
         """
         if isinstance(self.solution, Dense):
             return 0.0
-        return error_bound(self.solution, self.inputs, self.reference, self.reference.mean - self.mean(self.inputs))
+        mean = self.mean(self.inputs)
+        return error_bound(self.solution, self.inputs, self.reference, mean, lambda_mean=self.problem.lambda_mean)
 
     @cached_property
     def _prior(self) -> Array:
@@ -341,7 +347,7 @@ class KMP:
         return KMP(self.kernel, self.problem, own, via_points, frozen(replaced), origin=self, solution=solution)
 
     def _mean_of(self, row: Array) -> Array:
-        return np.asarray((row @ self._weights).ravel() + self._prior)[None]
+        return _finite(((row @ self._weights).ravel() + self._prior)[None])
 
     def _checked(self, queries: ArrayLike) -> Array:
         s = np.asarray(queries, dtype=np.float64)
@@ -357,6 +363,13 @@ class KMP:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(unpickled(state))
+
+
+def _finite(found: Array) -> Array:
+    # Quicker than a look at each number of the query.
+    if found[0, 0] != found[0, 0]:
+        raise ValueError("The query holds a number that is not finite, and every number must be finite.")
+    return found
 
 
 def _changed(base: KMP, replaced: NDArray[np.intp], inputs: Array, points: Gaussians) -> tuple[Array, Gaussians]:

@@ -111,8 +111,8 @@ def test_fit_200(benchmark, mixture):
     call = lambda: KMP.fit(*data, kernel=GaussianKernel(0.5), lambda_mean=2.0)  # noqa: E731
     benchmark(call)
     a = np.eye(600) * 600 + np.random.default_rng(0).random((600, 600))
-    unit = best(lambda: lapack.dpotrf(a + a.T, lower=1), rounds=20)
-    report(benchmark, best(call, rounds=20), unit, 4, "dpotrf(600 x 600)")
+    unit = best(lambda: lapack.dpotrf(a + a.T, lower=1), rounds=50)
+    report(benchmark, best(call, rounds=50), unit, 3, "dpotrf(600 x 600)")
 
 
 def test_mean_of_one_query_200(benchmark, small):
@@ -142,7 +142,7 @@ def test_adapt_200(benchmark, small):
     a = np.asfortranarray(small.solution._factor)
     b = np.zeros((600, 600), order="F")
     unit = best(lambda: np.copyto(b, a), rounds=20, calls=20)
-    report(benchmark, best(call, rounds=20), unit, 12, "a copy of the factor")
+    report(benchmark, best(call, rounds=200), unit, 16, "a copy of the factor")
 
 
 def test_fit_100_000(benchmark, large):

@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -88,6 +89,58 @@ def test_so_many_changes_that_all_points_go_are_solved_anew():
     dense, low = (one.adapt(inputs, desired, tolerance=0.5) for one in (dense, low))
     assert len(low.replaced) > 50
     agree(dense, low, dense.inputs[:10], within=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
+@properties
+@given(seeds, st.sampled_from([0.0, 0.2]))
+def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
+    low = both(seed, count=200)[1]
+    inputs, desired = points(seed, 4, std=0.01)
+    order = np.random.default_rng(seed).permutation(4)
+    together = low.adapt(inputs, desired, tolerance=tolerance)
+    shuffled = low.adapt(inputs[order], desired.take(order), tolerance=tolerance)
+    singly = low
+    for n in range(4):
+        singly = singly.adapt(inputs[n : n + 1], desired.take(slice(n, n + 1)), tolerance=tolerance)
+    queries = tube(seed + 3, 5)[0]
+    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-8)
+    np.testing.assert_allclose(shuffled.predict(queries).covariance, together.predict(queries).covariance, atol=1e-8)
+    assert np.array_equal(singly.mean(queries), together.mean(queries))
+    assert low.adapt(inputs[:0], desired.take(slice(0, 0)), tolerance=1) is low
+    assert together.base is low
+
+
+@properties
+@given(seeds)
+def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed):
+    inputs, reference = tube(seed, 60)
+    exact = Gaussians(reference.mean, np.tile(1e-12 * np.eye(3), (60, 1, 1)))
+    low = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation="low_rank")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)
+        adapted = low.adapt(inputs[:3] + 0.01, exact.take(slice(0, 3)), tolerance=0.1)
+    for one in (low, adapted):
+        for covariance in (one.predict(inputs).covariance, one.predict(inputs[:1]).covariance):
+            assert np.array_equal(covariance, covariance.swapaxes(1, 2))
+            assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_threads_may_share_it():
+    low, queries = both(0)[1].adapt(*points(1, 1), tolerance=0.1), tube(2, 64)[0][:, None]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(low.predict, queries))
+    fresh = both(0)[1].adapt(*points(1, 1), tolerance=0.1)
+    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(found, queries, strict=True))
+
+
+def test_a_tolerance_below_rounding_is_served_as_well_as_rounding_allows():
+    inputs, reference = tube(0, 200)
+    dense, low = (
+        KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=r, rank_tolerance=1e-18)
+        for r in ("dense", "low_rank")
+    )
+    agree(dense, low, inputs[:20])
 
 
 def test_more_via_points_than_points():
