@@ -6,6 +6,7 @@ points there are. What the features leave of the kernel is kept where it counts:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,6 +22,7 @@ from kmp.problem import Problem
 from kmp.whitener import Whitener
 
 _BLOCK = 8192  # rows at once, which bounds the memory
+_KEPT = 50_000_000  # numbers of features that are kept during a fit: 400 MB; more are made again for each pass
 _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
@@ -47,18 +49,22 @@ class LowRank:
         r, c, o = len(features.pivots), features.kernel.channels, reference.outputs
         d = o // c
         blocks = [slice(i, i + _BLOCK) for i in range(0, len(inputs), _BLOCK)]
-        z = [features(inputs[block]).T.reshape(-1, c, r) for block in blocks]
+
+        def lifted() -> Iterator[Array]:
+            return (features(inputs[block]).T.reshape(-1, c, r) for block in blocks)
+
+        kept = list(lifted()) if len(inputs) * c * r <= _KEPT else None
         precision = [np.asarray(np.linalg.inv(reference.covariance[block]), dtype=np.float64) for block in blocks]
         y = [reference.mean[block] - problem.prior_mean for block in blocks]
         total = np.zeros((r, d, r, d))
-        for zb, sb in zip(z, precision, strict=True):
+        for zb, sb in zip(kept or lifted(), precision, strict=True):
             _add_information(total, zb, sb)
         information = frozen(total.reshape(r * d, r * d))
         self = cls(problem, features, information, frozen(np.zeros((r, d))))
         w, factor = np.zeros((r, d)), self.factor(problem.lambda_mean)
         for _ in range(1 + _REFINEMENTS):
             pull = -problem.lambda_mean * w
-            for zb, sb, yb in zip(z, precision, y, strict=True):
+            for zb, sb, yb in zip(kept or lifted(), precision, y, strict=True):
                 miss = yb - (zb @ w).reshape(-1, o)
                 pull += np.tensordot(zb, (sb @ miss[:, :, None]).reshape(-1, c, d), axes=([0, 1], [0, 1]))
             w = w + lapack.dpotrs(factor, pull.ravel(), lower=1)[0].reshape(r, d)

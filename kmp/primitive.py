@@ -24,6 +24,8 @@ from kmp.low_rank import Conditioned, LowRank
 from kmp.problem import Problem
 
 _BATCH = 256  # queries at once, which bounds the memory of `predict`
+_DISTANCES = 10_000_000  # from via-points to the base's points, at once
+_ROWS = 8192  # reference points at once
 _MACHINE = float(np.finfo(np.float64).eps)
 _SMALL = 1500  # N O up to which the dense solution is the faster one
 _LARGE = 6000  # N O beyond which the dense solution takes seconds and 300 MB
@@ -191,10 +193,13 @@ class KMP:
         if len(via) == 0:
             return self
         base = self.base
-        distance = cdist(via, base.inputs)  # (V, N of the base)
-        nearest = distance.min(axis=1, keepdims=True)
-        claimed = ((distance == nearest) & (nearest < tolerance)).any(axis=0)
+        claimed = np.zeros(len(base.inputs), dtype=bool)
         claimed[self.replaced] = True
+        step = max(1, _DISTANCES // len(claimed))
+        for i in range(0, len(via), step):
+            distance = cdist(via[i : i + step], base.inputs)  # (V, N of the base)
+            nearest = distance.min(axis=1, keepdims=True)
+            claimed |= ((distance == nearest) & (nearest < tolerance)).any(axis=0)
         adapted = base.changed(
             np.flatnonzero(claimed),
             np.concatenate([self.via_inputs, via]),
@@ -288,7 +293,7 @@ class KMP:
         """
         if isinstance(self.solution, Dense):
             return 0.0
-        mean = self.mean(self.inputs)
+        mean = np.concatenate([self.mean(self.inputs[i : i + _ROWS]) for i in range(0, self._count, _ROWS)])
         return error_bound(self.solution, self.inputs, self.reference, mean, lambda_mean=self.problem.lambda_mean)
 
     @cached_property

@@ -152,6 +152,15 @@ def test_more_via_points_than_points():
     agree(dense, low, inputs[:10], within=1e-5)
 
 
+def test_what_is_too_much_to_keep_is_made_again_and_gives_the_same(monkeypatch):
+    before = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
+    monkeypatch.setattr("kmp.low_rank._KEPT", 0)
+    monkeypatch.setattr("kmp.primitive._DISTANCES", 1)
+    after = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
+    assert np.array_equal(before.replaced, after.replaced)
+    assert np.array_equal(before.weights, after.weights)
+
+
 def test_one_point_alone():
     one = KMP.fit([[1.0]], Gaussians([[2.0]], [[[0.5]]]), kernel=kernel, lambda_mean=1, representation="low_rank")
     np.testing.assert_allclose(one.mean([[1.0]]), 2 / 1.5)
