@@ -15,6 +15,8 @@ from kmp.kernel import Kernel, spread
 from kmp.problem import Problem
 from kmp.whitener import Whitener
 
+_COLUMNS = 64  # of a factor, copied at once
+
 
 @dataclass(frozen=True, eq=False)
 class Dense:
@@ -97,7 +99,8 @@ class Dense:
         factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
         corner = rows[:, p:]
         if base_factor is not None and p > 0:
-            factor[:p, :p] = base_factor[:p, :p]
+            for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
+                factor[a:p, a : min(a + _COLUMNS, p)] = base_factor[a:p, a : min(a + _COLUMNS, p)]
             left, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
             factor[p:, :p] = left.T
             corner = corner - left.T @ left
