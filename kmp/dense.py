@@ -96,15 +96,15 @@ class Dense:
         blocks = new.reshape(changed, o, count, o)
         blocks[points, :, points + same, :] += penalty * self.reference.covariance[same:]
         rows = blocks.reshape(n - p, n)
-        factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
-        corner = rows[:, p:]
-        if base_factor is not None and p > 0:
+        if base_factor is None or p == 0:  # in place: symmetric, so that the transpose is as LAPACK reads it
+            factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
+        else:
+            factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
             for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
                 factor[a:p, a : min(a + _COLUMNS, p)] = base_factor[a:p, a : min(a + _COLUMNS, p)]
             left, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
             factor[p:, :p] = left.T
-            corner = corner - left.T @ left
-        factor[p:, p:], info = lapack.dpotrf(corner, lower=1, clean=1)
+            factor[p:, p:], info = lapack.dpotrf(rows[:, p:] - left.T @ left, lower=1, clean=1)
         if info:
             raise ValueError(
                 f"K + lambda Sigma is not positive definite to working precision at point {same + (info - 1) // o}, "
