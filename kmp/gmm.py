@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, frozen, numbers, positive
+from kmp.checks import Array, frozen, numbers, positive, unpickled
 from kmp.gaussians import Gaussians
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
@@ -38,8 +38,7 @@ class GaussianMixture:
         object.__setattr__(self, "covariances", components.covariance)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Unpickled arrays come back writeable.
-        self.__dict__.update({name: frozen(array) for name, array in state.items()})
+        self.__dict__.update(unpickled(state))
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:

@@ -6,6 +6,7 @@ import hashlib
 import io
 import math
 import pickle
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.config import ExplainedError
 from service.frame import Vector
 from service.wire import TaughtPoint, ViaPoint
@@ -83,7 +84,9 @@ class Skill:
         try:
             inputs, outputs, deviations = _points(places)
             desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
-            primitive = self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ViaPointMissed)  # `taught` tells by how much
+                primitive = self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
         except ValueError as error:
             raise SkillError(f"cannot adapt to {[p.name for p in places]}: {error}") from None
         return replace(self, primitive=primitive, places=tuple(places), tolerance=tolerance, known=b"")
