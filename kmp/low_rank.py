@@ -256,7 +256,9 @@ class Conditioned:
 
     @staticmethod
     def _solve(system: tuple[Array, Array], right: Array) -> Array:
-        return np.asarray(lapack.dgetrs(*system, right)[0])
+        lu, pivots = system
+        # SciPy counts the pivots it is given from one while it solves, which threads that share them would see.
+        return np.asarray(lapack.dgetrs(lu, pivots.copy(), right)[0])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(unpickled(state))

@@ -84,7 +84,10 @@ def play(args: argparse.Namespace) -> int:
 
     if not 0.01 <= args.speed <= 100:
         raise UsageError(f"--speed {args.speed}: 0.01 to 100 accepted")
-    hands = list(iter_hands(args.file))
+    try:
+        hands = [(time_ns, side, wire.decode_pose(payload)) for time_ns, side, payload in iter_hands(args.file)]
+    except wire.WireError as error:
+        raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
     start_ns, last_ns = hands[0][0], hands[-1][0]
     with open_session(connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S) as session:
         publishers = {side: session.declare_publisher(wire.key(args.cell, f"hands/{side}")) for side in ("left", "right")}
@@ -96,12 +99,14 @@ def play(args: argparse.Namespace) -> int:
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
         while True:
             begin = time.monotonic()
-            for time_ns, side, payload in hands:
+            for time_ns, side, pose in hands:
                 early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()
                 if early > 0:
                     time.sleep(early)
                 # a tracker stamps what it sees now
-                publishers[side].put(wire.encode_pose(wire.decode_pose(payload)._replace(stamp_ns=time.time_ns())))
+                publishers[side].put(wire.encode_pose(pose._replace(stamp_ns=time.time_ns())))
+            if not all(publisher.matching_status for publisher in publishers.values()):
+                raise UnreachableError("the daemon stopped listening")
             if not args.loop:
                 return 0
 
@@ -183,6 +188,8 @@ def status(args: argparse.Namespace) -> int:
         "hands": ", ".join(f"{side} {age:.0f} ms old" for side, age in now["hand_age_ms"].items()) or "none seen",
         "rejected": ", ".join(f"{count} {cause}" for cause, count in now["rejected"].items()) or "none",
         "recording": now["scribe"].get("recording") or "none",
+        **({"lost": f"{now['scribe']['lost']} ticks are not recorded"} if now["scribe"].get("lost") else {}),
+        **({"trouble": "; ".join(now["scribe"]["errors"])} if now["scribe"].get("errors") else {}),
     }
     for name in ("lateness_us", "work_us", "latency_ms"):
         label, unit = name.rsplit("_", 1)
@@ -202,6 +209,10 @@ resume = reset = hold
 
 
 def _ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
+    try:
+        converted({"cell": args.cell}, origin="--cell")
+    except SettingsError as error:
+        raise UsageError(str(error)) from None
     with open_session(connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S) as session:
         return Client(session, args.cell).ask(suffix, request)
 

@@ -148,13 +148,13 @@ class Controller:
             return None
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:
-            if heard:
+            if heard and not self._is_moving():  # what still moves comes to rest first
                 state["arm_ready"], state["slow_tick"] = 1, state["tick"]
                 state["joints"] = (state["measured"], np.zeros(7), np.zeros(7))
                 state["setpoint"] = self._at_rest()
             return None
         if not heard:
-            if state["mode"] == Mode.FOLLOW or state["joints"][1].any():
+            if state["mode"] == Mode.FOLLOW or self._is_moving():
                 return Reason.ARM_SILENT
             state["arm_ready"] = 0
             return None
@@ -184,6 +184,10 @@ class Controller:
         position, velocity, acceleration, clamped = self._arm.clamp(boxed, prediction.velocity * inside, prediction.acceleration * inside)
         return Target(position, velocity, acceleration, bool(clamped or not inside.all()))
 
+    def _is_moving(self) -> bool:
+        """Whether the commanded joints have not come to rest."""
+        return bool(self._state["joints"][1:].any())
+
     def _at_rest(self) -> Vector:
         """The setpoint (3, 3) that goes with the commanded joints."""
         joints, velocities = self._state["joints"][:2]
@@ -206,7 +210,7 @@ class Controller:
         frame["joints"], frame["joint_velocities"], frame["joint_accelerations"] = state["joints"]
         frame["tool"] = self._arm.pose(state["joints"][0])[0]
         frame["mode"], frame["reason"], frame["flags"] = state["mode"], state["reason"], flags
-        frame["commanded"] = state["arm_ready"] and not (state["mode"] == Mode.FAULT and not state["joints"][1].any())
+        frame["commanded"] = self._is_moving() or (state["arm_ready"] and state["mode"] != Mode.FAULT)
         frame["rejected"] = state["rejected"]
         return frozen(frame)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import signal
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +32,7 @@ log = logging.getLogger("thirdhand")
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 DECIMATION = 5  # ticks to one tool/target and one tool/setpoint
 STOP_TIMEOUT_S = 3.0
+LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
 DECODERS = {"hands/left": wire.decode_pose, "hands/right": wire.decode_pose, "joints/state": wire.decode_joints}
 
 
@@ -48,6 +50,7 @@ class Daemon:
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._realtime = False
+        self._status: wire.Status | None = None
         self._late_ns = self._began_ns = 0
         self._laps: list[tuple[str, int]] = []
         self._session = open_session(connect=settings.network.connect, listen=settings.network.listen)
@@ -158,9 +161,11 @@ class Daemon:
         for stage, at in self._laps:
             timing["stages_us"][STAGES.index(stage)] = (at - before) / 1e3
             before = at
-        if any(event.kind[:5] == "hands" for event in tick.inbox):
-            timing["latency_us"] = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e3
-            self._latency.add(float(timing["latency_us"]) / 1e3)
+        if (frame["hand_ages"] == 0).any():
+            latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
+            if 0 <= latency_ms < LONGEST_LATENCY_MS:
+                timing["latency_us"] = latency_ms * 1e3
+                self._latency.add(latency_ms)
         timing["work_us"] = (time.perf_counter_ns() - self._began_ns) / 1e3
         self._lateness.add(self._late_ns / 1e3)
         self._work.add(float(timing["work_us"]))
@@ -168,20 +173,29 @@ class Daemon:
 
     # --- beside the loop ---
 
+    def status(self) -> wire.Status:
+        """What is, at most a tenth of a second ago."""
+        return self._status or self._survey()
+
     def _report(self) -> None:
         """Publishes the status, says what changed, and keeps the scribe alive, ten times a second."""
         said: tuple[str, str] | None = None
+        told: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
-            status = self.status()
+            status = self._status = self._survey()
             payload = wire.encode_json(status)
             self._publishers["status"].put(payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
             self._scribe.supervise()
+            for error in status.scribe["errors"]:
+                if error not in told:
+                    told.append(error)
+                    log.warning("%s", error)
             if status.tick >= 0 and (status.mode, status.reason) != said:
                 said = (status.mode, status.reason)
                 log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
 
-    def status(self) -> wire.Status:
+    def _survey(self) -> wire.Status:
         """What is, now."""
         frame, clock = self._frame, self._clock
         reason = Reason(int(frame["reason"]))
@@ -231,7 +245,10 @@ def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
     try:
         saved = PlacesFile(settings).read(skill)
     except SkillError as error:
-        log.warning("%s", error)
+        path = PlacesFile(settings).path
+        with contextlib.suppress(OSError):
+            path.replace(path.with_suffix(".damaged"))
+        log.warning("%s; it is kept as %s, and no places are in force", error, path.with_suffix(".damaged"))
         return skill
     return workshop.adapt(skill, saved[0], tolerance=saved[1]) if saved and saved[0] != skill.places else skill
 

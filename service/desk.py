@@ -32,7 +32,43 @@ if TYPE_CHECKING:
 QUEUED = 10_000  # messages; then the socket fills, and then the loop counts losses
 FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 2.0
+DRAW_END_S = 8.0
+DRAW_QUEUED = 5000  # ticks
 POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
+
+
+class Drawing:
+    """The viewer on a thread of its own: where it falls behind or hangs, on a full disk say, the recording does not."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        self.viewer = viewer
+        self.dropped = 0
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._draw, name="drawing", daemon=True)
+        self._thread.start()
+
+    def put(self, act: Callable[[], None]) -> None:
+        """Has something drawn, later; the oldest that waits too long is dropped."""
+        self._waiting.append(act)
+        if len(self._waiting) > DRAW_QUEUED:
+            self._waiting.popleft()
+            self.dropped += 1
+
+    def _draw(self) -> None:
+        flushed = time.monotonic()
+        while not (self._ended.wait(POLL_S) and not self._waiting):
+            while self._waiting:
+                self._waiting.popleft()()
+            if time.monotonic() - flushed > DRAW_FLUSH_S:
+                self.viewer.flush()
+                flushed = time.monotonic()
+        self.viewer.close()
+
+    def close(self) -> None:
+        """Ends the file and the live view, if that is possible in time."""
+        self._ended.set()
+        self._thread.join(DRAW_END_S)
 
 
 class Desk:
@@ -42,12 +78,13 @@ class Desk:
         self._task, self._source = task, source
         self._recorder: Recorder | None = None
         self._record_to = task.recording
-        self._viewer: Viewer | None = None
+        self._drawing: Drawing | None = None
+        self._said_dropped = 0
         if task.rrd is not None or task.live_port is not None:
             from service.viewer import Viewer  # half a second that a scribe without viewer need not spend
 
             rrd = None if task.rrd is None else Path(task.rrd)
-            self._viewer = Viewer(cell=task.settings.cell, urdf=URDF, rrd=rrd, live_port=task.live_port, settings=task.settings)
+            self._drawing = Drawing(Viewer(cell=task.settings.cell, urdf=URDF, rrd=rrd, live_port=task.live_port, settings=task.settings))
         if skill is not None:
             self._begin(skill, None if task.state is None else np.frombuffer(task.state, STATE)[0])
         self._report()
@@ -58,7 +95,7 @@ class Desk:
 
     def _report(self) -> None:
         """Says what went wrong and where things are written."""
-        viewer = self._viewer
+        viewer = None if self._drawing is None else self._drawing.viewer
         while viewer is not None and viewer.problems:
             self._tell({"error": viewer.problems.pop(0)})
         self._tell({"recording": self._record_to, "rrd": viewer and viewer.rrd, "live": viewer and viewer.url})
@@ -99,34 +136,39 @@ class Desk:
             self._record(
                 lambda: recorder.write(told.tick, told.frame, time_ns=time_ns, timing=told.timing, state=told.state, skill=told.skill, lost=told.lost)
             )
-        if self._viewer is not None:
-            self._viewer.add(told.frame, time_ns, told.timing)
+        if self._drawing is not None:
+            viewer = self._drawing.viewer
+            self._drawing.put(lambda: viewer.add(told.frame, time_ns, told.timing))
 
     def _note(self, key: str, text: str, time_ns: int) -> None:
         recorder = self._recorder
         if recorder is not None:
             self._record(lambda: recorder.note(key, text, time_ns))
-        if self._viewer is not None and key != "status":
-            self._viewer.log(text, "WARN" if key == "log" else "INFO", time_ns)
+        if self._drawing is not None and key != "status":
+            viewer = self._drawing.viewer
+            self._drawing.put(lambda: viewer.log(text, "WARN" if key == "log" else "INFO", time_ns))
 
     def flush_recording(self) -> None:
         """Hands what was recorded to the system."""
         if self._recorder is not None:
             self._record(self._recorder.flush)
 
-    def flush_drawing(self) -> None:
-        """Hands what was drawn to the system."""
-        if self._viewer is not None:
-            self._viewer.flush()
-            if self._viewer.problems:
-                self._report()
+    def watch_drawing(self) -> None:
+        """Says what went wrong with the drawing, and how much is not in it."""
+        if self._drawing is None:
+            return
+        if self._drawing.viewer.problems:
+            self._report()
+        if self._drawing.dropped > self._said_dropped:
+            self._said_dropped = self._drawing.dropped
+            self._tell({"error": f"the drawing cannot keep up: {self._drawing.dropped} of its entries dropped"})
 
     def close(self) -> None:
         """Ends both files."""
         if self._recorder is not None:
             self._record(self._recorder.close)
-        if self._viewer is not None:
-            self._viewer.close()
+        if self._drawing is not None:
+            self._drawing.close()
         self._report()
 
 
@@ -177,7 +219,7 @@ def _work(source: socket.socket) -> None:
             desk.flush_recording()
             flushed = now
         if now - drawn > DRAW_FLUSH_S:
-            desk.flush_drawing()
+            desk.watch_drawing()
             drawn = now
     desk.close()
 
@@ -191,6 +233,7 @@ def main() -> None:
         os.nice(5)
     with socket.socket(fileno=int(sys.argv[1])) as source:
         _work(source)
+    os._exit(0)  # without waiting for a drawing that hangs
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ class Replay:
 
     @property
     def exact(self) -> bool:
-        """Whether every frame is identical, bit for bit."""
-        return self.ticks > 0 and self.identical == self.ticks
+        """Whether every frame up to the regular end is identical, bit for bit."""
+        return self.ticks > 0 and self.identical == self.ticks and not self.truncated
 
     @property
     def close(self) -> bool:
@@ -49,7 +49,7 @@ class Replay:
         if self.gaps:
             lines.append(f"{self.gaps} gaps in the recording; continued from the state after each")
         if self.truncated:
-            lines.append("the recording is cut off at its end")
+            lines.append("the recording ends early, at a cut or at damage: what follows was not compared")
         if not self.ticks:
             lines.append("nothing to compare: the recording holds no state to start from")
         if self.first_difference:
@@ -70,6 +70,8 @@ def replay(path: Path | str, *, after: int | None = None, progress: Callable[[in
         controller: Controller | None = None
         for step in recording.steps():
             events = tuple(_event(kind, payload, skills) for kind, payload in step.events)
+            if controller is not None and step.tick <= controller.state["tick"]:
+                raise RecordingError(f"{path}: tick {step.tick} comes after tick {int(controller.state['tick'])}; growing ticks needed")
             if step.lost:
                 controller = None
                 result.gaps += 1

@@ -24,6 +24,7 @@ from service.skill import Skill, SkillError
 from service.workshop import Workshop
 
 ADOPTION_TIMEOUT_S = 2.0
+MOST_POINTS = 400  # via-points of all places
 LARGEST_REQUEST = 256 * 1024  # bytes
 IMMEDIATE = ("hold", "resume", "reset")
 
@@ -73,8 +74,8 @@ class PlacesFile:
             request = wire.decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), wire.Add) if saved["request"] else None
             if saved["learned_from"] != skill.learned_from:
                 return None
-        except (ValueError, KeyError, TypeError) as error:
-            raise SkillError(f"{self.path} does not hold taught places ({error}); move it away to start without them") from None
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise SkillError(f"{self.path} does not hold taught places ({error})") from None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def write(self, skill: Skill) -> None:
@@ -121,21 +122,16 @@ class Requests:
         self._keep = keep
         self._arm = Arm(settings)
         self._places = PlacesFile(settings)
-        quick: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        slow: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._queues = (quick, slow)
-        self._queryables = [
-            self._declare(session, suffix, to)
-            for to, suffixes in ((quick, (*IMMEDIATE, "status")), (slow, ("via_points", "skill")))
-            for suffix in suffixes
-        ]
-        self._threads = [threading.Thread(target=self._serve, args=(source,), name="requests", daemon=True) for source in self._queues]
+        self._quick: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._slow: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._queryables = [self._declare(session, suffix) for suffix in (*IMMEDIATE, "status", "via_points", "skill")]
+        self._threads = [threading.Thread(target=self._serve, args=(source,), name="requests", daemon=True) for source in (self._quick, self._slow)]
         for thread in self._threads:
             thread.start()
 
-    def _declare(self, session: zenoh.Session, suffix: str, to: queue.SimpleQueue[Any]) -> zenoh.Queryable[None]:
+    def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
         def enqueue(query: zenoh.Query) -> None:
-            to.put((suffix, query))
+            self._quick.put((suffix, query))
 
         return session.declare_queryable(wire.key(self._settings.cell, suffix), enqueue)
 
@@ -143,23 +139,36 @@ class Requests:
         """Ends both threads; requests still waiting are answered first."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for source in self._queues:
+        for source, thread in zip((self._quick, self._slow), self._threads, strict=True):
             source.put(None)
-        for thread in self._threads:
             thread.join(ADOPTION_TIMEOUT_S + 1)
 
     def _serve(self, source: queue.SimpleQueue[Any]) -> None:
         while (item := source.get()) is not None:
             suffix, query = item
+            if source is self._quick and suffix in ("via_points", "skill") and not self._is_list(query):
+                self._slow.put(item)
+                continue
             with query:  # its end tells the asker that no more replies come
                 try:
                     self._reply(suffix, query)
                 except zenoh.ZError as error:
                     self._note(f"{suffix} could not be answered: {error}")
+            item = query = None
+
+    def _is_list(self, query: zenoh.Query) -> bool:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        try:
+            return len(payload) < 100 and isinstance(wire.decode_request(payload, wire.ViaPointsRequest), wire.List)
+        except wire.RequestError:
+            return False
 
     def _reply(self, suffix: str, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
+        key = wire.key(self._settings.cell, suffix)
         try:
+            if str(query.key_expr) != key and suffix != "status":
+                raise wire.RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
             if len(payload) > LARGEST_REQUEST:
                 raise wire.RequestError(f"a request of {len(payload)} bytes, at most {LARGEST_REQUEST} accepted")
             answer = wire.encode_json(self._answer(suffix, payload))
@@ -172,7 +181,7 @@ class Requests:
         else:
             if suffix != "status":
                 self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
-            query.reply(query.key_expr, answer)
+            query.reply(key, answer)
 
     def _answer(self, suffix: str, payload: bytes) -> wire.Reply | wire.Status:
         if suffix == "status":
@@ -230,6 +239,9 @@ class Requests:
     def _check(self, points: Sequence[wire.ViaPoint]) -> None:
         """Raises RequestError for names given twice and for places that no target may reach."""
         names = [point.name for point in points]
+        count = sum(13 if place.radius else 1 for place in {p.name: p for p in (*self._skill.places, *points)}.values())
+        if count > MOST_POINTS:
+            raise wire.RequestError(f"$.points: {count} via-points in all, 13 for each place with a radius; at most {MOST_POINTS} accepted")
         for i, point in enumerate(points):
             if point.name in names[:i]:
                 raise wire.RequestError(f"$.points[{i}].name: {point.name!r} given twice, names once each needed")

@@ -253,10 +253,12 @@ class McapFile:
 def existing(path: str | Path) -> Path:
     """The path of a recording that is there. Raises RecordingError with the names of those that are."""
     path = Path(path)
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder, a recording needed")
     if not path.is_file():
         there = sorted(found.name for found in path.parent.glob("*.mcap"))
-        names = f"There are: {', '.join(there)}." if there else "There are none."
-        raise RecordingError(f"No recording {path.name!r} in {path.parent}/. {names}")
+        names = f" There are: {', '.join(there)}." if there else ""
+        raise RecordingError(f"no recording {path}.{names}")
     with path.open("rb") as stream:
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise RecordingError(f"{path} is not an MCAP file")

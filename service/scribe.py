@@ -29,6 +29,7 @@ from service.config import Settings
 from service.frame import EVENT_KINDS, FRAME, STATE, TIMING, Event, Record, Tick
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
+LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
 LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
 READY_TIMEOUT_S = 15.0
@@ -228,7 +229,7 @@ class Scribe:
         target = self._socket
         if target is not None:
             with contextlib.suppress(OSError):
-                target.send(HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text]).encode())
+                target.send(HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode())
 
     def supervise(self) -> None:
         """Hears what the process has to say, and starts it anew if it died, with new files. Ten times a second."""

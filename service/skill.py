@@ -24,6 +24,7 @@ from service.wire import TaughtPoint, ViaPoint
 
 FORMAT = 1
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
+FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
 GATE = 2.0  # times the largest deviation along a demonstration that was held out is off the data
 
 
@@ -259,6 +260,12 @@ def _in_phase(demonstration: Demonstrated, longest_s: float = 1.0) -> tuple[Vect
     reach = min(int(longest_s / period_s), len(hands) // 4)
     if reach < 1:
         raise SkillError(f"a demonstration of {len(hands)} samples is too short to learn from")
+    if max(np.abs(hands).max(), np.abs(tool[:, :3]).max()) > FARTHEST_M:
+        raise SkillError(f"a demonstration goes {max(np.abs(hands).max(), np.abs(tool[:, :3]).max()):.0f} m away: is it in metres?")
+    if min(np.ptp(hands, axis=0).max(), np.ptp(tool[:, :3], axis=0).max()) < LEAST_M:
+        raise SkillError(f"a demonstration in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teaches nothing")
+    if (np.abs(np.linalg.norm(tool[:, 3:], axis=1) - 1) > 0.01).any():
+        raise SkillError("a demonstration's tool orientations are not quaternions of norm 1")
     speeds = [np.linalg.norm(np.gradient(x, axis=0), axis=1) for x in (hands, tool[:, :3])]
     a, b = (s - s.mean() for s in speeds)
     inner = a[reach : len(a) - reach]

@@ -214,6 +214,10 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
 
     if "://" not in str(source) and not Path(source).is_file():
         raise ViewerError(f"nothing to picture: there is no {source}")
+    if "://" not in str(source):
+        with Path(source).open("rb") as file:
+            if file.read(4) != b"RRF2":
+                raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

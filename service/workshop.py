@@ -5,7 +5,6 @@ A skill comes back as a small pickle and its arrays in shared memory: taking it 
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
 import pickle
@@ -24,7 +23,7 @@ from service.wire import ViaPoint
 
 _HEADER = struct.Struct("<IQ")  # number of parts, bytes in all
 _PART = struct.Struct("<Q")
-TIMEOUT_S = 120.0
+TIMEOUT_S = 8.0  # shorter than a client waits
 
 
 class Workshop:
@@ -44,7 +43,9 @@ class Workshop:
         return self._ask("adapt", skill.to_bytes(), tuple(places), tolerance)
 
     def close(self) -> None:
-        """Ends the process."""
+        """Ends the process, also while it works."""
+        if self._child is not None:
+            self._child.kill()
         with self._busy:
             self._end()
 
@@ -53,8 +54,6 @@ class Workshop:
             self._socket.close()
             self._socket = None
         if self._child is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._child.wait(5)
             self._child.kill()
             self._child.wait()
             self._child = None
@@ -68,9 +67,12 @@ class Workshop:
             try:
                 _send(self._socket, [pickle.dumps(request)])
                 answer = _receive(self._socket)
-            except (OSError, EOFError) as error:
+            except TimeoutError:
                 self._end()
-                raise SkillError(f"the workshop process failed at {request[0]!r}: {error or 'it ended'}") from None
+                raise SkillError(f"the workshop process did not answer within {TIMEOUT_S:g} s; nothing was changed") from None
+            except (OSError, EOFError):
+                self._end()
+                raise SkillError("the workshop process ended while it worked; nothing was changed, try again") from None
         if isinstance(answer, Skill):
             return answer
         raise SkillError(answer)
@@ -78,8 +80,11 @@ class Workshop:
     def _start(self) -> None:
         mine, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         with theirs:
-            command = [sys.executable, "-m", "service.workshop", str(theirs.fileno())]
-            self._child = subprocess.Popen(command, pass_fds=[theirs.fileno()], env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+            root = str(Path(__file__).parents[1])
+            path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+            threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+            command = [sys.executable, "-P", "-m", "service.workshop", str(theirs.fileno())]
+            self._child = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=os.environ | threads | {"PYTHONPATH": path})
         mine.settimeout(TIMEOUT_S)
         self._socket = mine
 

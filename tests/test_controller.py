@@ -179,6 +179,25 @@ def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
     assert modes(follow(controller, 311, 20, speed=2.0))[-1] == ("fault", "tool_speed")
 
 
+def test_a_reset_while_the_arm_still_moves_lets_it_come_to_rest_first(taught: Skill) -> None:
+    controller = Controller(Settings(), taught)
+    out: list[np.ndarray] = []
+    joints, was_fault = POSTURE, False
+    for tick in list(ticks_of(HandScript(Scene(), seed=11), wait_s=0.5))[:3000]:
+        lies = 1400 <= tick.index < 1420
+        inbox = [*tick.inbox, arm(joints, tick.index + 1, (9.0,) * 7 if lies else (0.0,) * 7)]
+        if was_fault and tick.index % 7 == 0:
+            inbox.append(order("reset"))
+        frame = controller.step(Tick(tick.index, tuple(inbox)))
+        was_fault = frame["mode"] == Mode.FAULT
+        joints = tuple(frame["joints"].tolist())
+        out.append(frame)
+    seen = np.array(out)
+    assert [reason for _, reason in modes(seen)][-3:] == ["tool_speed", "arm_not_ready", "none"]
+    limits_hold(seen)
+    no_jump(seen)
+
+
 def test_reset_without_a_fault_changes_nothing(taught: Skill) -> None:
     plain = frames(Controller(ASSUMED, taught), resting(0, 400))
     reset = frames(Controller(ASSUMED, taught), resting(0, 400, lambda k: (order("reset"),) if k == 200 else ()))

@@ -129,8 +129,16 @@ def test_a_place_out_of_reach_is_refused_and_nothing_changes(shared_daemon: Any)
     assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == before
 
 
+def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_daemon: Any) -> None:
+    shared_daemon.client.ask("hold")
+    replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
+    assert sum(reply.ok is not None for reply in replies) == 1
+    assert shared_daemon.until(lambda s: s["reason"] in ("operator", "arm_not_ready"))["mode"] == "hold"
+    shared_daemon.client.ask("resume")
+
+
 def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> None:
-    many = [msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(0.5 + 0.005 * i, 0.0, 0.1)) for i in range(60)]
+    many = [msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(0.5 + 0.005 * i, 0.0, 0.1)) for i in range(30)]
     replies = shared_daemon.session.get("thirdhand/via_points", payload=wire.encode_json(wire.Add(tuple(many))), timeout=30)
     begin = time.monotonic()
     shared_daemon.client.ask("hold")

@@ -176,7 +176,7 @@ def test_a_recording_of_nothing_but_a_state_opens(tmp_path: Path) -> None:
 
 
 def test_errors_name_the_file_what_is_wrong_and_what_there_is(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=re.escape(f"No recording 'a.mcap' in {tmp_path}/. There are none.")):
+    with pytest.raises(RecordingError, match=re.escape(f"no recording {tmp_path}/a.mcap.")):
         Recording.open(tmp_path / "a.mcap")
     write_demonstration(tmp_path / "demo.mcap", np.arange(3) * 10, *np.ones((3, 3, 7)))
     (tmp_path / "notes.mcap").write_text("not an MCAP file at all", encoding="utf-8")
