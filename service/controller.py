@@ -118,14 +118,18 @@ class Controller:
         self._skill = skill
         self._direction = rotation(tuple(skill.orientation))[:, 2]
         self._state["skill"] = np.frombuffer(skill.digest, np.uint8)
+        self._state["covariance"] = 0.0
 
     def _predict(self) -> Prediction | None:
-        """The prediction, if both hands are known."""
+        """The prediction, if both hands are known; how sure it is, is asked anew with each sample of a hand."""
         state = self._state
         if not (self._intake.is_fresh(state, 0) and self._intake.is_fresh(state, 1)):
             return None
-        hands = state["filters"]
-        return self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2])
+        hands, known = state["filters"], state["covariance"]
+        is_new = bool((state["hand_ticks"] == state["tick"]).any()) or not known.any()
+        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], covariance=None if is_new else known)
+        state["covariance"] = prediction.covariance
+        return prediction
 
     def _decide(self, prediction: Prediction | None) -> None:
         """Mode and reason of this tick."""

@@ -130,6 +130,7 @@ STATE = np.dtype(
         ("measured_velocities", "<f8", (7,)),
         ("setpoint", "<f8", (3, 3)),  # position, velocity, acceleration; by axis
         ("joints", "<f8", (3, 7)),  # position, velocity, acceleration; by joint
+        ("covariance", "<f8", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
         ("rejected", "<u4", (len(Cause),)),
         ("mode", "u1"),
         ("reason", "u1"),

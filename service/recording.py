@@ -222,8 +222,11 @@ class Recording:
         urdf = parts.get("arm.urdf", b"").decode(errors="replace")
         return cls(path, settings, parts["skill.npz"], urdf, about, truncated=ends_early(path))
 
-    def steps(self) -> Iterator[Step]:
-        """Every recorded tick in order, after the initial state if there is one. Raises RecordingError on what is not understood."""
+    def steps(self, *, outputs: bool = True) -> Iterator[Step]:
+        """Every recorded tick in order, after the initial state if there is one. Raises RecordingError on what is not understood.
+
+        Without `outputs` only what went in: a recording of a version with other frames and states can be read so.
+        """
         prefix = self.settings.cell + "/"
         names = {prefix + name: name for name in (*EVENT_KINDS, "tick", "frame", "timing", "state", "skill_in_force")}
         messages = Messages(self.path)
@@ -231,12 +234,12 @@ class Recording:
         try:
             for schema, channel, message in messages:
                 name = names.get(channel.topic)
-                if name is None or schema is None:
+                if name is None or schema is None or (name in _LAYOUTS and not outputs):
                     continue
                 data = message.data
                 if name == "tick":
                     if step is not None:
-                        yield _finished(step)
+                        yield _finished(step, outputs=outputs)
                     index, kinds, lost = schemas.decode_tick(data)
                     step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
                 elif step is None:
@@ -249,8 +252,8 @@ class Recording:
                     step["skill"] = schemas.decode_skill(data)
                 else:
                     step["events"].append((name, schemas.decode_skill(data) if schema.name == schemas.SKILL else data))
-            if step is not None and "frame" in step:
-                yield _finished(step)
+            if step is not None and ("frame" in step or not outputs):
+                yield _finished(step, outputs=outputs)
         except wire.WireError as error:
             raise RecordingError(f"{self.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
         self.truncated = self.truncated or bool(messages.cut)
@@ -266,12 +269,12 @@ class Recording:
 _LAYOUTS = {"frame": FRAME, "timing": TIMING, "state": STATE}
 
 
-def _finished(step: dict[str, Any]) -> Step:
+def _finished(step: dict[str, Any], *, outputs: bool) -> Step:
     kinds, events = [EVENT_KINDS[place] for place in step["kinds"]], step["events"]
-    if [kind for kind, _ in events] != kinds or "frame" not in step:
+    if [kind for kind, _ in events] != kinds or (outputs and "frame" not in step):
         raise wire.WireError(f"tick {step['tick']} lists {kinds}; {[kind for kind, _ in events]} and {'a' if 'frame' in step else 'no'} frame follow")
     timing, state, skill = (step.get(name) for name in ("timing", "state", "skill"))
-    return Step(step["tick"], tuple(events), step["frame"], timing, state, skill, step["lost"], step["time_ns"])
+    return Step(step["tick"], tuple(events), step.get("frame"), timing, state, skill, step["lost"], step["time_ns"])
 
 
 # --- demonstrations ---------------------------------------------------------------------------------------------------------

@@ -91,9 +91,8 @@ def replay(path: Path | str, *, after: int | None = None, progress: Callable[[in
 def ticks(recording: Recording) -> Iterator[Tick]:
     """The ticks of a recording, as the core takes them."""
     skills: dict[bytes, Skill] = {}
-    for step in recording.steps():
-        if step.frame is not None:
-            yield Tick(step.tick, tuple(_event(kind, payload, skills) for kind, payload in step.events))
+    for step in recording.steps(outputs=False):
+        yield Tick(step.tick, tuple(_event(kind, payload, skills) for kind, payload in step.events))
 
 
 def _compare(result: Replay, controller: Controller, tick: Tick, step: Step) -> None:

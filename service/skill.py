@@ -57,19 +57,24 @@ class Skill:
     tolerance: float = 0.05  # [m] a reference point nearer to a place gives way
     known: bytes = field(default=b"", repr=False)
 
-    def predict(self, hands: Vector, velocities: Vector, accelerations: Vector) -> Prediction:
+    def predict(self, hands: Vector, velocities: Vector, accelerations: Vector, *, covariance: Vector | None = None) -> Prediction:
         """The prediction for hands (2, 3) [m] that move so. Equation (8) of Huang et al. 2019, its derivatives along the motion, its covariance.
+
+        The covariance takes as long as all else; one that was predicted just before may be given (3, 3) [m²].
 
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all that follows.
         """
         s = hands.reshape(6)
         v = velocities.reshape(6)
-        normal = self.primitive.predict(s[None])
+        if covariance is None:
+            normal = self.primitive.predict(s[None])
+            mean, covariance = normal.mean[0], np.round(normal.covariance[0], 10)
+        else:
+            mean = self.primitive.mean(s[None])[0]
         jacobian = np.round(self.primitive.jacobian(s), 6)
         curvature = self.primitive.curvature(s, v)
-        covariance = np.round(normal.covariance[0], 10)
         return Prediction(
-            np.round(normal.mean[0], 6),
+            np.round(mean, 6),
             np.round(jacobian @ v, 6),
             np.round(jacobian @ accelerations.reshape(6) + curvature, 6),
             covariance,

@@ -41,6 +41,8 @@ class Smoother:
         state: (3, 3) the setpoint now; position, velocity, acceleration: (3,) the target now [m, m/s, m/s²].
         """
         ahead, limited = self._track(state, position, velocity, acceleration)
+        if self._is_within(ahead) and self._is_within(state):
+            return ahead, limited  # one period at constant jerk: just what Ruckig would answer, found sooner
         reached = self._reach(state, ahead)
         if reached is None:
             reached, limited = self._stop(state), True
@@ -75,6 +77,11 @@ class Smoother:
             u = min(jerk, max(-jerk, 3 * w * (wanted_acceleration - a[i])))
             ahead.append((x[i] + dt * (v[i] + dt * (a[i] / 2 + dt * u / 6)), v[i] + dt * (a[i] + dt * u / 2), a[i] + dt * u))
         return np.array(ahead).T, limited
+
+    def _is_within(self, state: Vector) -> bool:
+        """Whether speed and acceleration keep their limits; jerk does by the way the tracker is made."""
+        _, velocity, acceleration = state.tolist()
+        return math.hypot(*velocity) <= self._max_speed and max(map(abs, acceleration)) <= self._max_acceleration
 
     def _reach(self, state: Vector, ahead: Vector) -> Vector | None:
         """Ruckig's state one period on, on its way to the tracker's; None where it knows no way."""

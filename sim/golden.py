@@ -16,7 +16,7 @@ import numpy as np
 from service import wire
 from service.config import Settings
 from service.controller import Controller, Tap, run
-from service.frame import Event, Frame, Record, Tick, differences
+from service.frame import Event, Frame, Tick, differences
 from service.recording import Recorder, Recording, RecordingError
 from service.replay import ticks
 from service.skill import Skill, SkillError
@@ -86,9 +86,9 @@ def _hands(bench: Bench, t: float, stamp_ns: int) -> list[Event]:
     return events
 
 
-def record(path: Path, settings: Settings, skill: Skill, source: Iterator[Tick], frames: list[Frame], *, state: Record | None = None) -> None:
+def record(path: Path, settings: Settings, skill: Skill, source: Iterator[Tick], frames: list[Frame]) -> None:
     """Runs the core on ticks and writes what came of it; `frames` grows as it runs."""
-    controller = Controller(settings, skill, state)
+    controller = Controller(settings, skill)
     with Recorder(path, settings=settings, skill=skill.to_bytes(), state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
@@ -111,15 +111,17 @@ def make(path: Path, skill: Skill) -> None:
 def refresh(path: Path) -> dict[str, float]:
     """Computes the frames of a golden session anew from its ticks; the largest change in each field that changed."""
     old = Recording.open(path)
-    first = next(old.steps())
-    before = [step.frame for step in old.steps() if step.frame is not None]
+    try:
+        before = [step.frame for step in old.steps() if step.frame is not None]
+    except RecordingError:  # frames or states had another layout then: there is nothing to compare with
+        before = []
     frames: list[Frame] = []
     beside = path.with_suffix(".new")
     skill = Skill.from_bytes(old.skill, origin=str(path))
-    record(beside, old.settings, skill, ticks(old), frames, state=first.state if first.frame is None else None)
+    record(beside, old.settings, skill, ticks(old), frames)
     beside.replace(path)
     changes: dict[str, float] = {}
-    for was, now in zip(before, frames, strict=True):
+    for was, now in zip(before, frames, strict=bool(before)):
         for name, value in differences(was, now).items():
             changes[name] = float(np.fmax(changes.get(name, 0.0), value))
     return changes
