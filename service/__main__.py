@@ -101,7 +101,11 @@ def parser() -> argparse.ArgumentParser:
     client("resume", "Ends an operator's hold.", "thirdhand resume")
     client("reset", "Ends a fault.", "thirdhand reset")
 
-    c = client("view", "Shows a recording, or a running daemon, in Rerun.", "thirdhand view thirdhand-demo/*.rrd --screenshot scene.png")
+    c = client(
+        "view",
+        "Shows a recording, or a running daemon, in Rerun.",
+        "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
+    )
     c.add_argument("file", metavar="FILE|live", help="an .rrd or .mcap file, or `live`")
     c.add_argument("--screenshot", metavar="PNG", type=Path, help="write a picture instead of opening a window")
     c.add_argument("--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)")

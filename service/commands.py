@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 import tempfile
 import time
@@ -56,7 +57,9 @@ def serve(args: argparse.Namespace) -> int:
         print(f"listening on {where} as cell {settings.cell}", flush=True)
 
     daemon.serve(settings, args.skill or skills / SHIPPED_SKILL, skills=skills, scribe=scribe, announce=announce)
-    return 0
+    sys.stdout.flush()
+    logging.shutdown()
+    os._exit(0)  # all is closed; libraries that complain of what their own threads still hold are not waited for
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
@@ -146,7 +149,10 @@ def learn(args: argparse.Namespace) -> int:
         demonstrations, name=args.name or args.output.stem, seed=args.seed, progress=lambda line: print(line, file=sys.stderr, flush=True)
     )
     args.output.write_bytes(skill.to_bytes())
-    print(f"{args.output}: {len(skill.primitive.inputs)} reference points; off the data above {1000 * skill.threshold:.0f} mm of deviation")
+    print(
+        f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where the "
+        f"prediction's standard deviation exceeds {1000 * skill.threshold:.0f} mm"
+    )
     return 0
 
 
@@ -193,7 +199,8 @@ def status(args: argparse.Namespace) -> int:
     }
     for name in ("lateness_us", "work_us", "latency_ms"):
         label, unit = name.rsplit("_", 1)
-        rows[label] = "p50 {p50:.4g}, p99 {p99:.4g}, max {max:.4g} {unit}".format(**now[name], unit=unit.replace("us", "µs"))
+        values, digits, unit = now[name], 1 if unit == "us" else 2, unit.replace("us", "µs")
+        rows[label] = ", ".join(f"{key} {values[key]:.{digits}f}" for key in ("p50", "p99", "max")) + f" {unit}" if values["max"] else "none yet"
     for name, text in rows.items():
         print(f"{name:<10} {text}")
     return 0

@@ -148,7 +148,9 @@ class Controller:
         """What is wrong with the arm, if anything; where it appears anew, the joints start from it."""
         state, arm = self._state, self._settings.arm
         if arm.source == "assumed":
-            state["arm_ready"] = 1
+            if not state["arm_ready"]:
+                state["arm_ready"] = 1
+                state["setpoint"] = self._at_rest()
             return None
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:

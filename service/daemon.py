@@ -149,7 +149,8 @@ class Daemon:
                 wire.encode_command(stamp_ns, frame["joints"].tolist(), frame["joint_velocities"].tolist()), attachment=attachment
             )
         if tick.index % DECIMATION == 0:
-            self._publishers["tool/target"].put(encode_target(stamp_ns, frame), attachment=attachment)
+            if frame["covariance"].any():  # without both hands nothing is predicted
+                self._publishers["tool/target"].put(encode_target(stamp_ns, frame), attachment=attachment)
             self._publishers["tool/setpoint"].put(encode_setpoint(stamp_ns, frame), attachment=attachment)
 
     def _hand_over(self, tick: Tick, frame: Frame) -> None:

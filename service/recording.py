@@ -137,7 +137,7 @@ class Recorder:
         for side in (0, 1):
             if seen[side]:
                 transforms.append(Transform(wire.BASE, _HANDS[side], tuple(frame["hands"][side].tolist()), (0.0, 0.0, 0.0, 1.0)))
-        if seen.all():
+        if frame["covariance"].any():  # without both hands nothing is predicted
             target = tuple(frame["target"].tolist())
             covariance = np.zeros((6, 6))
             covariance[:3, :3] = frame["covariance"]

@@ -214,7 +214,10 @@ class Requests:
         if not path.is_file():
             there = ", ".join(sorted(p.stem for p in self._skills.glob("*.npz"))) or "none"
             raise wire.RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {there}")
-        return self._adopt(self._workshop.load(path))
+        skill = self._workshop.load(path)
+        if skill.learned_from == self._skill.learned_from and self._skill.places:  # what was taught goes with what was learned
+            skill = self._workshop.adapt(skill, self._skill.places, tolerance=self._skill.tolerance)
+        return self._adopt(skill)
 
     def _teach(self, request: wire.ViaPointsRequest) -> wire.Reply:
         places = {place.name: place for place in self._skill.places}

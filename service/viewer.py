@@ -246,7 +246,9 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
 
 def show(source: str | Path) -> int:
     """The exit code of the Rerun viewer, opened on a file or a live view, once its window is closed."""
-    return subprocess.run([_executable(), str(source)], check=False).returncode
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
+    return subprocess.run([_executable(), "--bind", "127.0.0.1", str(source)], check=False).returncode
 
 
 def _extent(client: Any) -> tuple[int, int] | None:

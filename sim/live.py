@@ -178,7 +178,7 @@ def _play(bench: Bench, bridge: Bridge, live: Live, *, stop: threading.Event, re
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running = False
     said = missed_before = sent_before = 0
-    say(f"waiting for {key}")
+    say(f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)")
     while not stop.is_set():
         now_s = deadlines.wait()[0] * bench.period_s
         if now_s >= live.duration_s:

@@ -91,6 +91,12 @@ def test_it_goes_on_from_its_state_bit_for_bit(taught: Skill) -> None:
     assert np.concatenate([head, tail]).tobytes() == whole.tobytes()
 
 
+def test_the_first_setpoint_is_where_the_tool_is(taught: Skill) -> None:
+    seen = frames(Controller(ASSUMED, taught), resting(0, 300, every=1))
+    assert modes(seen) == [("follow", "none")]
+    assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.002
+
+
 def test_a_hand_that_falls_silent_brings_a_hold_within_100_ms_and_comes_back_without_a_jump(taught: Skill) -> None:
     script = HandScript(Scene(), seed=8)
     silent = range(1500, 1900)

@@ -175,10 +175,13 @@ def test_what_the_loop_adopts_is_what_a_recording_keeps(bench: Bench, skill: Ski
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
-def test_a_skill_is_loaded_by_name_and_without_places(bench: Bench, skill: Skill, name: str) -> None:
+def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(bench: Bench, skill: Skill, name: str) -> None:
     bench.client.add(PLACES)
-    assert bench.client.ask("skill", {"name": name})["points"] == []
-    assert bench.taken[-1].value.digest == skill.digest
+    assert len(bench.client.ask("skill", {"name": name})["points"]) == len(PLACES)
+    other = replace(skill, learned_from="other demonstrations", known=b"")
+    (bench.folder / "other.npz").write_bytes(other.to_bytes())
+    assert bench.client.ask("skill", {"name": "other"})["points"] == []
+    assert bench.taken[-1].value.digest == other.digest
     assert bench.names() == []
 
 
