@@ -8,19 +8,18 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from service.client import Client, open_session
-from sim.bench import Bench
-from sim.experiments.rehearsal import TOLERANCE_M
-from sim.experiments.report import ExperimentError
-from sim.experiments.scenes import Drawn
-from sim.live import Live, Report
-from sim.live import run as play
+import msgspec
 
-TIMEOUT_S = 60.0
+from service.client import Client, open_session
+from sim.experiments.rehearsal import NOISE_M, TOLERANCE_M, TREMOR_M
+from sim.experiments.report import ExperimentError
+from sim.experiments.scenes import OFFSET_M, Drawn
+from sim.live import Report
+
+TIMEOUT_S = 120.0
 
 
 def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = False) -> Report:
@@ -28,12 +27,26 @@ def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = 
 
     With `record` its recording and Rerun file go into `folder`. If not `taught`, the skill is as it was learned.
     """
-    reports: list[Report] = []
-    with _service(folder, record=record) as endpoint, open_session(connect=[endpoint]) as session, Bench(drawn.script()) as bench:
+    with _service(folder, record=record) as endpoint, open_session(connect=[endpoint]) as session:
         if taught:
             Client(session).add(drawn.scene.places(), tolerance=TOLERANCE_M)
-        play(bench, session, Live(once=True), stop=threading.Event(), report=reports.append, say=lambda line: None)
-    return reports[0]
+        return msgspec.json.decode(_bench(endpoint, drawn), type=Report)
+
+
+def _bench(endpoint: str, drawn: Drawn) -> str:
+    """The bench's report of one run as JSON: a process, as a user would start it."""
+    command = [sys.executable, "-m", "sim", "--connect", endpoint, "--once", "--json", "-", "--seed", str(drawn.seed), "--speed", str(drawn.speed)]
+    command += ["--offset-mm", str(1000 * OFFSET_M), "--tremor-mm", str(1000 * TREMOR_M), "--noise-mm", str(1000 * NOISE_M)]
+    for pause in drawn.pauses:
+        command += ["--turn" if pause.depth > 1 else "--pause", str(pause.at_s), str(pause.lasts_s)]
+    places = "".join(f"{name} = {list(getattr(drawn.scene, name))}\n" for name in ("handover", "glass", "soldering"))
+    with tempfile.TemporaryDirectory() as scratch:
+        scene = Path(scratch) / "scene.toml"
+        scene.write_text(places)
+        done = subprocess.run([*command, "--scene", str(scene)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    if done.returncode != 0:
+        raise ExperimentError(f"the bench ended with code {done.returncode}: {done.stderr.strip()}")
+    return next(line for line in done.stdout.splitlines() if line.startswith("{"))
 
 
 @contextlib.contextmanager

@@ -40,7 +40,7 @@ class Rehearsed:
     @property
     def errors_mm(self) -> tuple[float, float, float]:
         """Of handover, grasp and carry."""
-        return tuple(getattr(self.events, name).error_mm for name in Events.__struct_fields__)  # type: ignore[return-value]
+        return tuple(getattr(self.events, name).error_mm for name in Events.__struct_fields__)
 
 
 def rehearse(
@@ -99,7 +99,7 @@ def _ticks(bench: Bench, newest: list[Frame]) -> Iterator[Tick]:
         if bench.tick % every == 0:
             for side, pose in zip(("left", "right"), bench.script.sample(bench.time_s), strict=True):
                 x, y, z, *orientation = pose.tolist()
-                inbox.append(Event(f"hands/{side}", b"", wire.PoseStamped(stamp_ns, wire.BASE, (x, y, z), tuple(orientation))))  # type: ignore[arg-type]
+                inbox.append(Event(f"hands/{side}", b"", wire.PoseStamped(stamp_ns, wire.BASE, (x, y, z), tuple(orientation))))
             inbox.append(Event("joints/state", b"", wire.JointState(stamp_ns, wire.JOINT_NAMES, seen.joints, seen.joint_velocities)))
         yield Tick(bench.tick, tuple(inbox))
 

@@ -108,7 +108,7 @@ def equal_box(axes: Any, points: Array) -> None:
     half = 0.55 * (high - low).clip(min=1e-3)
     middle = (low + high) / 2
     axes.set(xlim=middle[0] + half[0] * np.array([-1, 1]), ylim=middle[1] + half[1] * np.array([-1, 1]), zlim=middle[2] + half[2] * np.array([-1, 1]))
-    axes.set_box_aspect(half)
+    axes.set_box_aspect(half, zoom=1.1)
 
 
 def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
@@ -18,8 +19,8 @@ from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.skill import Demonstrated, Prediction, Skill
 from service.wire import ViaPoint
 from sim.bench import Bench
-from sim.experiments.rehearsal import TOLERANCE_M, Array
-from sim.experiments.report import ExperimentError
+from sim.experiments.rehearsal import TOLERANCE_M
+from sim.experiments.report import Array, ExperimentError
 from sim.scene import Scene
 
 Law: TypeAlias = Callable[[Array], Array]
@@ -29,7 +30,7 @@ COMPONENTS, POINTS, SEED = 10, 200, 0
 PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
 VIA_STD_M, EXACT_STD_M = 0.001, 0.0001
 BASES = 20  # of the ProMP, for each of x, y and z
-RIDGE = 0.1  # of the mean variance of a ProMP's weights
+RIDGE = 10.0  # times the mean variance of a ProMP's weights: of 0 to 100, about where it leaves the rest of a letter as well alone as KMP does
 STEP_S = 1e-3  # of differences in time
 
 
@@ -89,7 +90,8 @@ def ours(skill: Skill) -> Adapt:
 def gmr(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
     """Gaussian mixture regression alone, which cannot be told of places."""
     mixture = GaussianMixture.fit(_samples(demonstrations), components=COMPONENTS, seed=SEED)
-    return lambda scene: lambda bench: _rival(skill, lambda s: mixture.regress(s).mean)
+    law = _regression(mixture)
+    return lambda scene: lambda bench: _rival(skill, law)
 
 
 def paper(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
@@ -104,7 +106,7 @@ def paper(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
         places = scene.places()
         hands = [[*place.left, *place.right] for place in places]
-        desired = Gaussians([place.tool for place in places], np.tile(PAPER_VIA_STD_M**2 * np.eye(3), (len(places), 1, 1)))
+        desired = Gaussians(np.array([place.tool for place in places]), np.tile(PAPER_VIA_STD_M**2 * np.eye(3), (len(places), 1, 1)))
         primitive = base.adapt(hands, desired, tolerance=TOLERANCE_M)
         return lambda bench: _rival(skill, primitive.mean)
 
@@ -135,7 +137,7 @@ def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstrated], *, ev
         y = np.concatenate([outputs[kept], wanted]) - centre
         variance = np.concatenate([np.full(int(kept.sum()), noise), np.full(len(at), VIA_STD_M**2)])
         weights = cho_solve(cho_factor(covariance(s, s) + np.diag(variance)), y)
-        return lambda bench: _rival(skill, lambda q: covariance(q, s) @ weights + centre)
+        return lambda bench: _rival(skill, lambda q: np.asarray(covariance(q, s) @ weights + centre))
 
     return adapt
 
@@ -152,28 +154,20 @@ def promp(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
         for (begin, end), place in zip(scene.dwells, (scene.handover, scene.glass, scene.carry), strict=True):
             conditioned = conditioned.condition_position(np.array(place), EXACT_STD_M**2 * np.eye(3), t=(begin + end) / 2, t_max=lasts_s)
 
-        grid = np.linspace(0.0, lasts_s, 2001)
-        rows = conditioned.mean_trajectory(grid.copy())
-
-        def at(t: Array) -> Array:
-            now = np.clip(t[:, 0], 0.0, lasts_s)
-            return np.stack([np.interp(now, grid, rows[:, axis]) for axis in range(3)], axis=1)
-
-        def smooth(t: Array) -> Array:
-            # Between samples of the grid differences jump: averaged over one of its steps they do not.
-            width = lasts_s / 2000
-            return np.mean([at(t + shift) for shift in width * np.linspace(-1, 1, 9)], axis=0)
-
-        return lambda bench: TimeDriven(**_fields(skill, b"promp"), trajectory=smooth, bench=bench)
+        grid = np.linspace(0.0, lasts_s, 1001)
+        spline = CubicSpline(grid, conditioned.mean_trajectory(grid.copy()))
+        return lambda bench: TimeDriven(
+            **_fields(skill, b"promp"), trajectory=lambda t: np.asarray(spline(np.clip(t[:, 0], 0.0, lasts_s))), bench=bench
+        )
 
     return adapt
 
 
-def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, bases: int) -> Any:
+def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, bases: int, ridge: float = RIDGE) -> Any:
     """The ProMP (of movement_primitives) of trajectories (T, O) at times (T,) [s], from 0. Raises ExperimentError.
 
-    H demonstrations leave its weights' covariance with a rank of H - 1, which can meet that many numbers and no more: three places in space are nine.
-    So a tenth of the mean variance is added to the diagonal, with which ProMP meets via-points as it does in the paper.
+    H demonstrations leave its weights' covariance with a rank of H - 1, which can meet that many numbers and no more, and not where wanted: three
+    places in space are nine. So `ridge` times the mean variance is added to its diagonal, with which ProMP meets via-points as it does in the paper.
     """
     try:
         from movement_primitives.promp import ProMP
@@ -181,8 +175,8 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
         raise ExperimentError("ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'") from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
     primitive.imitate([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
-    ridge = RIDGE * np.trace(primitive.weight_cov) / len(primitive.weight_cov) * np.eye(len(primitive.weight_cov))
-    return primitive.from_weight_distribution(primitive.weight_mean, primitive.weight_cov + ridge)
+    variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
+    return primitive.from_weight_distribution(primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov)))
 
 
 def neighbourhoods(places: Sequence[ViaPoint]) -> tuple[Array, Array]:
@@ -194,6 +188,23 @@ def neighbourhoods(places: Sequence[ViaPoint]) -> tuple[Array, Array]:
             inputs.append(np.array([*place.left, *place.right]) + step)
             outputs.append(np.array(place.tool) + follow[place.follow] @ step)
     return np.array(inputs), np.array(outputs)
+
+
+def _regression(mixture: GaussianMixture) -> Law:
+    """The mean of the mixture's regression, as `regress` gives it, with all that does not depend on the query made once."""
+    covariances = mixture.covariances
+    precisions = np.linalg.inv(covariances[:, :6, :6])
+    gains = precisions @ covariances[:, :6, 6:]  # (K, 6, 3)
+    shares = np.log(mixture.weights) - 0.5 * np.linalg.slogdet(covariances[:, :6, :6])[1]
+
+    def law(s: Array) -> Array:
+        offsets = s[:, None, :] - mixture.means[:, :6]  # (M, K, 6)
+        log_share = shares - 0.5 * np.einsum("mki,kij,mkj->mk", offsets, precisions, offsets)
+        share = np.exp(log_share - log_share.max(axis=1, keepdims=True))
+        means = mixture.means[:, 6:] + np.einsum("mki,kio->mko", offsets, gains)
+        return np.asarray(np.einsum("mk,mko->mo", share / share.sum(axis=1, keepdims=True), means))
+
+    return law
 
 
 def _samples(demonstrations: Sequence[Demonstrated]) -> Array:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Array
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M
+from sim.experiments.report import Array
 from sim.hands import Clock, HandScript, Pause
 from sim.scene import MOST_MOVED, Scene
 
@@ -66,11 +67,15 @@ def draw(number: int, *, seed: int = 2019) -> Drawn:
 
 def _never_before_the_start(pauses: list[Pause], speed: float) -> list[Pause]:
     """The pauses, those in which the hands go back ended where they would be back at their start."""
-    for i, pause in enumerate(pauses):
-        while pause.depth > 1 and pause.lasts_s > 0.6 and Clock(speed=speed, pauses=pauses).at(pause.at_s + pause.lasts_s)[0] < 0:
-            pause = pause._replace(lasts_s=max(0.6, pause.lasts_s - 0.1))
-            pauses = [*pauses[:i], pause, *pauses[i + 1 :]]
-    return pauses
+    shorter = list(pauses)
+    for i in range(len(shorter)):
+        while shorter[i].depth > 1 and shorter[i].lasts_s > 0.6 and _script_s_after(shorter[i], shorter, speed) < 0:
+            shorter[i] = shorter[i]._replace(lasts_s=max(0.6, shorter[i].lasts_s - 0.1))
+    return shorter
+
+
+def _script_s_after(pause: Pause, pauses: list[Pause], speed: float) -> float:
+    return Clock(speed=speed, pauses=pauses).at(pause.at_s + pause.lasts_s)[0]
 
 
 def _moved(place: tuple[float, float, float], random: np.random.Generator) -> tuple[float, float, float]:

@@ -144,7 +144,7 @@ def wilson(successes: int, of: int) -> tuple[float, float]:
 def _draw(report: Report, found: dict[str, list[Outcome]]) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.2), width_ratios=(1, 1.7))
-    for i, (method, rows) in enumerate(found.items()):
+    for i, rows in enumerate(found.values()):
         rate = 100 * sum(one.success for one in rows) / len(rows)
         low, high = (100 * bound for bound in wilson(round(rate * len(rows) / 100), len(rows)))
         left.barh(i, rate, color=SERIES[i], height=0.6)
