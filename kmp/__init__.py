@@ -7,9 +7,37 @@ Symbols: s an input (I,), xi an output (O,), (s_n, mu_n, Sigma_n) the N referenc
 parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, O) the fitted weights.
 """
 
+from kmp.checks import RankReached, ViaPointMissed
+from kmp.correlation import Correlation, Improvement, improve
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
-from kmp.kernel import GaussianKernel
-from kmp.primitive import KMP
+from kmp.kernel import GaussianKernel, VelocityKernel
+from kmp.orientation import OrientationKMP
+from kmp.primitive import KMP, Uncertainty
+from kmp.references import Frame, LocalKMP, superposed
+from kmp.selection import Learned, Score, learn
+from kmp.storage import Stored, load, save
 
-__all__ = ["KMP", "GaussianKernel", "GaussianMixture", "Gaussians"]
+__all__ = [
+    "KMP",
+    "Correlation",
+    "Frame",
+    "GaussianKernel",
+    "GaussianMixture",
+    "Gaussians",
+    "Improvement",
+    "Learned",
+    "LocalKMP",
+    "OrientationKMP",
+    "RankReached",
+    "Score",
+    "Stored",
+    "Uncertainty",
+    "VelocityKernel",
+    "ViaPointMissed",
+    "improve",
+    "learn",
+    "load",
+    "save",
+    "superposed",
+]

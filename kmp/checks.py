@@ -12,10 +12,23 @@ Array: TypeAlias = NDArray[np.float64]
 _Some = TypeVar("_Some", bound=NDArray[Any])
 
 
+class ViaPointMissed(UserWarning):
+    """A via-point is missed by more than its own deviation allows."""
+
+
+class RankReached(UserWarning):
+    """The rank was too low for the data, and accuracy was lost."""
+
+
 def frozen(array: _Some) -> _Some:
     """The same array, read-only."""
     array.setflags(write=False)
     return array
+
+
+def unpickled(state: dict[str, Any]) -> dict[str, Any]:
+    """The state of a frozen value as it was: arrays come back from a pickle writeable."""
+    return {name: frozen(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
 
 
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:

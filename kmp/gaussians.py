@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, frozen, numbers
+from kmp.checks import Array, ViaPointMissed, frozen, numbers, unpickled
 
 _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance that was meant to be symmetric
+_MISSED = 3.0  # of a via-point's deviations: more is a miss
+_WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
 _MACHINE = float(np.finfo(np.float64).eps)
 
 
@@ -47,8 +50,7 @@ class Gaussians:
         return len(self.mean)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Unpickled arrays come back writeable.
-        self.__dict__.update({name: frozen(array) for name, array in state.items()})
+        self.__dict__.update(unpickled(state))
 
     @property
     def outputs(self) -> int:
@@ -104,4 +106,34 @@ def _check_covariances(name: str, covariance: Array) -> None:
         raise ValueError(
             f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest[n]:.3g}, and must be above 0. "
             "Add a small variance to the diagonal: (deviation that may be ignored)^2."
+        )
+
+
+def check_pairs(inputs: Array, points: Gaussians, outputs: int) -> None:
+    """Raises ValueError unless there is one normal over that many outputs for each input (N, I)."""
+    if points.mean.shape != (len(inputs), outputs):
+        raise ValueError(f"{len(points)} normals over {points.outputs} outputs given for {len(inputs)} inputs; {len(inputs)} over {outputs} needed.")
+
+
+def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
+    """Warns of the desired points that the mean (V, O) is far from, in their deviations and in the unit."""
+    count, d = len(mean), desired.outputs // channels
+    miss = (desired.mean - mean).reshape(count, channels, d)
+    far = np.sqrt((miss * miss).sum(axis=2))  # (V, C)
+    if not (far > _WORTH_SAYING).any():
+        return
+    told = []
+    for c in range(channels):
+        block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
+        deviations = np.linalg.norm(np.linalg.solve(np.linalg.cholesky(block), miss[:, c, :, None]), axis=(1, 2))
+        told += [
+            f"{n} by {far[n, c]:.3g} ({deviations[n]:.3g} deviations)" for n in np.flatnonzero((far[:, c] > _WORTH_SAYING) & (deviations > _MISSED))
+        ]
+    if told:
+        warnings.warn(
+            f"Via-points missed [unit of the outputs]: {', '.join(told)}. Another point near in the inputs asks for "
+            "something else, or lambda is large: give the via-point less variance, replace what is near by a "
+            "larger tolerance, or take a larger ell.",
+            ViaPointMissed,
+            stacklevel=3,
         )

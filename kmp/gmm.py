@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, frozen, numbers, positive
+from kmp.checks import Array, frozen, numbers, positive, unpickled
 from kmp.gaussians import Gaussians
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
@@ -38,8 +38,7 @@ class GaussianMixture:
         object.__setattr__(self, "covariances", components.covariance)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Unpickled arrays come back writeable.
-        self.__dict__.update({name: frozen(array) for name, array in state.items()})
+        self.__dict__.update(unpickled(state))
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
@@ -55,8 +54,8 @@ class GaussianMixture:
         if len(data) < components:
             raise ValueError(f"{len(data)} samples given for {components} components: give at least {components} samples, or fewer components.")
         # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
-        from sklearn.mixture import GaussianMixture as Estimator  # noqa: PLC0415
-        from threadpoolctl import threadpool_limits  # noqa: PLC0415
+        from sklearn.mixture import GaussianMixture as Estimator
+        from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
             found = Estimator(

@@ -2,45 +2,68 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import lapack
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, frozen, numbers, positive
-from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel
+from kmp import storage
+from kmp.bound import error_bound
+from kmp.checks import Array, RankReached, frozen, numbers, positive, unpickled
+from kmp.dense import Dense
+from kmp.features import Features
+from kmp.gaussians import Gaussians, check_pairs, warn_of_missed
+from kmp.kernel import Kernel, spread
+from kmp.low_rank import Conditioned, LowRank
+from kmp.problem import Problem
 
 _BATCH = 256  # queries at once, which bounds the memory of `predict`
-_BANDS = 4  # of the whitener: with 4, five eighths of the square are kept
+_DISTANCES = 10_000_000  # from via-points to the base's points, at once
+_ROWS = 8192  # reference points at once
 _MACHINE = float(np.finfo(np.float64).eps)
+_SMALL = 1500  # N O up to which the dense solution is the faster one
+_LARGE = 6000  # N O beyond which the dense solution takes seconds and 300 MB
+_RANK = 400
+_TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
+_ROUNDING = 1e-12  # share that rounding may leave, whatever was asked for
+_LEFT = 1e-10  # the same, for the uncertainty that is distance from the data
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The covariance of `predict` in two parts, each (M, O, O) [unit of the outputs^2], whose sum it is."""
+
+    variability: Array
+    """How much the demonstrations differ from each other there."""
+    distance: Array
+    """How far the query is from the data: what would remain if each reference point were exact."""
 
 
 @dataclass(frozen=True, eq=False)
 class KMP:
-    """A skill: the reference database, the via-points in it, and the weights. From `fit`, `adapt`, `from_arrays`.
+    """A skill: the reference database, the via-points in it, and its solution. From `fit`, `adapt`, `from_arrays`.
 
     N points in all, I inputs, O outputs. Immutable, so that threads may share it. `inputs` (N, I) and `reference` (N)
     are the database after adaptation: the points of `base` that were not replaced, then `via_inputs` with `via_points`.
     What is fitted depends on the fields alone, bit for bit, however the primitive came about.
     """
 
-    kernel: GaussianKernel
-    lambda_mean: float
-    lambda_covariance: float
-    prior_mean: Array
-    inputs: Array
-    reference: Gaussians
+    kernel: Kernel
+    problem: Problem
+    own_inputs: Array
+    """The base's points, or after an adaptation the via-points."""
+    own_reference: Gaussians
     replaced: NDArray[np.intp]
     """(R,) the indices of the base's points that via-points took the place of, ascending."""
     origin: KMP | None
     """The base, or None in the base itself."""
+    solution: Dense | LowRank | Conditioned
 
     @classmethod
     def fit(
@@ -48,31 +71,61 @@ class KMP:
         inputs: ArrayLike,
         reference: Gaussians,
         *,
-        kernel: GaussianKernel,
+        kernel: Kernel,
         lambda_mean: float,
         lambda_covariance: float | None = None,
         prior_mean: ArrayLike | None = None,
+        representation: Literal["auto", "dense", "low_rank"] = "auto",
+        rank: int = _RANK,
+        rank_tolerance: float = _TOLERANCE,
     ) -> KMP:
         """The primitive of a reference database: inputs (N, I), N normals over O outputs.
 
         `prior_mean` (O,) [unit of the outputs] is what the mean returns to far from the inputs, the origin by default.
-        `lambda_covariance` None is `lambda_mean`; another value costs a second Cholesky factor.
+        `lambda_covariance` None is `lambda_mean`; another value costs a second factor.
+
+        `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost (4) on at most
+        `rank` features of the kernel, which leave a share of at most `rank_tolerance` of it at the inputs. "auto" is
+        dense for few points or where the rank does not suffice, and low rank for many. A rank that did not suffice is
+        said in a `RankReached` warning, with the accuracy that was lost.
         """
-        return cls._base(
-            inputs,
-            reference,
-            kernel=kernel,
-            lambda_mean=lambda_mean,
-            lambda_covariance=lambda_covariance,
-            prior_mean=prior_mean,
-        )._solved()
+        s = numbers("inputs", inputs, "N", "I")
+        if len(s) == 0:
+            raise ValueError("inputs: no reference point given, at least 1 needed.")
+        problem = Problem.of(s, reference, kernel, lambda_mean=lambda_mean, lambda_covariance=lambda_covariance, prior_mean=prior_mean)
+        if representation not in {"auto", "dense", "low_rank"}:
+            raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
+        if rank < 1:
+            raise ValueError(f"rank is {rank}, and must be at least 1.")
+        positive("rank_tolerance", rank_tolerance)
+        size = reference.mean.size
+        if representation == "dense" or (representation == "auto" and size <= _SMALL):
+            return cls.of_base(s, reference, problem, Dense(kernel, problem, s, reference).solved())
+        features, left = Features.of(kernel, s, rank=rank, tolerance=rank_tolerance)
+        reached = len(features.pivots) >= rank
+        enough = left <= max(rank_tolerance if reached else 100 * rank_tolerance, _ROUNDING)
+        if representation == "auto" and not enough and size <= _LARGE:
+            return cls.of_base(s, reference, problem, Dense(kernel, problem, s, reference).solved())
+        self = cls.of_base(s, reference, problem, LowRank.fit(features, problem, s, reference).solved())
+        if not enough:
+            warnings.warn(
+                f"rank: {rank} features leave up to {left:.2g} of the kernel at the {len(s)} inputs, and "
+                f"{rank_tolerance:.2g} was asked for: the mean at them may be off by up to {self.error_bound:.2g} "
+                "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
+                RankReached,
+                stacklevel=2,
+            )
+        return self
 
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O). Equation (8). One query alone may differ by rounding from it in a set."""
         s = self._checked(queries)
         if len(s) == 1:
-            return (self.kernel.value_at(s - self.inputs) @ self.weights + self.prior_mean)[None]
-        return self.kernel(s, self.inputs) @ self.weights + self.prior_mean
+            return self._mean_of(self.kernel.row_at(s - self._centres))
+        mean = (self.kernel(s, self._centres) @ self._weights).reshape(len(s), self.outputs) + self._prior
+        for n in np.flatnonzero(np.isnan(mean[:, 0]))[:1]:
+            raise ValueError(f"queries[{n}]: {s[n]} given, and every number must be finite.")
+        return mean
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals. The mean is that of `mean`, bit for bit.
@@ -81,30 +134,42 @@ class KMP:
         The first prediction inverts the triangular factor: make one before there is a deadline.
         """
         s = self._checked(queries)
+        solution = self.solution
         if len(s) == 1:
-            k = self.kernel.value_at(s - self.inputs)
-            mean = (k @ self.weights + self.prior_mean)[None]
-            root = np.concatenate([band @ k[: band.shape[1]] for band in self._whitener]).reshape(-1, self.outputs).T
-            explained = blas.dgemm(1.0, root, root, trans_b=1)[None]
+            row = self.kernel.row_at(s - self._centres)
+            mean = self._mean_of(row)
+            unexplained = solution.unexplained_one(row)[None]
         else:
             mean = self.mean(s)
-            parts = [self._explained(s[i : i + _BATCH]) for i in range(0, len(s), _BATCH)]
-            explained = np.concatenate(parts) if parts else np.empty((0, self.outputs, self.outputs))
-        unexplained = _positive(self._unit - explained)  # k(s, s) = 1
-        return Gaussians.trusted(mean, unexplained * (len(self.inputs) / self.lambda_covariance))
+            parts = [solution.unexplained(self.kernel(s[i : i + _BATCH], solution.centres)) for i in range(0, len(s), _BATCH)]
+            unexplained = np.concatenate(parts) if parts else np.empty((0, self.outputs, self.outputs))
+        return Gaussians.trusted(mean, _positive(unexplained) * (self._count / self.problem.lambda_covariance))
+
+    def uncertainty(self, queries: ArrayLike) -> Uncertainty:
+        """The covariance at queries (M, I), split: how the demonstrations vary, and how far away they are.
+
+        The second is what IJRR 2019's covariance would be with Sigma = 0.
+        """
+        s = self._checked(queries)
+        total = self.predict(s).covariance
+        c = self.kernel.channels
+        z = self._spanned(s).T.reshape(len(s), c, -1)
+        left = _positive(spread(self.kernel.own - z @ z.transpose(0, 2, 1), self.outputs // c))
+        distance = left * (self._count / self.problem.lambda_covariance)
+        return Uncertainty(frozen(_positive(total - distance)), frozen(distance))
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs]. Equation (8), derived."""
-        offsets = self._checked_one("query", query) - self.inputs
-        return np.asarray((self._weight_rows * self.kernel.slope_at(offsets)) @ offsets)
+        offsets = self._checked_one("query", query) - self._centres
+        return _finite(self.kernel.jacobian_of(offsets, self._weight_rows))
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,), direction v (I,): (O,). Equation (8), derived twice.
 
         Where v is the velocity of the input, this is the part of the output's acceleration that the velocity makes.
         """
-        offsets = self._checked_one("query", query) - self.inputs
-        return self.kernel.curvature_at(offsets, self._checked_one("direction", direction)) @ self.weights
+        offsets = self._checked_one("query", query) - self._centres
+        return self.kernel.curvature_of(offsets, self._checked_one("direction", direction), self._weights)
 
     def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> KMP:
         """A new primitive that also goes through the desired points: inputs (V, I), V normals. Algorithm 1.
@@ -112,41 +177,36 @@ class KMP:
         A desired point nearer than `tolerance` [unit of the inputs] to a point of the *base's* reference takes the
         place of its nearest one (of all, where several are equally near); any other is inserted. The order of
         the desired points does not matter. Earlier via-points stay: to be rid of them, adapt `base` anew.
+
+        A desired point that is then missed by more than 3 of its deviations, and by more than 0.001 (1 mm, where the
+        unit is the metre), is named in a `ViaPointMissed` warning.
         """
-        via = numbers("inputs", inputs, "V", self.inputs.shape[1])
-        _check_pairs(via, desired, self.outputs)
+        via = numbers("inputs", inputs, "V", self._dimensions)
+        check_pairs(via, desired, self.outputs)
         if not tolerance >= 0:
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
         if len(via) == 0:
             return self
         base = self.base
-        distance = cdist(via, base.inputs)  # (V, N of the base)
-        nearest = distance.min(axis=1, keepdims=True)
-        claimed = ((distance == nearest) & (nearest < tolerance)).any(axis=0)
+        claimed = np.zeros(len(base.inputs), dtype=bool)
         claimed[self.replaced] = True
-        return base._adapted(
+        step = max(1, _DISTANCES // len(claimed))
+        for i in range(0, len(via), step):
+            distance = cdist(via[i : i + step], base.inputs)  # (V, N of the base)
+            nearest = distance.min(axis=1, keepdims=True)
+            claimed |= ((distance == nearest) & (nearest < tolerance)).any(axis=0)
+        adapted = base.changed(
             np.flatnonzero(claimed),
             np.concatenate([self.via_inputs, via]),
             Gaussians.concatenated([self.via_points, desired]),
-        )._solved()
+        )
+        adapted.solution.solved()
+        warn_of_missed(desired, adapted.mean(via), self.kernel.channels)
+        return adapted
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All that `from_arrays` needs, by name: base and via-points apart, their fitted weights, the parameters."""
-        return {
-            "base_inputs": self.base.inputs,
-            "base_mean": self.base.reference.mean,
-            "base_covariance": self.base.reference.covariance,
-            "base_weights": self.base.weights,
-            "via_inputs": self.via_inputs,
-            "via_mean": self.via_points.mean,
-            "via_covariance": self.via_points.covariance,
-            "replaced": self.replaced,
-            "weights": self.weights,
-            "ell": np.array(self.kernel.ell),
-            "lambda_mean": np.array(self.lambda_mean),
-            "lambda_covariance": np.array(self.lambda_covariance),
-            "prior_mean": self.prior_mean,
-        }
+        return storage.to_arrays(self)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> KMP:
@@ -155,213 +215,165 @@ class KMP:
         Nothing is fitted here: the factors are made when `predict` or `adapt` first asks for them, and come out the
         same bit for bit, given the same libraries and kind of processor.
         """
-        if missing := [name for name in _ARRAYS if name not in arrays]:
-            raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(_ARRAYS)}.")
-        base = cls._base(
-            arrays["base_inputs"],
-            Gaussians(arrays["base_mean"], arrays["base_covariance"]),
-            kernel=GaussianKernel(float(arrays["ell"])),
-            lambda_mean=float(arrays["lambda_mean"]),
-            lambda_covariance=float(arrays["lambda_covariance"]),
-            prior_mean=arrays["prior_mean"],
-        )
-        base.__dict__["weights"] = numbers("base_weights", arrays["base_weights"], len(base.inputs), base.outputs)
-        via = numbers("via_inputs", arrays["via_inputs"], "V", base.inputs.shape[1])
-        points = Gaussians(arrays["via_mean"], arrays["via_covariance"])
-        _check_pairs(via, points, base.outputs)
-        if len(via) == 0:
-            return base
-        replaced = np.array(arrays["replaced"], dtype=np.intp)
-        n = len(base.inputs)
-        if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
-            raise ValueError(f"replaced: {replaced} given, ascending indices of the {n} base points needed.")
-        self = base._adapted(replaced, via, points)
-        self.__dict__["weights"] = numbers("weights", arrays["weights"], len(self.inputs), self.outputs)
-        return self
+        return storage.from_arrays(cls, arrays)
+
+    @property
+    def lambda_mean(self) -> float:
+        """lambda of equation (9)."""
+        return self.problem.lambda_mean
+
+    @property
+    def lambda_covariance(self) -> float:
+        """lambda of the covariance."""
+        return self.problem.lambda_covariance
+
+    @property
+    def prior_mean(self) -> Array:
+        """(O,) what the mean returns to far from the inputs."""
+        return self.problem.prior_mean
 
     @property
     def base(self) -> KMP:
         """The primitive before any adaptation: itself, if there was none."""
         return self.origin or self
 
+    @cached_property
+    def inputs(self) -> Array:
+        """(N, I) where the reference points are: the base's that were not replaced, then the via-points."""
+        if isinstance(self.solution, Dense):
+            return self.solution.inputs
+        if self.origin is None:
+            return self.own_inputs
+        return _changed(self.origin, self.replaced, self.own_inputs, self.own_reference)[0]
+
+    @cached_property
+    def reference(self) -> Gaussians:
+        """The N reference points."""
+        if isinstance(self.solution, Dense):
+            return self.solution.reference
+        if self.origin is None:
+            return self.own_reference
+        return _changed(self.origin, self.replaced, self.own_inputs, self.own_reference)[1]
+
     @property
     def via_inputs(self) -> Array:
         """(V, I) where the via-points are."""
-        return self.inputs[self._kept :]
+        return self.own_inputs[:0] if self.origin is None else self.own_inputs
 
     @property
     def via_points(self) -> Gaussians:
         """The V via-points."""
-        return self.reference.take(slice(self._kept, None))
+        return self.own_reference.take(slice(0, 0)) if self.origin is None else self.own_reference
 
     @property
     def outputs(self) -> int:
         """O."""
-        return self.reference.outputs
+        return self.own_reference.outputs
+
+    @property
+    def representation(self) -> Literal["dense", "low_rank"]:
+        """How the primitive is solved."""
+        return "dense" if isinstance(self.solution, Dense) else "low_rank"
+
+    @property
+    def weights(self) -> Array:
+        """The weights of equation (8): alpha (N, O) of equation (9), or those of the low rank solution's centres."""
+        return self.solution.weights
 
     @cached_property
-    def weights(self) -> Array:
-        """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        solution, _ = lapack.dpotrs(self._factor, (self.reference.mean - self.prior_mean).ravel(), lower=1)
-        return frozen(np.ascontiguousarray(solution).reshape(self.reference.mean.shape))
+    def error_bound(self) -> float:
+        """How far the mean at the reference points can be from the dense solution's [unit of the outputs], at most.
+
+        0 for the dense solution; rigorous but for rounding, and pessimistic by one to three orders.
+        """
+        if isinstance(self.solution, Dense):
+            return 0.0
+        mean = np.concatenate([self.mean(self.inputs[i : i + _ROWS]) for i in range(0, self._count, _ROWS)])
+        return error_bound(self.solution, self.inputs, self.reference, mean, lambda_mean=self.problem.lambda_mean)
+
+    @cached_property
+    def _prior(self) -> Array:
+        return self.problem.prior_mean
+
+    @cached_property
+    def _centres(self) -> Array:
+        return self.solution.centres
+
+    @cached_property
+    def _weights(self) -> Array:
+        return self.solution.weights.reshape(-1, self.outputs // self.kernel.channels)
 
     @cached_property
     def _weight_rows(self) -> Array:
-        return frozen(np.ascontiguousarray(self.weights.T))
+        return frozen(np.ascontiguousarray(self._weights.T))
 
     @cached_property
-    def _unit(self) -> Array:
-        return frozen(np.eye(self.outputs))
-
-    @property
-    def _kept(self) -> int:
-        return len(self.inputs) if self.origin is None else len(self.origin.inputs) - len(self.replaced)
+    def _spanned(self) -> Features:
+        centres = self.solution.centres
+        return Features.of(self.kernel, centres, rank=len(centres), tolerance=_LEFT)[0]
 
     @cached_property
-    def _factor(self) -> Array:
-        return self._factorised(self.lambda_mean, self.origin._factor if self.origin else None)
+    def _dimensions(self) -> int:
+        return int(self.own_inputs.shape[1])
 
     @cached_property
-    def _covariance_factor(self) -> Array:
-        if self.lambda_covariance == self.lambda_mean:
-            return self._factor
-        return self._factorised(self.lambda_covariance, self.origin._covariance_factor if self.origin else None)
-
-    def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
-        """The lower Cholesky factor (N O, N O) of K (x) I + lambda Sigma: the base's, down to the first changed row."""
-        o = self.outputs
-        same = 0
-        if base_factor is not None:
-            same = int(self.replaced[0]) if len(self.replaced) else self._kept
-        n, p = len(self.inputs) * o, same * o
-        new = np.zeros((len(self.inputs) - same, o, len(self.inputs), o))
-        k = self.kernel(self.inputs[same:], self.inputs)
-        for i in range(o):
-            new[:, i, :, i] = k
-        points = np.arange(len(new))
-        new[points, :, points + same, :] += penalty * self.reference.covariance[same:]
-        rows = new.reshape(n - p, n)
-        factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
-        corner = rows[:, p:]
-        if base_factor is not None and p > 0:
-            factor[:p, :p] = base_factor[:p, :p]
-            left, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
-            factor[p:, :p] = left.T
-            corner = corner - left.T @ left
-        factor[p:, p:], info = lapack.dpotrf(corner, lower=1, clean=1)
-        if info:
-            raise ValueError(
-                f"K + lambda Sigma is not positive definite to working precision at point {same + (info - 1) // o}, "
-                f"with lambda {penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
-            )
-        return frozen(factor)
-
-    @cached_property
-    def _whitener(self) -> tuple[Array, ...]:
-        """The inverse of the triangular factor L, (N O O, N), so that it times k (N,) is L^-1 (k (x) I).
-
-        In bands of rows, each without the columns beyond the triangle.
-        """
-        n, o = self.reference.mean.shape
-        inverse, _ = lapack.dtrtri(self._covariance_factor, lower=1)
-        rows = inverse.reshape(n * o, n, o)
-        edges = [n * band // _BANDS for band in range(_BANDS + 1)]
-        return tuple(
-            frozen(np.ascontiguousarray(rows[a * o : b * o, :b].transpose(0, 2, 1)).reshape(-1, b))
-            for a, b in pairwise(edges)
-            if a < b  # fewer points than bands
-        )
-
-    def _explained(self, queries: Array) -> Array:
-        k = self.kernel(queries, self.inputs)
-        root = np.concatenate([band @ k[:, : band.shape[1]].T for band in self._whitener])
-        roots = root.reshape(-1, self.outputs, len(queries)).transpose(2, 0, 1)  # (M, N O, O)
-        return np.asarray(roots.transpose(0, 2, 1) @ roots)
+    def _count(self) -> int:
+        return len(self.own_inputs) + (0 if self.origin is None else len(self.origin.own_inputs) - len(self.replaced))
 
     @classmethod
-    def _base(
-        cls,
-        inputs: ArrayLike,
-        reference: Gaussians,
-        *,
-        kernel: GaussianKernel,
-        lambda_mean: float,
-        lambda_covariance: float | None,
-        prior_mean: ArrayLike | None,
-    ) -> KMP:
-        s = numbers("inputs", inputs, "N", "I")
-        if len(s) == 0:
-            raise ValueError("inputs: no reference point given, at least 1 needed.")
-        _check_pairs(s, reference, reference.outputs)
-        if lambda_covariance is None:
-            lambda_covariance = lambda_mean
-        if prior_mean is None:
-            prior_mean = np.zeros(reference.outputs)
-        return cls(
-            kernel=kernel,
-            lambda_mean=positive("lambda_mean", lambda_mean),
-            lambda_covariance=positive("lambda_covariance", lambda_covariance),
-            prior_mean=numbers("prior_mean", prior_mean, reference.outputs),
-            inputs=s,
-            reference=reference,
-            replaced=frozen(np.empty(0, dtype=np.intp)),
-            origin=None,
-        )
+    def of_base(cls, inputs: Array, reference: Gaussians, problem: Problem, solution: Dense | LowRank) -> KMP:
+        """The primitive before any adaptation, of a database and its solution."""
+        nothing = frozen(np.empty(0, dtype=np.intp))
+        return cls(solution.kernel, problem, inputs, reference, nothing, None, solution)
 
-    def _adapted(self, replaced: NDArray[np.intp], via_inputs: Array, via_points: Gaussians) -> KMP:
-        kept = np.delete(np.arange(len(self.inputs)), replaced)
-        return KMP(
-            kernel=self.kernel,
-            lambda_mean=self.lambda_mean,
-            lambda_covariance=self.lambda_covariance,
-            prior_mean=self.prior_mean,
-            inputs=frozen(np.concatenate([self.inputs[kept], via_inputs])),
-            reference=Gaussians.concatenated([self.reference.take(kept), via_points]),
-            replaced=frozen(replaced),
-            origin=self,
-        )
+    def changed(self, replaced: NDArray[np.intp], via_inputs: Array, via_points: Gaussians) -> KMP:
+        """The primitive with these via-points, and without those points of this base whose indices are given."""
+        solution: Dense | LowRank | Conditioned = self.solution
+        if isinstance(solution, Dense):
+            same = int(replaced[0]) if len(replaced) else len(self.inputs)
+            solution = solution.adapted(same, *_changed(self, replaced, via_inputs, via_points))
+        elif isinstance(solution, LowRank) and len(replaced) + len(via_inputs) <= len(solution.centres):
+            changed = np.concatenate([via_inputs, self.inputs[replaced]])
+            points = Gaussians.concatenated([via_points, self.reference.take(replaced)])
+            solution = Conditioned(solution, frozen(changed), points, len(via_inputs))
+        else:  # so many changes cost more, and lose more digits, than a new solution
+            inputs, reference = _changed(self, replaced, via_inputs, via_points)
+            rank = max(_RANK, len(solution.centres) + len(via_inputs))
+            features, _ = Features.of(self.kernel, inputs, rank=rank, tolerance=_TOLERANCE)
+            solution = LowRank.fit(features, self.problem, inputs, reference)
+        own = frozen(via_inputs)
+        return KMP(self.kernel, self.problem, own, via_points, frozen(replaced), origin=self, solution=solution)
 
-    def _solved(self) -> KMP:
-        # What cannot be fitted fails here, not in the first prediction.
-        self.weights  # noqa: B018
-        self._covariance_factor  # noqa: B018
-        return self
+    def _mean_of(self, row: Array) -> Array:
+        return _finite(((row @ self._weights).ravel() + self._prior)[None])
 
     def _checked(self, queries: ArrayLike) -> Array:
         s = np.asarray(queries, dtype=np.float64)
-        if s.ndim != 2 or s.shape[1] != self.inputs.shape[1]:
-            raise ValueError(f"queries: shape {s.shape} given, (M, {self.inputs.shape[1]}) needed.")
+        if s.ndim != 2 or s.shape[1] != self._dimensions:
+            raise ValueError(f"queries: shape {s.shape} given, (M, {self._dimensions}) needed.")
         return s
 
     def _checked_one(self, name: str, value: ArrayLike) -> Array:
         s = np.asarray(value, dtype=np.float64)
-        if s.shape != self.inputs.shape[1:]:
-            raise ValueError(f"{name}: shape {s.shape} given, {self.inputs.shape[1:]} needed.")
+        if s.shape != (self._dimensions,):
+            raise ValueError(f"{name}: shape {s.shape} given, {(self._dimensions,)} needed.")
         return s
 
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy in another process predicts at once; the factors, which only `adapt` needs, are made again there.
-        return {name: value for name, value in self.__dict__.items() if name not in {"_factor", "_covariance_factor"}}
-
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Unpickled arrays come back writeable.
-        for value in state.values():
-            for array in value if isinstance(value, tuple) else (value,):
-                if isinstance(array, np.ndarray):
-                    frozen(array)
-        self.__dict__.update(state)
+        self.__dict__.update(unpickled(state))
 
 
-_ARRAYS = (
-    *("base_inputs", "base_mean", "base_covariance", "base_weights"),
-    *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
-    *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
-)
+def _finite(found: Array) -> Array:
+    # Quicker than a look at each number of the query.
+    if found[0, 0] != found[0, 0]:
+        raise ValueError("The query holds a number that is not finite, and every number must be finite.")
+    return found
 
 
-def _check_pairs(inputs: Array, points: Gaussians, outputs: int) -> None:
-    if points.mean.shape != (len(inputs), outputs):
-        raise ValueError(f"{len(points)} normals over {points.outputs} outputs given for {len(inputs)} inputs; {len(inputs)} over {outputs} needed.")
+def _changed(base: KMP, replaced: NDArray[np.intp], inputs: Array, points: Gaussians) -> tuple[Array, Gaussians]:
+    kept = np.delete(np.arange(len(base.inputs)), replaced)
+    changed = frozen(np.concatenate([base.inputs[kept], inputs]))
+    return changed, Gaussians.concatenated([base.reference.take(kept), points])
 
 
 def _positive(covariance: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -41,6 +42,10 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
         return zenoh.open(config)
     except zenoh.ZError as error:
         reason = str(error).split(" at ")[0]
+        wrong = next((endpoint for endpoint in (*connect, *listen) if not re.match(r"[a-z]+/.+:.+|unixsock-stream/.+", endpoint)), None)
+        if wrong is not None:
+            how = f"connect to {wrong}" if wrong in connect else f"listen on {wrong}"
+            raise UnreachableError(f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed") from None
         if connect and "connect" in reason:
             raise UnreachableError(f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?") from None
         raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None

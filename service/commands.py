@@ -15,7 +15,7 @@ import msgspec
 
 from service import wire
 from service.client import Client, UnreachableError, open_session
-from service.config import ENDPOINT, ExplainedError, Settings, load, path_first
+from service.config import ENDPOINT, ExplainedError, Settings, SettingsError, converted, load
 
 CONNECT_TIMEOUT_S = 3.0
 SHIPPED_SKILL = "soldering.npz"
@@ -73,9 +73,9 @@ def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
         if value is not None:
             section[field] = value
     try:
-        return msgspec.convert(given, Settings)
-    except msgspec.ValidationError as error:
-        raise UsageError(path_first(error)) from None
+        return converted(given, origin="command line")
+    except SettingsError as error:
+        raise UsageError(str(error)) from None
 
 
 def play(args: argparse.Namespace) -> int:
@@ -141,9 +141,7 @@ def learn(args: argparse.Namespace) -> int:
         demonstrations, name=args.name or args.output.stem, seed=args.seed, progress=lambda line: print(line, file=sys.stderr, flush=True)
     )
     args.output.write_bytes(skill.to_bytes())
-    print(
-        f"{args.output}: {len(skill.primitive.inputs)} reference points, far from the demonstrations above {1000 * skill.threshold:.0f} mm of deviation"
-    )
+    print(f"{args.output}: {len(skill.primitive.inputs)} reference points; off the data above {1000 * skill.threshold:.0f} mm of deviation")
     return 0
 
 

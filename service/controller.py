@@ -16,6 +16,8 @@ from service.limiter import Limiter
 from service.skill import Prediction, Skill
 from service.smoother import Smoother
 
+TOO_FAST_S = 0.03  # for so long the tool must be too fast to be a fault: an arm that catches up after a late command is not
+
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
 
@@ -147,7 +149,7 @@ class Controller:
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:
             if heard:
-                state["arm_ready"] = 1
+                state["arm_ready"], state["slow_tick"] = 1, state["tick"]
                 state["joints"] = (state["measured"], np.zeros(7), np.zeros(7))
                 state["setpoint"] = self._at_rest()
             return None
@@ -159,7 +161,9 @@ class Controller:
         if np.abs(state["joints"][0] - state["measured"]).max() > arm.fault_error_rad:
             return Reason.ARM_ERROR
         speed = self._arm.velocity(state["measured"], state["measured_velocities"])
-        return Reason.TOOL_SPEED if math.hypot(*speed) > self._settings.tool.fault_speed else None
+        if math.hypot(*speed) <= self._settings.tool.fault_speed:
+            state["slow_tick"] = state["tick"]
+        return Reason.TOOL_SPEED if (state["tick"] - state["slow_tick"]) * self._settings.period_s > TOO_FAST_S else None
 
     def _why_hold(self, prediction: Prediction | None) -> Reason:
         state = self._state

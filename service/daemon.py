@@ -22,7 +22,7 @@ from service.clock import SPIN_NS, Deadlines, Window, ask_for_real_time
 from service.config import Settings
 from service.controller import Controller, run
 from service.frame import FRAME, SIDES, STAGES, TIMING, Cause, Event, Flag, Frame, Mode, Reason, Tick, blank
-from service.requests import Pending, PlacesFile, Requests
+from service.requests import PlacesFile, Requests
 from service.scribe import Scribe
 from service.skill import Skill, SkillError
 from service.workshop import Workshop
@@ -110,11 +110,12 @@ class Daemon:
             self._laps = []
             inbox = [event for kind, decode, subscriber in self._subscribers if (event := self._receive(kind, decode, subscriber))]
             while self._requests.inbox:
-                inbox.append(self._requests.inbox.popleft().taken(index))
+                if (event := self._requests.inbox.popleft().taken(index)) is not None:
+                    inbox.append(event)
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + STOP_TIMEOUT_S
-                    inbox.append(Pending(Event("hold", wire.encode_string("{}"), None)).event)
+                    inbox.append(Event("hold", wire.encode_string("{}"), None))
                 elif not self._frame["joint_velocities"].any() or time.monotonic() > stop_by:
                     return
             yield Tick(index, tuple(inbox))

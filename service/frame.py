@@ -123,6 +123,7 @@ STATE = np.dtype(
         ("hand_ticks", "<i8", (2,)),  # tick of the newest sample; -1: none yet
         ("arm_stamp_ns", "<i8"),
         ("arm_tick", "<i8"),
+        ("slow_tick", "<i8"),  # the last one at which the tool was not too fast
         ("filters", "<f8", (2, 3, 3)),  # position, velocity, acceleration; by axis
         ("filter_covariances", "<f8", (2, 3, 3)),
         ("measured", "<f8", (7,)),

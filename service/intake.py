@@ -17,6 +17,11 @@ JUMP_M = 0.1  # from where a hand was expected: the filter starts anew there, an
 START_DEVIATIONS = (0.3, 1.0)  # [m/s], [m/s²] of a hand of which one sample is known
 
 
+def _ticks(duration_ms: float, period_s: float) -> int:
+    """The whole ticks that a duration takes, at least one; rounding of the period does not make it one more."""
+    return max(1, math.ceil(round(duration_ms / 1000 / period_s, 6)))
+
+
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
     """The rotation matrix (3, 3) of a quaternion x y z w, normalised first."""
     x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
@@ -34,8 +39,8 @@ class Intake:
 
     def __init__(self, hands: Hands, arm: Arm, period_s: float) -> None:
         self._period_s = period_s
-        self._stale_ticks = max(1, math.ceil(hands.stale_ms / 1000 / period_s))
-        self._silent_ticks = max(1, math.ceil(arm.silent_ms / 1000 / period_s))
+        self._stale_ticks = _ticks(hands.stale_ms, period_s)
+        self._silent_ticks = _ticks(arm.silent_ms, period_s)
         self._scale = UNIT_M[hands.unit]
         self._origin = np.array(hands.base_from_tracker[:3])
         self._axes = rotation(hands.base_from_tracker[3:])
@@ -64,17 +69,30 @@ class Intake:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         transition, noise = self._motion(ticks)
         state["tick"] += ticks
+        means, covariances = state["filters"], state["filter_covariances"]
+        fresh = (self.is_fresh(state, 0), self.is_fresh(state, 1))
+        if all(fresh):
+            means[:] = transition @ means
+            covariances[:] = transition @ covariances @ transition.T + noise
+            return
         for side in (0, 1):
-            if self.is_fresh(state, side):
-                state["filters"][side] = transition @ state["filters"][side]
-                state["filter_covariances"][side] = transition @ state["filter_covariances"][side] @ transition.T + noise
+            if fresh[side]:
+                means[side] = transition @ means[side]
+                covariances[side] = transition @ covariances[side] @ transition.T + noise
             else:
-                state["filters"][side, 1:] = 0.0
+                means[side, 1:] = 0.0
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
-        position = self._axes @ (self._scale * np.array(sample.position)) + self._origin
-        cause = self._why_rejected(state, side, sample, position)
+        cause: Cause | None = None
+        if not (finite(sample.position) and finite(sample.orientation)):
+            cause = Cause.NOT_FINITE
+        elif abs(math.hypot(*sample.orientation) - 1.0) > 0.01:
+            cause = Cause.NOT_A_ROTATION
+        elif math.hypot(*(position := self._in_base(sample.position)).tolist()) > FARTHEST_M:
+            cause = Cause.OUT_OF_RANGE
+        else:
+            cause = self._why_not_newer(sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=self.is_fresh(state, side))
         if cause is not None:
             state["rejected"][cause] += 1
             return
@@ -89,14 +107,9 @@ class Intake:
         state["hand_stamps_ns"][side] = sample.stamp_ns
         state["hand_ticks"][side] = state["tick"]
 
-    def _why_rejected(self, state: Record, side: int, sample: PoseStamped, position: Vector) -> Cause | None:
-        if not (finite(sample.position) and finite(sample.orientation)):
-            return Cause.NOT_FINITE
-        if abs(math.hypot(*sample.orientation) - 1.0) > 0.01:
-            return Cause.NOT_A_ROTATION
-        if math.hypot(*position) > FARTHEST_M:
-            return Cause.OUT_OF_RANGE
-        return self._why_not_newer(sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=self.is_fresh(state, side))
+    def _in_base(self, position: tuple[float, float, float]) -> Vector:
+        """A tracker's position (3,) in frame `base` [m]."""
+        return np.asarray(self._axes @ (self._scale * np.array(position)) + self._origin)
 
     @staticmethod
     def _why_not_newer(stamp_ns: int, newest_ns: int, *, fresh: bool) -> Cause | None:

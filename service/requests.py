@@ -29,23 +29,28 @@ IMMEDIATE = ("hold", "resume", "reset")
 
 
 class Pending:
-    """An event on its way into the loop, and the tick that took it."""
+    """An event on its way into the loop, and the tick that took it. Either the loop takes it or its asker gives it up, never both."""
 
     def __init__(self, event: Event) -> None:
-        self.event = event
+        self._event = event
         self._tick = -1
+        self._claim = threading.Lock()
         self._taken = threading.Event()
 
-    def taken(self, tick: int) -> Event:
-        """The event, marked as consumed by this tick. Called by the loop."""
+    def taken(self, tick: int) -> Event | None:
+        """The event, consumed by this tick, or None where it was given up. Called by the loop."""
+        if not self._claim.acquire(blocking=False):
+            return None
         self._tick = tick
         self._taken.set()
-        return self.event
+        return self._event
 
     def wait(self) -> int:
-        """The tick that consumed it. Raises RequestError where the loop does not."""
+        """The tick that consumed it. Raises RequestError where the loop does not; then it never will."""
         if not self._taken.wait(ADOPTION_TIMEOUT_S):
-            raise wire.RequestError("the control loop did not take the request: it is ending or stalled")
+            if self._claim.acquire(blocking=False):
+                raise wire.RequestError("the control loop did not take the request: it is ending or stalled")
+            self._taken.wait()
         return self._tick
 
 
@@ -73,14 +78,22 @@ class PlacesFile:
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def write(self, skill: Skill) -> None:
-        """Puts the places of this skill into the file."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        """Puts the places of this skill into the file. Raises SkillError."""
+        self.draft(skill).replace(self.path)
+
+    def draft(self, skill: Skill) -> Path:
+        """A new file beside, whole and on disk, that is to replace the old one. Raises SkillError."""
         request = {"points": msgspec.to_builtins(skill.places), "tolerance": skill.tolerance} if skill.places else None
-        with tempfile.NamedTemporaryFile("w", dir=self.path.parent, delete=False) as file:
-            json.dump({"skill": skill.name, "learned_from": skill.learned_from, "request": request}, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(file.name, self.path)
+        content = json.dumps({"skill": skill.name, "learned_from": skill.learned_from, "request": request}, indent=1)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self.path.parent, suffix=".new", delete=False) as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise SkillError(f"cannot save taught places in {self.path.parent}: {error.strerror}") from None
+        return Path(file.name)
 
 
 class Requests:
@@ -178,9 +191,13 @@ class Requests:
 
     def _adopt(self, skill: Skill) -> wire.Reply:
         self._keep(skill.to_bytes())
-        tick = self._through_the_loop(Event("skill", skill.to_bytes(), skill))
+        draft = self._places.draft(skill)  # what cannot be saved is not taught
+        try:
+            tick = self._through_the_loop(Event("skill", skill.to_bytes(), skill))
+            draft.replace(self._places.path)
+        finally:
+            draft.unlink(missing_ok=True)
         self._skill = skill
-        self._places.write(skill)
         return wire.Reply(tick, skill.taught())
 
     def _load(self, name: str) -> wire.Reply:
@@ -200,8 +217,11 @@ class Requests:
                 places = {}
             case wire.Remove(names):
                 for i, name in enumerate(names):
-                    if places.pop(name, None) is None:
+                    if name in names[:i]:
+                        raise wire.RequestError(f"$.names[{i}]: {name!r} given twice, names once each needed")
+                    if name not in places:
                         raise wire.RequestError(f"$.names[{i}]: no place {name!r}. There are: {', '.join(places) or 'none'}")
+                places = {name: place for name, place in places.items() if name not in names}
             case wire.Add(points, tolerance):
                 self._check(points)
                 places |= {point.name: point for point in points}

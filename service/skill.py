@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import pickle
+import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.config import ExplainedError
 from service.frame import Vector
 from service.wire import TaughtPoint, ViaPoint
@@ -82,7 +84,9 @@ class Skill:
         try:
             inputs, outputs, deviations = _points(places)
             desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
-            primitive = self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ViaPointMissed)  # `taught` tells by how much
+                primitive = self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
         except ValueError as error:
             raise SkillError(f"cannot adapt to {[p.name for p in places]}: {error}") from None
         return replace(self, primitive=primitive, places=tuple(places), tolerance=tolerance, known=b"")
@@ -125,28 +129,49 @@ class Skill:
     def from_bytes(cls, data: bytes, *, origin: str) -> Skill:
         """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError."""
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                if int(arrays["format"]) != FORMAT:
-                    raise SkillError(f"{origin}: skill of format {int(arrays['format'])}, {FORMAT} needed")
-                primitive = KMP.from_arrays(dict(arrays))
-                if (primitive.inputs.shape[1], primitive.outputs) != (6, 3):
-                    raise SkillError(f"{origin}: {primitive.inputs.shape[1]} inputs and {primitive.outputs} outputs, 6 and 3 needed")
-                return cls(
-                    name=str(arrays["name"]),
-                    primitive=primitive,
-                    orientation=arrays["orientation"],
-                    box=arrays["box"],
-                    threshold=float(arrays["threshold"]),
-                    learned_from=str(arrays["learned_from"]),
-                    components=int(arrays["components"]),
-                    places=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
-                    tolerance=float(arrays["tolerance"]),
-                    known=bytes(data),
-                )
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                if not isinstance(archive, np.lib.npyio.NpzFile):
+                    raise SkillError(f"{origin}: not a skill (no .npz archive)")
+                arrays = dict(archive)
+            if (kind := arrays["format"].item()) != FORMAT:
+                raise SkillError(f"{origin}: skill of format {kind}, {FORMAT} needed")
+            if not all(np.isfinite(arrays[name]).all() for name in ("weights", "base_weights")):
+                raise SkillError(f"{origin}: weights that are not all finite")
+            primitive = KMP.from_arrays(arrays)
+            skill = cls(
+                name=str(arrays["name"]),
+                primitive=primitive,
+                orientation=arrays["orientation"],
+                box=arrays["box"],
+                threshold=float(arrays["threshold"]),
+                learned_from=str(arrays["learned_from"]),
+                components=int(arrays["components"]),
+                places=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
+                tolerance=float(arrays["tolerance"]),
+                known=bytes(data),
+            )
         except SkillError:
             raise
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, msgspec.DecodeError) as error:
+        except KeyError as error:
+            raise SkillError(f"{origin}: not a skill (the array {error} is missing)") from None
+        except (pickle.UnpicklingError, zipfile.BadZipFile):
+            raise SkillError(f"{origin}: not a skill (no .npz archive)") from None
+        except Exception as error:  # what a damaged archive may raise is not documented by anyone
             raise SkillError(f"{origin}: not a skill ({error})") from None
+        for wrong in skill._faults():
+            raise SkillError(f"{origin}: {wrong}")
+        return skill
+
+    def _faults(self) -> Iterator[str]:
+        """What in the file would harm the motion."""
+        if (self.primitive.inputs.shape[1], self.primitive.outputs) != (6, 3):
+            yield f"{self.primitive.inputs.shape[1]} inputs and {self.primitive.outputs} outputs, 6 and 3 needed"
+        if not (math.isfinite(self.threshold) and self.threshold > 0):
+            yield f"threshold is {self.threshold}, a number above 0 needed"
+        if self.box.shape != (2, 3) or not (self.box[0] < self.box[1]).all() or not np.isfinite(self.box).all():
+            yield f"box is {self.box.tolist()}, lower and upper corner needed"
+        if self.orientation.shape != (4,) or not abs(np.linalg.norm(self.orientation) - 1) < 1e-6:
+            yield f"orientation is {self.orientation.tolist()}, a quaternion x y z w of norm 1 needed"
 
 
 def _points(places: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vector]:
@@ -227,6 +252,8 @@ def learn(
 def _in_phase(demonstration: Demonstrated, longest_s: float = 1.0) -> tuple[Vector, Vector]:
     """Hands and tool, shifted against each other where that makes their speeds agree better: a tool that lags makes the map no function."""
     hands, tool, period_s = demonstration
+    if len(hands) != len(tool):
+        raise SkillError(f"a demonstration of {len(hands)} hand and {len(tool)} tool samples, as many of each needed")
     if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
         raise SkillError("a demonstration holds numbers that are not finite")
     reach = min(int(longest_s / period_s), len(hands) // 4)

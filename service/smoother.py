@@ -27,6 +27,13 @@ class Smoother:
         self._max_acceleration = tool.max_acceleration
         self._max_jerk = tool.max_jerk
         self._ruckig = Ruckig(3, period_s)
+        # Made once for speed; each question sets all that differs, so that nothing is remembered.
+        self._path = Trajectory(3)
+        self._question = InputParameter(3)
+        self._question.synchronization = Synchronization.No
+        self._question.max_velocity = [self._max_speed] * 3
+        self._question.max_acceleration = [self._max_acceleration] * 3
+        self._question.max_jerk = [self._max_jerk] * 3
 
     def step(self, state: Vector, position: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, bool]:
         """The setpoint's position, velocity and acceleration (3, 3) one period on, by axis, and whether a limit was met.
@@ -58,47 +65,42 @@ class Smoother:
             wanted_velocity.append(float(velocity[i]) + approach)
         speed = math.hypot(*wanted_velocity)
         slow_down = min(1.0, SPEED_SHARE * self._max_speed / speed) if speed > 0 else 1.0
-        limited = slow_down < 1.0
+        limited = slowed = slow_down < 1.0
         ahead = []
         for i in range(3):
-            asked = float(acceleration[i]) + w * (slow_down * wanted_velocity[i] - v[i])
+            # at the speed limit what the target does beyond it is not followed
+            asked = (0.0 if slowed else float(acceleration[i])) + w * (slow_down * wanted_velocity[i] - v[i])
             wanted_acceleration = min(push, max(-push, asked))
             limited |= wanted_acceleration != asked
             u = min(jerk, max(-jerk, 3 * w * (wanted_acceleration - a[i])))
             ahead.append((x[i] + dt * (v[i] + dt * (a[i] / 2 + dt * u / 6)), v[i] + dt * (a[i] + dt * u / 2), a[i] + dt * u))
         return np.array(ahead).T, limited
 
-    def _question(self, state: Vector) -> InputParameter:
-        question = InputParameter(3)
-        question.synchronization = Synchronization.No
-        question.current_position, question.current_velocity, question.current_acceleration = state.tolist()
-        question.max_velocity = [self._max_speed] * 3
-        question.max_acceleration = [self._max_acceleration] * 3
-        question.max_jerk = [self._max_jerk] * 3
-        return question
-
-    def _answer(self, question: InputParameter) -> Vector | None:
-        path = Trajectory(3)
-        try:
-            if self._ruckig.calculate(question, path) not in (Result.Working, Result.Finished):
-                return None
-        except RuckigError:
-            return None
-        reached = np.array(path.at_time(self._period_s))
-        return reached if np.isfinite(reached).all() else None
-
     def _reach(self, state: Vector, ahead: Vector) -> Vector | None:
-        question = self._question(state)
+        """Ruckig's state one period on, on its way to the tracker's; None where it knows no way."""
+        question = self._question
+        question.control_interface = ControlInterface.Position
         question.target_position, question.target_velocity, question.target_acceleration = ahead.tolist()
-        return self._answer(question)
+        return self._answer(state)
 
     def _stop(self, state: Vector) -> Vector:
-        question = self._question(state)
+        question = self._question
         question.control_interface = ControlInterface.Velocity
         question.target_velocity, question.target_acceleration = [0.0] * 3, [0.0] * 3
-        stopped = self._answer(question)
+        stopped = self._answer(state)
         if stopped is None:  # from a state no limit allows: brake by hand, without jerk limit
             dt, push = self._period_s, self._max_acceleration
             velocity = state[1] - np.clip(state[1], -push * dt, push * dt)
             stopped = np.stack([state[0] + dt * velocity, velocity, np.zeros(3)])
         return stopped
+
+    def _answer(self, state: Vector) -> Vector | None:
+        question = self._question
+        question.current_position, question.current_velocity, question.current_acceleration = state.tolist()
+        try:
+            if self._ruckig.calculate(question, self._path) not in (Result.Working, Result.Finished):
+                return None
+            reached = np.array(self._path.at_time(self._period_s))
+        except (RuckigError, ValueError):  # the latter where its result has no name
+            return None
+        return reached if np.isfinite(reached).all() else None

@@ -218,6 +218,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     os.environ.setdefault("RUST_LOG", "error")  # or its remarks cover the picture
+    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
     try:
         with ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True, executable_path=str(_executable())) as client:
             client.open(str(source if "://" in str(source) else Path(source).absolute()))

@@ -6,7 +6,6 @@ documentation derive from it.
 
 from __future__ import annotations
 
-import re
 import struct
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
@@ -36,6 +35,7 @@ from service.cdr import (
     in_chain_order,
 )  # fmt: skip
 from service.config import ExplainedError
+from service.explain import explained
 
 __all__ = [
     "BASE",
@@ -156,9 +156,10 @@ def decode_attachment(data: bytes) -> Attachment:
 
 # --- requests and replies --------------------------------------------------------------------------------------------------
 
-Metre = Annotated[float, msgspec.Meta(ge=-10, le=10)]
+_NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
+Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
 Point = tuple[Metre, Metre, Metre]
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"^[\w .-]+\Z")]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)]
 
 
 class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -208,7 +209,7 @@ ViaPointsRequest: TypeAlias = Add | Remove | Clear | List
 class SkillRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Load another skill: the name of a file in the skill folder."""
 
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[\w][\w .-]*\Z")]
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"\A\w[\w .-]*\Z", extra=_NAMES)]
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -235,22 +236,13 @@ class RequestError(ExplainedError, ValueError):
 def decode_request(data: bytes, kind: Any) -> Any:
     """The request in JSON bytes, checked whole against its type. Raises RequestError like "$.points[0].left: 2 numbers, 3 needed"."""
     try:
-        return msgspec.json.decode(data or b"{}", type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        message, found, path = str(error).rpartition(" - at `")
-        path = path.rstrip("`") if found else "$"
-        length = re.fullmatch(r"Expected `array` of length (\d+).*", message)
-        if length:
-            message = f"{_length_at(data, path)} numbers, {length[1]} needed"
-        raise RequestError(f"{path}: {message}" if found else str(error)) from None
-
-
-def _length_at(data: bytes, path: str) -> int:
-    """How many elements the array at a path like `$.points[0].left` has."""
-    value = msgspec.json.decode(data)
-    for field, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
-        value = value[field] if field else value[int(index)]
-    return len(value)
+        given = msgspec.json.decode(data or b"{}")
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RequestError(f"not JSON: {error}") from None
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        raise RequestError(explained(error, given, kind)) from None
 
 
 def encode_json(value: Any) -> bytes:

@@ -86,7 +86,7 @@ def _hands(bench: Bench, t: float, stamp_ns: int) -> list[Event]:
     return events
 
 
-def record(path: Path, settings: Settings, skill: Skill, source: Iterator[Tick], frames: list[Frame], state: Record | None = None) -> None:
+def record(path: Path, settings: Settings, skill: Skill, source: Iterator[Tick], frames: list[Frame], *, state: Record | None = None) -> None:
     """Runs the core on ticks and writes what came of it; `frames` grows as it runs."""
     controller = Controller(settings, skill, state)
     with Recorder(path, settings=settings, skill=skill.to_bytes(), state=controller.state) as recorder:
@@ -116,7 +116,7 @@ def refresh(path: Path) -> dict[str, float]:
     frames: list[Frame] = []
     beside = path.with_suffix(".new")
     skill = Skill.from_bytes(old.skill, origin=str(path))
-    record(beside, old.settings, skill, ticks(old), frames, first.state if first.frame is None else None)
+    record(beside, old.settings, skill, ticks(old), frames, state=first.state if first.frame is None else None)
     beside.replace(path)
     changes: dict[str, float] = {}
     for was, now in zip(before, frames, strict=True):

@@ -10,12 +10,12 @@ import math
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
 from service import wire
-from service.config import path_first
+from service.explain import explained
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -113,16 +113,16 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @staticmethod
     def load(path: Path) -> Scene:
         """The scene in a TOML file, the nominal one where the file says nothing. Raises SceneError."""
+        given: Any = None
         try:
-            return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
+            given = tomllib.loads(path.read_text(encoding="utf-8"))
+            return msgspec.convert(given, Scene)
         except (OSError, UnicodeDecodeError) as error:
             raise SceneError(f"cannot read scene {path}: {error}") from None
         except tomllib.TOMLDecodeError as error:
             raise SceneError(f"{path}: {error}") from None
         except msgspec.ValidationError as error:
-            known = ", ".join(Scene.__struct_fields__)
-            hint = f"; known are {known}" if "unknown field" in str(error) else ""
-            raise SceneError(f"{path}: {path_first(error)}{hint}") from None
+            raise SceneError(f"{path}: {explained(error, given, Scene)}") from None
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -239,9 +239,9 @@ def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(networ
 
 def test_bad_usage_and_bad_scenes_have_their_exit_codes(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("glass = [0.5, 0.38, 0.5]")
-    nowhere = sim("--once")
-    assert nowhere.returncode == 2
-    assert "--connect or --listen" in nowhere.stderr
+    usage = sim("--once", "--hands-rate", "7")
+    assert usage.returncode == 2
+    assert "30 to 500 accepted" in usage.stderr
     bad = sim("--connect", "tcp/127.0.0.1:1", "--scene", str(tmp_path / "scene.toml"))
     assert bad.returncode == 1
     assert "34.0 cm" in bad.stderr

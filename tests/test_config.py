@@ -7,7 +7,6 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service import config
 from service.config import Settings, SettingsError, load, parse
 
 
@@ -42,7 +41,10 @@ def test_a_cell_may_hold_slashes(name: str) -> None:
     assert parse(f'cell = "{name}"', origin="cell.toml").cell == name
 
 
-@pytest.mark.parametrize("name", ["", "/", "a/", "/a", "a//b", "*", "a/*/b", "a/**", "a$*", "a?", "a#", "a b", r"a\n", r"a\u0000b", "..", "a/../b"])
+@pytest.mark.parametrize(
+    "name",
+    ["", "/", "a/", "/a", "*", "a/*/b", "a/**", "a$*", "a?", "a#", "a b", r"a\nb", "a//b", r"a\n", r"a\u0000b", "..", "a/../b"],
+)
 def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
     assert refusal(f'cell = "{name}"').startswith("cell.toml: $.cell: ")
 
@@ -50,29 +52,29 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("text", "path", "accepted"),
     [
-        ("rate_hz = 1001", "$.rate_hz", "<= 1000"),
-        ("rate_hz = 49", "$.rate_hz", ">= 50"),
-        ("rate_hz = 100.5", "$.rate_hz", "`int`"),
+        ("rate_hz = 1001", "$.rate_hz", "from 50 to 1000"),
+        ("rate_hz = 49", "$.rate_hz", "from 50 to 1000"),
+        ("rate_hz = 100.5", "$.rate_hz", "whole number"),
         ("rats = 1", "rats", "rate_hz"),
-        ("[hands]\nunits = 'mm'", "$.hands", "unit"),
+        ("[hands]\nunits = 'mm'", "$.hands", "stale_ms"),
         ("[hands]\nunit = 'inch'", "$.hands.unit", "mm"),
-        ("[hands]\nstale_ms = 0", "$.hands.stale_ms", "> 0"),
-        ("[hands]\nstale_ms = nan", "$.hands.stale_ms", "> 0"),
+        ("[hands]\nstale_ms = 0", "$.hands.stale_ms", "above 0"),
+        ("[hands]\nstale_ms = nan", "$.hands.stale_ms", "accepted"),
         ("[hands]\nbase_from_tracker = [0, 0, 0]", "$.hands.base_from_tracker", "7"),
         ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "hands.base_from_tracker", "1 needed (x y z w)"),
         ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "hands.base_from_tracker", "1 needed (x y z w)"),
         ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "tool.plate_from_tool", "1 needed (x y z w)"),
-        ("[tool]\nmax_speed = -1", "$.tool.max_speed", "> 0"),
+        ("[tool]\nmax_speed = -1", "$.tool.max_speed", "above 0"),
         ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "joints.velocity[0]", "1.5"),
-        ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "joints.velocity[0]", "1.5"),
+        ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "joints.velocity[0]", "finite"),
         ("[joints]\njerk = [1, 1, 0, 1, 1, 1, 1]", "joints.jerk[2]", "500"),
         ("[joints]\nlower = [-3, -1, -1, 0, -1, -1, -1]", "joints.lower[0]", "-2.6"),
         ("[joints]\nupper = [1, 1, 1, 3.2, 1, 1, 1]", "joints.upper[3]", "3.1"),
-        ("[joints]\nupper = [-2.6, 1, 1, 3, 1, 1, 1]", "joints.lower[0]", "less than joints.upper[0] = -2.6"),
+        ("[joints]\nupper = [-2.6, 1, 1, 3, 1, 1, 1]", "joints.lower[0]", "less than $.joints.upper[0] = -2.6"),
         ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "arm.posture[5]", "-1.5707 to 1.5707 accepted"),
         ("[arm]\nsource = 'guess'", "$.arm.source", "assumed"),
         ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "`array`"),
-        ("[files]\nrecord = 3", "$.files.record", "`str`"),
+        ("[files]\nrecord = 3", "$.files.record", "a text needed"),
     ],
 )
 def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, accepted: str) -> None:
@@ -114,10 +116,5 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     file.write_bytes(b'cell = "\xff"')
     with pytest.raises(SettingsError, match="cannot read configuration"):
         load(file)
-    with pytest.raises(SettingsError, match="nowhere.toml"):
+    with pytest.raises(SettingsError, match=r"nowhere\.toml"):
         load(tmp_path / "nowhere.toml")
-
-
-def test_the_path_comes_first_where_a_message_has_one() -> None:
-    assert config.path_first(ValueError("Expected `int` - at `$.a.b`")) == "$.a.b: Expected `int`"
-    assert config.path_first(ValueError("plain")) == "plain"

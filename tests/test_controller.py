@@ -174,7 +174,9 @@ def test_an_arm_that_falls_silent_while_followed_is_a_fault(taught: Skill) -> No
 def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
     controller = Controller(Settings(), taught)
     follow(controller, 0, 300)
-    assert modes(follow(controller, 300, 5, speed=2.0))[-1] == ("fault", "tool_speed")
+    assert modes(follow(controller, 300, 10, speed=2.0))[-1] == ("follow", "none")
+    assert modes(follow(controller, 310, 1))[-1] == ("follow", "none")
+    assert modes(follow(controller, 311, 20, speed=2.0))[-1] == ("fault", "tool_speed")
 
 
 def test_reset_without_a_fault_changes_nothing(taught: Skill) -> None:

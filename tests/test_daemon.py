@@ -123,7 +123,7 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def test_a_place_out_of_reach_is_refused_and_nothing_changes(shared_daemon: Any) -> None:
     before = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
-    far = msgspec.structs.replace(HANDOVER, tool=(1.3, 0.0, 0.3))
+    far = msgspec.structs.replace(HANDOVER, name="far", tool=(1.3, 0.0, 0.3))
     with pytest.raises(RefusedError, match="accepted"):
         shared_daemon.client.add([HANDOVER, far])
     assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == before

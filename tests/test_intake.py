@@ -119,7 +119,16 @@ def test_hands_do_not_share_stamps() -> None:
     assert bench.fresh(RIGHT)
 
 
-@pytest.mark.parametrize(("rate_hz", "stale_ms", "ticks"), [(500, 100.0, 50), (1000, 100.0, 100), (140, 100.0, 14), (500, 99.0, 50), (50, 1.0, 1)])
+@pytest.mark.parametrize(
+    ("rate_hz", "stale_ms", "ticks"),
+    [
+        (500, 100.0, 50),
+        (1000, 100.0, 100),
+        (140, 100.0, 14),
+        (500, 99.0, 50),
+        (50, 1.0, 1),
+    ],
+)
 def test_a_hand_is_stale_after_exactly_the_configured_time(rate_hz: int, stale_ms: float, ticks: int) -> None:
     bench = Bench(Hands(stale_ms=stale_ms), rate_hz=rate_hz)
     bench.hand(1)

@@ -198,7 +198,7 @@ def test_a_state_that_is_no_state_neither_raises_nor_moves_the_others(bad: float
         assert np.array_equal(result.position, state[0], equal_nan=True)
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=100)
 @given(st.tuples(*[st.floats(-1e4, 1e4)] * 21))
 def test_no_finite_state_raises_or_gives_nan(values: tuple[float, ...]) -> None:
     q, dq, ddq = np.array(values).reshape(3, 7)

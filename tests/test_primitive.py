@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 
 properties = settings(max_examples=15, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -210,6 +210,7 @@ def test_the_tolerance_itself_is_not_near_enough():
     assert list(primitive.adapt([[0.5]], point, tolerance=1).replaced) == [0, 1]
 
 
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
 @properties
 @given(seeds, st.floats(0, 3))
 def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
@@ -295,9 +296,84 @@ def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
             one.prior_mean,
             one.reference.mean,
             one.via_inputs,
-            *one._whitener,
+            *one.solution._whitener.bands,
         ]
         assert not any(array.flags.writeable for array in arrays)
+
+
+def test_a_via_point_that_is_missed_is_named_with_the_numbers():
+    primitive = skill()
+    near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
+    points = Gaussians([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], np.tile(1e-4 * np.eye(3), (3, 1, 1)))
+    with pytest.warns(ViaPointMissed, match=r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell") as told:
+        adapted = primitive.adapt(near, points, tolerance=0)
+    assert told[0].filename == __file__
+    miss = np.linalg.norm(adapted.mean(near) - points.mean, axis=1)
+    assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(told[0].message)
+
+
+def test_a_via_point_that_may_be_missed_or_is_missed_by_less_than_a_millimetre_is_not_named():
+    near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
+    for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
+        points = Gaussians([[0.0, 0, 0], [apart, 0, 0]], np.tile(std**2 * np.eye(3), (2, 1, 1)))
+        skill().adapt(near, points, tolerance=0)
+
+
+@properties
+@given(seeds, st.sampled_from([0.01, 3.0, 1000.0]), st.sampled_from(["dense", "low_rank"]))
+def test_other_units_change_nothing(seed, c, representation):
+    inputs, reference = database(seed)
+    points, desired = via(seed, 2, std=0.01)
+    queries = np.random.default_rng(seed + 1).normal(size=(4, 4))
+    one, other = (
+        KMP.fit(
+            f * inputs,
+            Gaussians(f * reference.mean, f**2 * reference.covariance),
+            kernel=GaussianKernel(0.5 / f**2),
+            lambda_mean=2.0 / f**2,
+            representation=representation,
+        )
+        .base.adapt(f * points, Gaussians(f * desired.mean, f**2 * desired.covariance), tolerance=0.1 * f)
+        .predict(f * queries)
+        for f in (1.0, c)
+    )
+    np.testing.assert_allclose(other.mean / c, one.mean, atol=1e-6)
+    np.testing.assert_allclose(other.covariance / c**2, one.covariance, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_the_covariance_is_small_at_a_via_point_and_not_at_a_query_far_from_the_others(representation):
+    inputs, reference = database()
+    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
+    where, points = via(4, 1, std=1e-3)
+    before, after = primitive.predict(where), primitive.adapt(where, points, tolerance=0).predict(where)
+    assert np.trace(after.covariance[0]) < 0.1 * np.trace(before.covariance[0])
+    assert np.linalg.eigvalsh(after.covariance[0])[-1] < 31 * 1e-6 * 1.01  # N times the via-point's own, no more
+
+
+@properties
+@given(seeds, st.sampled_from(["dense", "low_rank"]))
+def test_the_uncertainty_is_the_demonstrations_variability_and_the_distance_from_them(seed, representation):
+    inputs, reference = database(seed)
+    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
+    queries = np.concatenate([inputs[:3], np.random.default_rng(seed).normal(size=(3, 4)), np.full((1, 4), 50.0)])
+    parts = primitive.uncertainty(queries)
+    total = primitive.predict(queries).covariance
+    np.testing.assert_allclose(parts.variability + parts.distance, total, rtol=1e-6, atol=1e-7)
+    for part in (parts.variability, parts.distance):
+        assert (np.linalg.eigvalsh(part) > -1e-12).all()
+    assert np.abs(parts.distance[:3]).max() < 1e-6  # at the data, all is the demonstrations'
+    np.testing.assert_allclose(parts.variability[-1], 0, atol=1e-9)  # far away, nothing is
+    np.testing.assert_allclose(parts.distance[-1], 15 * np.eye(3), rtol=1e-9)
+
+
+def test_without_variability_all_uncertainty_is_distance():
+    inputs, reference = database()
+    queries = np.random.default_rng(5).normal(size=(4, 4))
+    exact = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
+    of_exact = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=2.0).predict(queries).covariance
+    found = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0).uncertainty(queries).distance
+    np.testing.assert_allclose(found, of_exact, rtol=1e-4, atol=1e-6)
 
 
 def test_threads_may_share_a_primitive():
@@ -335,6 +411,10 @@ def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
         (lambda: fit().predict(np.zeros((1, 3))), r"queries: shape \(1, 3\) given, \(M, 4\) needed"),
         (lambda: fit().jacobian(np.zeros((1, 4))), r"query: shape \(1, 4\) given, \(4,\) needed"),
         (lambda: fit().curvature(np.zeros(4), np.zeros(3)), r"direction: shape \(3,\) given, \(4,\) needed"),
+        (lambda: fit().mean([[0, np.nan, 0, 0]]), "The query holds a number that is not finite"),
+        (lambda: fit().predict([[0, np.nan, 0, 0]]), "The query holds a number that is not finite"),
+        (lambda: fit().jacobian([0, np.nan, 0, 0]), "The query holds a number that is not finite"),
+        (lambda: fit().predict(np.array([[0, 1, 0, 0], [0, np.nan, 0, 0]])), r"queries\[1\]: \[ ?0\. nan .* must be finite"),
         (lambda: fit().adapt(*via(0, 1), tolerance=-1), "tolerance is -1, and must not be below 0"),
         (lambda: fit().adapt(*via(0, 1), tolerance=np.nan), "tolerance is nan"),
         (lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1), r"inputs: shape \(1, 2\) given, \(V, 4\) needed"),

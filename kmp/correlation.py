@@ -1,0 +1,138 @@
+"""Correlation-adaptive imitation: how strongly the outputs are tied to each other, learned from a reward.
+
+The paper, section II-D: the reference's covariances become Lambda(s)^T Sigma Lambda(s), equation (11), and the diagonal
+Lambda(s) is found by policy improvement with path integrals with constant exploration, as in section III-B; the reward
+is the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.distance import cdist
+
+from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.gaussians import Gaussians
+from kmp.primitive import KMP
+
+Reward = Callable[[Array], float]
+"""How good a predicted trajectory (M, O) is; higher is better."""
+
+_SHARPNESS = 10.0  # h of the exponential weights, usual in path integral methods
+_SMALLEST = 0.05  # of Lambda: below it a covariance would be near to singular
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions: one factor for each of O outputs.
+
+    centres (B, I) and width [unit of the inputs] of the basis functions, theta (B, O). Read-only. Lambda = 1 leaves the
+    covariances as they are. Factors below 0.05 are 0.05.
+    """
+
+    centres: Array
+    width: float
+    theta: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centres", numbers("centres", self.centres, "B", "I"))
+        object.__setattr__(self, "width", positive("width", self.width))
+        object.__setattr__(self, "theta", numbers("theta", self.theta, len(self.centres), "O"))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(unpickled(state))
+
+    @classmethod
+    def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
+        """Lambda = 1 everywhere, for so many outputs."""
+        places = numbers("centres", centres, "B", "I")
+        return cls(places, width, np.ones((len(places), outputs)))
+
+    def __call__(self, inputs: ArrayLike) -> Array:
+        """The diagonals of Lambda at inputs (N, I): (N, O)."""
+        s = numbers("inputs", inputs, "N", self.centres.shape[1])
+        exponent = -0.5 * cdist(s, self.centres, "sqeuclidean") / self.width**2
+        phi = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+        return np.asarray(np.maximum((phi / phi.sum(axis=1, keepdims=True)) @ self.theta, _SMALLEST))
+
+    def applied(self, primitive: KMP) -> KMP:
+        """The primitive of the cost (11): its base's covariances changed, and its via-points as they were."""
+        base = primitive.base
+        scale = self(base.inputs)
+        covariance = scale[:, :, None] * base.reference.covariance * scale[:, None, :]
+        adapted = KMP.fit(
+            base.inputs,
+            Gaussians(base.reference.mean, covariance),
+            kernel=base.kernel,
+            lambda_mean=base.lambda_mean,
+            lambda_covariance=base.lambda_covariance,
+            prior_mean=base.prior_mean,
+            representation=base.representation,
+        )
+        if len(primitive.via_inputs) == 0:
+            return adapted
+        return adapted.changed(primitive.replaced, primitive.via_inputs, primitive.via_points)
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """What `improve` found."""
+
+    correlation: Correlation
+    """The best Lambda of all that were tried."""
+    primitive: KMP
+    """The primitive with it."""
+    rewards: Array
+    """(U + 1,) the reward of the policy itself before the first update and after each."""
+
+
+def improve(
+    primitive: KMP,
+    reward: Reward,
+    queries: ArrayLike,
+    *,
+    correlation: Correlation,
+    exploration: float,
+    updates: int,
+    rollouts: int,
+    seed: int,
+) -> Improvement:
+    """The Lambda(s) that makes the trajectory at `queries` (M, I) more rewarding. The paper, equation (11), section III-B.
+
+    Each update draws `rollouts` theta + epsilon, epsilon of standard deviation `exploration`, the same in each update
+    (constant exploration); fits and adapts the primitive with each; and moves theta by the mean of the epsilons,
+    weighted with exp(h (R - max R) / (max R - min R)), h = 10. The via-points of the primitive are kept.
+    """
+    s = numbers("queries", queries, "M", primitive.inputs.shape[1])
+    positive("exploration", exploration)
+    if rollouts < 2 or updates < 1:
+        raise ValueError(f"{rollouts} rollouts and {updates} updates given; at least 2 and 1 are needed.")
+    if correlation.theta.shape[1] != primitive.outputs:
+        raise ValueError(f"correlation: {correlation.theta.shape[1]} outputs given, {primitive.outputs} needed.")
+    random = np.random.default_rng(seed)
+
+    def tried(theta: Array) -> tuple[float, Correlation]:
+        policy = replace(correlation, theta=theta)
+        value = float(reward(policy.applied(primitive).mean(s)))
+        if not np.isfinite(value):
+            raise ValueError(f"The reward is {value}, and must be a finite number for any trajectory (M, O).")
+        return value, policy
+
+    theta = correlation.theta
+    best = tried(theta)
+    rewards = [best[0]]
+    for _ in range(updates):
+        epsilon = exploration * random.standard_normal((rollouts, *theta.shape))
+        found = [tried(theta + one) for one in epsilon]
+        values = np.array([value for value, _ in found])
+        span = max(values.max() - values.min(), np.finfo(np.float64).tiny)
+        weights = np.exp(_SHARPNESS * (values - values.max()) / span)
+        theta = theta + np.tensordot(weights / weights.sum(), epsilon, axes=1)
+        now = tried(theta)
+        rewards.append(now[0])
+        best = max([best, now, *found], key=lambda one: one[0])
+    return Improvement(best[1], best[1].applied(primitive), frozen(np.array(rewards)))

@@ -1,0 +1,176 @@
+"""Orientation as a skill: unit quaternions in a tangent space, with angular velocity.
+
+Huang et al., Generalized Orientation Learning in Robot Task Space, ICRA 2019, and Toward Orientation Learning and
+Adaptation in Cartesian Space, T-RO 2021 ("T-RO"). zeta = log(q conj(q_a)) (3) lies in the tangent space at an auxiliary
+quaternion q_a; |zeta| is half of the angle of rotation. Quaternions are x y z w, and q and -q are one orientation;
+rotations multiply from the left, so that axes, angular velocities and deviations are those of the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kmp.checks import Array, frozen, numbers, unpickled
+from kmp.gaussians import Gaussians
+from kmp.primitive import KMP
+
+_TINY = 1e-4  # [rad] below it a power series is exact to rounding
+_CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
+_UNIT = 1e-3  # of the norm: what is farther from 1 was not meant to be a unit quaternion
+
+
+def continuous(quaternions: ArrayLike) -> Array:
+    """The same orientations (T, 4), of norm 1, with signs such that neighbours are near each other. x y z w."""
+    q = _unit("quaternions", quaternions).copy()
+    signs = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    q[1:] *= np.cumprod(signs)[:, None]
+    return frozen(q)
+
+
+def multiplied(a: Array, b: Array) -> Array:
+    """The products a b (..., 4): first b, then a. x y z w."""
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    return np.concatenate([vector, aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
+    """zeta = log(q conj(q_a)) (T, 3) [rad, half the angle]. T-RO, section II; signs as they are given.
+
+    Defined for all but q = -q_a, where the angle of rotation would be 360 degrees.
+    """
+    q = multiplied(_unit("quaternions", quaternions), _unit("auxiliary", np.atleast_2d(auxiliary))[0] * _CONJUGATE)
+    length = np.linalg.norm(q[:, :3], axis=1, keepdims=True)
+    angle = np.arctan2(length, q[:, 3:])
+    for n in np.flatnonzero(angle > np.pi - 1e-6)[:1]:
+        raise ValueError(f"quaternions[{n}] is the auxiliary one with the sign changed: give -q, the same orientation.")
+    return np.asarray(np.where(length > _TINY, angle / np.maximum(length, _TINY), 1 + length**2 / 6) * q[:, :3])
+
+
+def exp(zeta: Array, auxiliary: Array) -> Array:
+    """q = exp(zeta) q_a (T, 4) for zeta (T, 3) [rad, half the angle]. T-RO, section II. x y z w."""
+    angle = np.linalg.norm(zeta, axis=1, keepdims=True)
+    return multiplied(np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary)
+
+
+def rotation_per_zeta(zeta: ArrayLike) -> Array:
+    """J (3, 3): small rotations [rad], and angular velocities, are J times changes of zeta, here (3,).
+
+    Twice the left Jacobian of the rotation by 2 zeta: exact where the papers take differences over a step of time.
+    """
+    vector = 2 * numbers("zeta", zeta, 3)
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < _TINY:
+        return np.asarray(2 * (np.eye(3) + cross / 2 + cross @ cross / 6))
+    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(2 * (np.eye(3) + first * cross + second * (cross @ cross)))
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationKMP:
+    """A skill whose output is an orientation: a primitive of zeta, or over time of zeta with its rate. Immutable.
+
+    Learn it so: make each demonstration's quaternions `continuous`, take `log` with a common auxiliary quaternion
+    (any in the midst of them), learn a reference of zeta (with its rate, and a VelocityKernel, if driven by time), and
+    fit the primitive.
+    """
+
+    primitive: KMP
+    auxiliary: Array
+    """(4,) q_a, x y z w."""
+
+    def __post_init__(self) -> None:
+        wanted = 3 * self.primitive.kernel.channels
+        if self.primitive.outputs != wanted:
+            raise ValueError(f"primitive: {self.primitive.outputs} outputs given, {wanted} needed for an orientation.")
+        object.__setattr__(self, "auxiliary", frozen(_unit("auxiliary", np.atleast_2d(self.auxiliary))[0].copy()))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(unpickled(state))
+
+    def mean(self, queries: ArrayLike) -> Array:
+        """The orientations (M, 4) at queries (M, I). x y z w."""
+        return exp(self.primitive.mean(queries)[:, :3], self.auxiliary)
+
+    def predict(self, queries: ArrayLike) -> tuple[Array, Array]:
+        """The orientations (M, 4), and the covariances (M, 3, 3) [rad^2] of small rotations from them, at (M, I)."""
+        found = self.primitive.predict(queries)
+        zeta = found.mean[:, :3]
+        turn = np.array([rotation_per_zeta(one) for one in zeta]).reshape(-1, 3, 3)
+        return exp(zeta, self.auxiliary), turn @ found.covariance[:, :3, :3] @ turn.transpose(0, 2, 1)
+
+    def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
+        """omega (3,) [rad/s] at one query (I,) whose input moves with the velocity (I,) [unit of the inputs/s].
+
+        Over time the velocity of the input is 1.
+        """
+        s = np.asarray(query, dtype=np.float64)
+        rate = self.primitive.jacobian(s)[:3] @ numbers("velocity", velocity, len(s))
+        return np.asarray(rotation_per_zeta(self.primitive.mean(s[None])[0, :3]) @ rate)
+
+    def adapt(
+        self,
+        inputs: ArrayLike,
+        quaternions: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        tolerance: float,
+        angular_velocities: ArrayLike | None = None,
+        velocity_covariance: ArrayLike | None = None,
+    ) -> OrientationKMP:
+        """A new skill that also goes through orientations (V, 4) at inputs (V, I). Of q and -q, the nearer is taken.
+
+        `covariance` (3, 3) or (V, 3, 3) [rad^2] is of small rotations. Skills over time take angular velocities too,
+        (V, 3) [rad/s] with their covariance [(rad/s)^2]; left out, they are free.
+        """
+        where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
+        q = numbers("quaternions", quaternions, len(where), 4)
+        zeta = self._nearest(where, q)
+        back = np.array([np.linalg.inv(rotation_per_zeta(one)) for one in zeta]).reshape(-1, 3, 3)
+        spread = back @ _each("covariance", covariance, len(where)) @ back.transpose(0, 2, 1)
+        if self.primitive.kernel.channels == 1:
+            if angular_velocities is not None or velocity_covariance is not None:
+                raise ValueError("angular_velocities: this skill's outputs have no rates; fit it with a VelocityKernel.")
+            return self._adapted(where, Gaussians(zeta, _symmetric(spread)), tolerance)
+        if (angular_velocities is None) != (velocity_covariance is None):
+            raise ValueError("angular_velocities and velocity_covariance: give both, or none.")
+        now = self.primitive.mean(where)[:, 3:]
+        rates, loose = now, np.tile(1e6 * np.max(np.abs(self.primitive.reference.covariance)) * np.eye(3), (len(where), 1, 1))
+        if angular_velocities is not None and velocity_covariance is not None:
+            omega = numbers("angular_velocities", angular_velocities, len(where), 3)
+            rates = (back @ omega[:, :, None])[:, :, 0]
+            loose = back @ _each("velocity_covariance", velocity_covariance, len(where)) @ back.transpose(0, 2, 1)
+        whole = np.zeros((len(where), 6, 6))
+        whole[:, :3, :3], whole[:, 3:, 3:] = spread, loose
+        return self._adapted(where, Gaussians(np.hstack([zeta, rates]), _symmetric(whole)), tolerance)
+
+    def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float) -> OrientationKMP:
+        return OrientationKMP(self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary)
+
+    def _nearest(self, inputs: Array, quaternions: Array) -> Array:
+        # The sign that is nearer to what the skill does there now.
+        signs = np.where((self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        return log(signs * quaternions, self.auxiliary) if len(inputs) else np.zeros((0, 3))
+
+
+def _unit(name: str, quaternions: ArrayLike) -> Array:
+    q = numbers(name, quaternions, "T", 4)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    for n in np.flatnonzero(np.abs(length - 1) > _UNIT)[:1]:
+        raise ValueError(f"{name}[{n}] has norm {length[n, 0]:.4g}, and must have 1. Divide by it, if that is what is meant.")
+    return np.asarray(q / length)
+
+
+def _each(name: str, covariance: ArrayLike, count: int) -> Array:
+    given = np.asarray(covariance, dtype=np.float64)
+    return numbers(name, np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given, count, 3, 3)
+
+
+def _symmetric(covariance: Array) -> Array:
+    return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)

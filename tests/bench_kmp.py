@@ -1,0 +1,207 @@
+"""Speed of the primitive, as ratios to NumPy's own primitives measured in the same run.
+
+    OPENBLAS_NUM_THREADS=1 python -m pytest tests/bench_kmp.py --benchmark-only
+
+A limit in milliseconds means little on a machine that is busy or old, so each is a multiple of what NumPy or LAPACK
+needs there and then for the work that cannot be avoided. The multiples leave a factor of about two for a busy machine.
+"""
+
+import resource
+import time
+import warnings
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import lapack
+from threadpoolctl import threadpool_limits
+
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
+
+I, O = 6, 3  # noqa: E741
+PLACES = np.array(
+    [
+        [0.98, -0.32, 0.06, 0.98, 0.32, 0.06, 0.45, -0.05, 0.35],
+        [0.62, -0.28, 0.30, 0.98, 0.32, 0.06, 0.62, -0.28, 0.30],
+        [0.75, 0.00, 0.06, 0.90, 0.42, 0.10, 0.50, 0.38, 0.16],
+        [0.75, 0.00, 0.06, 0.78, 0.06, 0.11, 0.62, 0.00, 0.26],
+    ]
+)  # [m] left hand, right hand, tool, on the way of a soldering task
+VIA = PLACES[1:2, :I], Gaussians(PLACES[1:2, I:] + 0.02, [1e-8 * np.eye(O)])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    with threadpool_limits(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def mixture():
+    random, demonstrations = np.random.default_rng(0), []
+    for _ in range(5):
+        places = PLACES + 0.008 * random.normal(size=PLACES.shape)
+        u = np.linspace(0, 1, 333)[:, None]
+        ways = [a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5) for a, b in pairwise(places)]
+        demonstrations.append(np.concatenate(ways) + 0.001 * random.normal(size=(999, I + O)))
+    return GaussianMixture.fit(np.concatenate(demonstrations), components=10, seed=0)
+
+
+def database(mixture, count):
+    inputs = mixture.sample_inputs(count, dimensions=I, seed=1)
+    return inputs, mixture.regress(inputs)
+
+
+def fit(mixture, count, **options):
+    return KMP.fit(*database(mixture, count), kernel=GaussianKernel(0.5), lambda_mean=2.0, **options)
+
+
+@pytest.fixture(scope="module")
+def small(mixture):
+    return fit(mixture, 200)
+
+
+@pytest.fixture(scope="module")
+def large(mixture):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    inputs, reference = database(mixture, 100_000)
+    start = time.perf_counter()
+    primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.5), lambda_mean=2.0)
+    took = time.perf_counter() - start
+    return primitive, took, (before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def best(call, *, rounds, calls=1):
+    call()
+    times = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        for _ in range(calls):
+            call()
+        times.append((time.perf_counter() - start) / calls)
+    return min(times)
+
+
+def gemm_rate():
+    """[multiply-adds/s] of a product of the size that the fits are made of."""
+    a = np.random.default_rng(0).random((2048, 256))
+    b = a.copy()
+    return a.size * 256 / best(lambda: a.T @ b, rounds=10)
+
+
+def compare(benchmark, call, unit, limit, what, *, calls=1):
+    """Both in turn, so that a machine that is busy for a while is busy for both; the best of each."""
+    call(), unit()
+    times = []
+    for _ in range(60):
+        times.append((best(call, rounds=1, calls=calls), best(unit, rounds=1, calls=calls)))
+    report(benchmark, *np.min(times, axis=0), limit, what)
+
+
+def report(benchmark, seconds, unit_s, limit, what):
+    ratio = float(seconds / unit_s)
+    benchmark.extra_info.update(best_us=round(1e6 * float(seconds), 2), ratio=round(ratio, 2), of=what, limit=limit)
+    assert ratio < limit, f"{1e6 * seconds:.1f} us is {ratio:.1f} times {what} ({1e6 * unit_s:.1f} us); {limit} allowed"
+
+
+def primitive_query(primitive):
+    """The least that a mean can cost: the offsets, the kernel, one product, written out."""
+    s, weights, query = primitive.solution.centres, primitive.solution.weights, primitive.inputs[:1]
+
+    def call():
+        offsets = query - s
+        return np.exp(-0.5 * np.vecdot(offsets, offsets)) @ weights
+
+    return call
+
+
+def factorised():
+    """What a fit of 200 points cannot do without."""
+    a = np.eye(600) * 600 + np.random.default_rng(0).random((600, 600))
+    a = np.asfortranarray(a + a.T)
+    return lambda: lapack.dpotrf(a, lower=1)
+
+
+def test_fit_200(benchmark, mixture):
+    data = database(mixture, 200)
+    call = lambda: KMP.fit(*data, kernel=GaussianKernel(0.5), lambda_mean=2.0)  # noqa: E731
+    benchmark(call)
+    compare(benchmark, call, factorised(), 4, "dpotrf(600 x 600)")
+
+
+def test_mean_of_one_query_200(benchmark, small):
+    query = small.inputs[:1].copy()
+    benchmark(small.mean, query)
+    compare(benchmark, lambda: small.mean(query), primitive_query(small), 2, "NumPy's five calls", calls=300)
+
+
+def test_mean_and_covariance_of_one_query_200(benchmark, small):
+    query = small.inputs[:1].copy()
+    benchmark(small.predict, query)
+    whitener = np.random.default_rng(0).random((1800, 200))
+    k = np.random.default_rng(0).random(200)
+    compare(benchmark, lambda: small.predict(query), lambda: whitener @ k, 4, "dgemv(1800 x 200)", calls=50)
+
+
+def test_jacobian_200(benchmark, small):
+    query = small.inputs[0].copy()
+    benchmark(small.jacobian, query)
+    compare(benchmark, lambda: small.jacobian(query), primitive_query(small), 2.5, "NumPy's five calls", calls=300)
+
+
+def test_adapt_200(benchmark, small):
+    call = lambda: small.adapt(*VIA, tolerance=0.0)  # noqa: E731
+    benchmark(call)
+    compare(benchmark, call, factorised(), 0.6, "dpotrf(600 x 600)")
+
+
+def test_fit_100_000(benchmark, large):
+    primitive, took, (before, peak) = large
+    r, d = primitive.solution.w.shape
+    work = 100_000 * r * r * (d * (d + 1) / 4 + 2)  # multiply-adds: the normal equations, the features three times
+    benchmark.pedantic(lambda: None)
+    benchmark.extra_info.update(fit_s=round(took, 2), rank=r, peak_mb=peak // 1000, before_mb=before // 1000)
+    report(benchmark, took, work / gemm_rate(), 5, "its multiply-adds by dgemm")
+    assert peak < 2_000_000  # [kB]
+
+
+@pytest.mark.parametrize("where", ["in the data", "beside it"])
+def test_adapt_100_000(benchmark, large, where):
+    primitive, (inputs, desired) = large[0], VIA
+    inputs = inputs + (0.0 if where == "in the data" else 0.1)
+    call = lambda: primitive.adapt(inputs, desired, tolerance=0.05 if where == "in the data" else 0.0)  # noqa: E731
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)  # where 100 000 points say something else
+        benchmark(call)
+        data = primitive.inputs
+        compare(benchmark, call, lambda: ((data - inputs) ** 2).sum(axis=1).min(), 2, "NumPy's nearest of 100 000")
+
+
+def test_mean_of_one_query_100_000(benchmark, large):
+    primitive = large[0]
+    query = primitive.inputs[:1].copy()
+    benchmark(primitive.mean, query)
+    compare(benchmark, lambda: primitive.mean(query), primitive_query(primitive), 2, "NumPy's five calls", calls=300)
+
+
+def test_mean_and_covariance_of_one_query_100_000(benchmark, large):
+    primitive = large[0]
+    query = primitive.inputs[:1].copy()
+    benchmark(primitive.predict, query)
+    r, d = primitive.solution.w.shape
+    whitener, z = np.random.default_rng(0).random((r * d * d, r)), np.zeros(r)
+    compare(benchmark, lambda: primitive.predict(query), lambda: whitener @ z, 4, "dgemv of the rank's size", calls=50)
+
+
+def test_low_rank_against_dense_2000(benchmark, mixture):
+    data = database(mixture, 2000)
+    options = {"kernel": GaussianKernel(0.5), "lambda_mean": 2.0}
+    start = time.perf_counter()
+    dense = KMP.fit(*data, **options, representation="dense")
+    dense_s = time.perf_counter() - start
+    low = benchmark.pedantic(lambda: KMP.fit(*data, **options, representation="low_rank"), rounds=5)
+    difference = np.abs(low.mean(data[0]) - dense.mean(data[0])).max()
+    low_s = benchmark.stats.stats.min
+    benchmark.extra_info.update(dense_s=round(dense_s, 2), times_faster=round(dense_s / low_s, 1), difference_m=float(f"{difference:.2g}"))
+    assert difference < 1e-6
+    assert low_s < dense_s / 10

@@ -1,0 +1,147 @@
+"""The client's side: sessions between named endpoints, and requests as calls that end in an answer or in words."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+
+from service.client import Client, RefusedError, UnreachableError, endpoints, open_session
+from service.wire import ViaPoint
+
+Answer = Callable[[zenoh.Query], object]
+
+
+@pytest.fixture(scope="module")
+def daemon() -> Iterator[zenoh.Session]:
+    """A session that listens where the system gave it a port."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        yield session
+
+
+@pytest.fixture(scope="module")
+def session(daemon: zenoh.Session) -> Iterator[zenoh.Session]:
+    """A session that is connected to it."""
+    with open_session(connect=endpoints(daemon)) as connected:
+        yield connected
+
+
+@pytest.fixture
+def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
+    """Declares who answers on a key, until the test ends."""
+    declared = []
+
+    def answer(key: str, with_what: Answer) -> None:
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                with_what(query)
+
+        declared.append(daemon.declare_queryable(key, reply))
+
+    yield answer
+    for queryable in declared:
+        queryable.undeclare()
+
+
+def ready(query: zenoh.Query) -> None:
+    query.reply(query.key_expr, b'{"mode": "hold"}')
+
+
+# --- sessions ----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_endpoint_is_told_with_the_port_that_was_given(daemon: zenoh.Session) -> None:
+    (endpoint,) = endpoints(daemon)
+    assert endpoint.startswith("tcp/127.0.0.1:")
+    assert int(endpoint.rpartition(":")[2]) > 0
+
+
+def test_a_session_that_does_not_listen_has_no_endpoints() -> None:
+    with open_session() as alone:
+        assert endpoints(alone) == ()
+
+
+def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
+    with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127.0.0.1:1: is a daemon running and listening there"):
+        open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
+
+
+def test_listening_where_another_does_is_told_with_the_endpoint(daemon: zenoh.Session) -> None:
+    (taken,) = endpoints(daemon)
+    with pytest.raises(UnreachableError, match=f"cannot listen on {taken}: .*in use"):
+        open_session(listen=[taken], timeout_s=0.2)
+
+
+@pytest.mark.parametrize("what", ["listen", "connect"])
+def test_an_endpoint_of_no_form_is_told(what: str) -> None:
+    with pytest.raises(UnreachableError, match=f"cannot {what} (on|to) somewhere: .*<protocol>/<address>"):
+        open_session(**{what: ["somewhere"]}, timeout_s=0.2)  # type: ignore[arg-type]
+
+
+# --- requests ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_reply_ends_the_call_at_once(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+    answering("bench/status", ready)
+    client = Client(session, "bench", timeout_s=20)
+    client.wait_until_ready()
+    begin = time.monotonic()
+    assert client.status() == {"mode": "hold"}
+    assert time.monotonic() - begin < 2
+
+
+def test_a_refusal_is_raised_with_the_daemons_words(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+    answering("bench/status", ready)
+    answering("bench/hold", lambda query: query.reply_err("not now: º".encode()))
+    client = Client(session, "bench")
+    client.wait_until_ready()
+    with pytest.raises(RefusedError, match=r"^not now: º$"):
+        client.ask("hold")
+
+
+def test_places_are_asked_for_as_the_wire_says(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+    asked: list[bytes] = []
+
+    def take(query: zenoh.Query) -> None:
+        assert query.payload is not None
+        asked.append(query.payload.to_bytes())
+        query.reply(query.key_expr, b'{"tick": 3}')
+
+    answering("bench/status", ready)
+    answering("bench/via_points", take)
+    client = Client(session, "bench")
+    client.wait_until_ready()
+    assert client.add([ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))], tolerance=0.1) == {"tick": 3}
+    request = json.loads(asked[0])
+    assert (request["op"], request["tolerance"]) == ("add", 0.1)
+    assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
+
+
+def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:
+    with pytest.raises(UnreachableError, match=r"nobody answers on nowhere/status: .*cell's name"):
+        Client(session, "nowhere", timeout_s=0.5).status()
+    with pytest.raises(UnreachableError, match="nowhere/status"):
+        Client(session, "nowhere", timeout_s=0.1).wait_until_ready(timeout_s=0.0)
+
+
+def test_a_cell_with_slashes_is_a_cell_of_its_own(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+    answering("lab/bench2/status", ready)
+    assert Client(session, "lab/bench2").wait_until_ready() == {"mode": "hold"}
+    with pytest.raises(UnreachableError):
+        Client(session, "lab", timeout_s=0.5).status()
+
+
+def test_who_does_not_answer_in_time_counts_as_unreachable(
+    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None]
+) -> None:
+    kept: list[zenoh.Query] = []
+    with daemon.declare_queryable("bench/hold", kept.append):
+        answering("bench/status", ready)
+        Client(session, "bench").wait_until_ready()
+        with pytest.raises(UnreachableError, match="bench/hold"):
+            Client(session, "bench", timeout_s=0.2).ask("hold")
+        assert len(kept) == 1
+        kept[0].drop()

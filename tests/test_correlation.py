@@ -1,0 +1,77 @@
+"""Correlation adaptation: equation (11), and that rewards grow while via-points are kept."""
+
+import numpy as np
+import pytest
+
+from kmp import KMP, Correlation, GaussianKernel, Gaussians, improve
+
+T = np.linspace(0, 2, 60)[:, None]
+
+
+def letter(representation="dense"):
+    """A planar curve whose outputs are strongly tied to each other."""
+    mean = np.hstack([np.sin(2 * T), np.cos(3 * T)])
+    tied = 0.02 * np.array([[1.0, 0.95], [0.95, 1.0]])
+    primitive = KMP.fit(T, Gaussians(mean, np.tile(tied, (60, 1, 1))), kernel=GaussianKernel(2.0), lambda_mean=2.0, representation=representation)
+    return primitive.adapt([[1.0]], Gaussians([[1.4, -1.2]], [1e-8 * np.eye(2)]), tolerance=0.02)
+
+
+def basis(count=5):
+    return Correlation.neutral(np.linspace(0, 2, count)[:, None], width=0.3, outputs=2)
+
+
+def roughness(path):
+    """Weighted smoothness, as in the paper: here the first output may not move away from the base's."""
+    return float(np.exp(-5 * np.linalg.norm(np.diff(path, axis=0) * [3.0, 0.3], axis=1).sum() / 10))
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_the_neutral_correlation_changes_nothing(representation):
+    primitive = letter(representation)
+    same = basis().applied(primitive)
+    assert same.representation == representation
+    np.testing.assert_allclose(same.mean(T), primitive.mean(T), atol=1e-12)
+    np.testing.assert_array_equal(same.via_inputs, primitive.via_inputs)
+
+
+def test_the_covariances_are_those_of_equation_11():
+    correlation = Correlation(basis().centres, 0.3, np.random.default_rng(0).uniform(0.5, 2, size=(5, 2)))
+    primitive = letter()
+    found = correlation.applied(primitive).base.reference.covariance
+    for n in (0, 20, 59):
+        phi = np.exp(-0.5 * (T[n] - correlation.centres[:, 0]) ** 2 / 0.3**2)
+        factor = np.diag(phi / phi.sum() @ correlation.theta)
+        np.testing.assert_allclose(found[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rewards_grow_and_the_via_point_is_still_met(seed):
+    primitive = letter()
+    found = improve(primitive, roughness, T, correlation=basis(), exploration=0.3, updates=15, rollouts=8, seed=seed)
+    assert found.rewards[-1] > 1.03 * found.rewards[0]
+    assert roughness(found.primitive.mean(T)) >= found.rewards.max()
+    np.testing.assert_allclose(found.primitive.mean([[1.0]]), [[1.4, -1.2]], atol=1e-3)
+    assert len(found.rewards) == 16
+
+
+def test_the_same_seed_gives_the_same_policy():
+    a, b, c = (improve(letter(), roughness, T, correlation=basis(), exploration=0.3, updates=2, rollouts=4, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(a.correlation.theta, b.correlation.theta)
+    assert not np.array_equal(a.correlation.theta, c.correlation.theta)
+
+
+def test_far_from_all_basis_functions_the_nearest_rules():
+    correlation = Correlation([[0.0], [1.0]], 0.01, [[2.0], [3.0]])
+    np.testing.assert_allclose(correlation([[50.0], [-50.0]]), [[3], [2]])
+
+
+def test_what_cannot_be_done_is_refused_with_what_could():
+    options = {"correlation": basis(), "exploration": 0.3, "updates": 1, "rollouts": 4, "seed": 0}
+    for changed, says in (
+        ({"exploration": 0}, "exploration is 0, and must be finite and above 0"),
+        ({"rollouts": 1}, "1 rollouts and 1 updates given; at least 2 and 1 are needed"),
+        ({"correlation": Correlation.neutral([[0.0]], width=1, outputs=3)}, "correlation: 3 outputs given, 2 needed"),
+        ({"reward": lambda path: np.nan}, r"The reward is nan, and must be a finite number for any trajectory \(M, O\)"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            improve(letter(), changed.pop("reward", roughness), T, **(options | changed))

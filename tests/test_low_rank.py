@@ -1,0 +1,248 @@
+"""The low rank solution against the dense one: means, covariances, via-points, what is said when the rank is reached."""
+
+import pickle
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kmp import KMP, GaussianKernel, Gaussians, RankReached, VelocityKernel, ViaPointMissed
+
+properties = settings(max_examples=10, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+kernel = GaussianKernel(0.5)
+STD = 0.02
+
+
+def tube(seed, count):
+    """Hands that move along a path, with scatter, and a tool that goes with them."""
+    random = np.random.default_rng(seed)
+    t = random.uniform(size=count)
+    path = np.stack([0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1)
+    inputs = path + 0.02 * random.normal(size=path.shape)
+    tool = np.stack([np.sin(3 * t), 0.5 * np.cos(4 * t), t - t**2], axis=1) * 0.5
+    root = STD * random.normal(size=(count, 3, 3))
+    return inputs, Gaussians(tool + 0.01 * random.normal(size=tool.shape), root @ root.swapaxes(1, 2) + 1e-5 * np.eye(3))
+
+
+def both(seed, count=300, **options):
+    inputs, reference = tube(seed, count)
+    options = {"kernel": kernel, "lambda_mean": 2.0, "prior_mean": [0.1, 0.2, 0.3]} | options
+    return [KMP.fit(inputs, reference, representation=r, **options) for r in ("dense", "low_rank")]
+
+
+def points(seed, count, std=1e-4, spread=0.05):
+    random = np.random.default_rng(seed)
+    inputs = tube(seed + 1, count)[0] + spread * random.normal(size=(count, 6))
+    mean = 0.2 * random.normal(size=(count, 3))
+    return inputs, Gaussians(mean, np.tile(std**2 * np.eye(3), (count, 1, 1)))
+
+
+def agree(dense, low, queries, within=1e-6):
+    np.testing.assert_allclose(low.mean(queries), dense.mean(queries), atol=within)
+    np.testing.assert_allclose(low.mean(queries[:1]), dense.mean(queries[:1]), atol=within)
+    a, b = dense.predict(queries), low.predict(queries)
+    scale = np.abs(a.covariance).max()
+    np.testing.assert_allclose(b.covariance, a.covariance, atol=1e-5 * scale)
+    np.testing.assert_allclose(low.predict(queries[:1]).covariance[0], b.covariance[0], atol=1e-9 * scale)
+    assert np.array_equal(b.mean, low.mean(queries))
+    one, v = queries[0], np.ones(queries.shape[1])
+    np.testing.assert_allclose(low.jacobian(one), dense.jacobian(one), atol=100 * within)
+    np.testing.assert_allclose(low.curvature(one, v), dense.curvature(one, v), atol=1e4 * within)
+
+
+@properties
+@given(seeds, st.sampled_from([None, 5.0]))
+def test_within_the_data_it_is_the_dense_solution_to_a_micrometre(seed, lambda_covariance):
+    dense, low = both(seed, lambda_covariance=lambda_covariance)
+    assert (dense.representation, low.representation) == ("dense", "low_rank")
+    assert len(low.solution.centres) < 300
+    agree(dense, low, np.concatenate([dense.inputs[:20], tube(seed + 7, 20)[0]]))
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
+@properties
+@given(seeds, st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 0.05, 1.0]), st.sampled_from([None, 5.0]))
+def test_adapted_it_is_the_dense_solution_adapted(seed, tolerance, spread, lambda_covariance):
+    dense, low = both(seed, lambda_covariance=lambda_covariance)
+    inputs, desired = points(seed, 3, std=1e-3, spread=spread)
+    dense, low = (one.adapt(inputs, desired, tolerance=tolerance) for one in (dense, low))
+    assert np.array_equal(dense.inputs, low.inputs)
+    assert np.array_equal(dense.reference.mean, low.reference.mean)
+    agree(dense, low, np.concatenate([dense.inputs[:20], inputs]), within=5e-6)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.05, 2.0])
+def test_via_points_are_met_in_the_data_and_far_from_it(spread):
+    low = both(0)[1]
+    inputs, desired = points(1, 1, std=1e-5, spread=spread)
+    np.testing.assert_allclose(low.adapt(inputs, desired, tolerance=0.1).mean(inputs), desired.mean, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # the demonstrations scatter
+def test_so_many_changes_that_all_points_go_are_solved_anew():
+    dense, low = both(0, count=60)
+    inputs, desired = dense.inputs + 0.001, Gaussians(dense.reference.mean + 0.1, dense.reference.covariance)
+    dense, low = (one.adapt(inputs, desired, tolerance=0.5) for one in (dense, low))
+    assert len(low.replaced) > 50
+    agree(dense, low, dense.inputs[:10], within=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
+@properties
+@given(seeds, st.sampled_from([0.0, 0.2]))
+def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
+    low = both(seed, count=200)[1]
+    inputs, desired = points(seed, 4, std=0.01)
+    order = np.random.default_rng(seed).permutation(4)
+    together = low.adapt(inputs, desired, tolerance=tolerance)
+    shuffled = low.adapt(inputs[order], desired.take(order), tolerance=tolerance)
+    singly = low
+    for n in range(4):
+        singly = singly.adapt(inputs[n : n + 1], desired.take(slice(n, n + 1)), tolerance=tolerance)
+    queries = tube(seed + 3, 5)[0]
+    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-8)
+    np.testing.assert_allclose(shuffled.predict(queries).covariance, together.predict(queries).covariance, atol=1e-8)
+    assert np.array_equal(singly.mean(queries), together.mean(queries))
+    assert low.adapt(inputs[:0], desired.take(slice(0, 0)), tolerance=1) is low
+    assert together.base is low
+
+
+@properties
+@given(seeds)
+def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed):
+    inputs, reference = tube(seed, 60)
+    exact = Gaussians(reference.mean, np.tile(1e-12 * np.eye(3), (60, 1, 1)))
+    low = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation="low_rank")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)
+        adapted = low.adapt(inputs[:3] + 0.01, exact.take(slice(0, 3)), tolerance=0.1)
+    for one in (low, adapted):
+        for covariance in (one.predict(inputs).covariance, one.predict(inputs[:1]).covariance):
+            assert np.array_equal(covariance, covariance.swapaxes(1, 2))
+            assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_threads_may_share_it():
+    low, queries = both(0)[1].adapt(*points(1, 1), tolerance=0.1), tube(2, 64)[0][:, None]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(low.predict, queries))
+    fresh = both(0)[1].adapt(*points(1, 1), tolerance=0.1)
+    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(found, queries, strict=True))
+
+
+def test_a_tolerance_below_rounding_is_served_as_well_as_rounding_allows():
+    inputs, reference = tube(0, 200)
+    dense, low = (KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=r, rank_tolerance=1e-18) for r in ("dense", "low_rank"))
+    agree(dense, low, inputs[:20])
+
+
+def test_more_via_points_than_points():
+    dense, low = both(0, count=4)
+    inputs, desired = points(1, 40, std=0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)
+        dense, low = (one.adapt(inputs, desired, tolerance=0.0) for one in (dense, low))
+    agree(dense, low, inputs[:10], within=1e-5)
+
+
+def test_what_is_too_much_to_keep_is_made_again_and_gives_the_same(monkeypatch):
+    before = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
+    monkeypatch.setattr("kmp.low_rank._KEPT", 0)
+    monkeypatch.setattr("kmp.primitive._DISTANCES", 1)
+    after = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
+    assert np.array_equal(before.replaced, after.replaced)
+    assert np.array_equal(before.weights, after.weights)
+
+
+def test_one_point_alone():
+    one = KMP.fit([[1.0]], Gaussians([[2.0]], [[[0.5]]]), kernel=kernel, lambda_mean=1, representation="low_rank")
+    np.testing.assert_allclose(one.mean([[1.0]]), 2 / 1.5)
+    np.testing.assert_allclose(one.predict([[1.0]]).covariance, [[[1 - 1 / 1.5]]])
+
+
+def test_repeated_inputs_are_legal():
+    inputs, reference = tube(0, 40)
+    inputs, reference = np.tile(inputs, (3, 1)), Gaussians.concatenated([reference] * 3)
+    dense, low = (KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=r) for r in ("dense", "low_rank"))
+    agree(dense, low, inputs[:10])
+
+
+def test_far_from_the_data_the_mean_is_the_prior_and_the_covariance_the_whole():
+    low = both(0)[1]
+    for primitive in (low, low.adapt(*points(0, 1), tolerance=0.1)):
+        far = primitive.predict(np.full((1, 6), 50.0))
+        np.testing.assert_array_equal(far.mean, [[0.1, 0.2, 0.3]])
+        np.testing.assert_allclose(far.covariance[0], len(primitive.inputs) / 2 * np.eye(3))
+
+
+def test_position_with_velocity_too():
+    t = np.linspace(0, 2, 150)[:, None]
+    mean = np.hstack([np.sin(3 * t), np.cos(2 * t), 3 * np.cos(3 * t), -2 * np.sin(2 * t)])
+    reference = Gaussians(mean, np.tile(np.diag([1e-3, 2e-3, 0.1, 0.1]), (150, 1, 1)))
+    dense, low = (KMP.fit(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1, representation=r) for r in ("dense", "low_rank"))
+    agree(dense, low, t[::10] + 0.003, within=1e-5)
+    via = [[0.77]], Gaussians([[0.9, 0.0, 0.5, -2.0]], [1e-8 * np.eye(4)])
+    dense, low = (one.adapt(*via, tolerance=0.01) for one in (dense, low))
+    agree(dense, low, t[::10] + 0.003, within=1e-5)
+    np.testing.assert_allclose(low.mean([[0.77]]), [[0.9, 0.0, 0.5, -2.0]], atol=1e-3)
+
+
+def test_large_problems_choose_the_low_rank_and_small_ones_the_dense_solution():
+    small, large = tube(0, 500), tube(0, 501)
+    assert KMP.fit(*small, kernel=kernel, lambda_mean=2).representation == "dense"
+    assert KMP.fit(*large, kernel=kernel, lambda_mean=2).representation == "low_rank"
+    assert KMP.fit(*large, kernel=GaussianKernel(500.0), lambda_mean=2).representation == "dense"
+
+
+@pytest.mark.parametrize("rank", [10, 20, 40])
+def test_a_rank_that_is_reached_is_said_and_the_error_is_within_the_bound_that_is_said(rank):
+    inputs, reference = tube(0, 300)
+    dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
+    with pytest.warns(RankReached, match=rf"rank: {rank} features leave up to .* 4e-12 was asked .* Raise the rank") as said:
+        low = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank)
+    error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
+    assert 1e-6 < error < low.error_bound
+    assert f"{low.error_bound:.2g} [unit" in str(said[0].message)
+    assert said[0].filename == __file__
+
+
+@properties
+@given(seeds, st.sampled_from([1e-6, 1e-9, 1e-12]), st.booleans())
+def test_the_error_bound_holds(seed, left, adapted):
+    dense, low = both(seed, rank_tolerance=left)
+    if adapted:
+        inputs, desired = points(seed, 1)
+        dense, low = (one.adapt(inputs, desired, tolerance=0.02) for one in (dense, low))
+    data = dense.inputs[:300]
+    assert np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= low.error_bound
+    assert dense.error_bound == 0
+
+
+def test_arrays_and_pickles_give_it_back_bit_for_bit():
+    low = both(0, lambda_covariance=3.0)[1]
+    queries = tube(9, 5)[0]
+    for one in (low, low.adapt(*points(3, 2), tolerance=0.2)):
+        one.predict(queries)
+        for again in (KMP.from_arrays(one.to_arrays()), pickle.loads(pickle.dumps(one))):
+            assert np.array_equal(again.mean(queries), one.mean(queries))
+            assert np.array_equal(again.predict(queries).covariance, one.predict(queries).covariance)
+            assert np.array_equal(again.predict(queries[:1]).covariance, one.predict(queries[:1]).covariance)
+            more = points(5, 1)
+            a, b = (x.adapt(*more, tolerance=0.1) for x in (again, one))
+            assert np.array_equal(a.mean(queries), b.mean(queries))
+            assert not again.weights.flags.writeable
+
+
+def test_what_cannot_be_done_is_refused_with_what_could():
+    inputs, reference = tube(0, 20)
+    for options, says in (
+        ({"rank": 0}, "rank is 0, and must be at least 1"),
+        ({"rank_tolerance": 0}, "rank_tolerance is 0, and must be finite and above 0"),
+        ({"representation": "sparse"}, "representation: 'sparse' given, 'auto', 'dense' or 'low_rank' needed"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, **options)

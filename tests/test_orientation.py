@@ -1,0 +1,145 @@
+"""Orientation: the tangent space against SciPy, signs, angular velocity, via-points."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP, VelocityKernel, orientation
+
+properties = settings(max_examples=20, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def drawn(seed, count=5):
+    return Rotation.random(count, random_state=seed).as_quat()
+
+
+def same(a, b, atol=1e-9):
+    np.testing.assert_allclose(np.abs((a * b).sum(axis=-1)), 1, atol=atol)
+
+
+@properties
+@given(seeds)
+def test_exp_undoes_log_and_log_is_half_the_rotation_vector(seed):
+    q, a = drawn(seed % 2**31), drawn((seed + 1) % 2**31, 1)[0]
+    zeta = orientation.log(q, a)
+    np.testing.assert_allclose(orientation.exp(zeta, a), q, atol=1e-12)
+    angle = 2 * np.linalg.norm(zeta, axis=1)
+    turn = (Rotation.from_quat(q) * Rotation.from_quat(a).inv()).magnitude()
+    np.testing.assert_allclose(np.minimum(angle, 2 * np.pi - angle), turn, atol=1e-7)
+
+
+@pytest.mark.parametrize("angle", [0, 1e-12, 1e-8, 1e-5, 1e-4, 2e-4, 1.0])
+def test_small_angles_lose_no_digits(angle):
+    zeta = np.array([[angle, 0, 0]])
+    found = orientation.log(orientation.exp(zeta, np.array([0, 0, 0, 1.0])), [0, 0, 0, 1])
+    np.testing.assert_allclose(found, zeta, rtol=1e-9, atol=1e-300)
+
+
+@properties
+@given(seeds, st.sampled_from([1e-7, 1e-3, 1.0]))
+def test_rotations_per_zeta_agree_with_finite_differences(seed, size):
+    random, h = np.random.default_rng(seed), 1e-6
+    zeta, change, a = size * random.normal(size=3), random.normal(size=3), np.array([0, 0, 0, 1.0])
+    ahead, behind = (Rotation.from_quat(orientation.exp((zeta + t * change)[None], a)[0]) for t in (h, -h))
+    omega = (ahead * behind.inv()).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(orientation.rotation_per_zeta(zeta) @ change, omega, rtol=1e-6, atol=1e-7)
+
+
+def test_signs_are_chosen_so_that_neighbours_are_near():
+    t = np.linspace(0, 4, 50)
+    q = Rotation.from_rotvec(np.outer(t, [0.3, 0.9, 0.1])).as_quat()
+    flipped = q * np.random.default_rng(0).choice([-1, 1], size=(50, 1))
+    found = orientation.continuous(flipped)
+    assert ((found[1:] * found[:-1]).sum(axis=1) > 0.9).all()
+    same(found, q)
+    assert np.linalg.norm(np.diff(orientation.log(found, found[25]), axis=0), axis=1).max() < 0.1
+
+
+def path(t):
+    return Rotation.from_rotvec([0.3, 0.2, -0.5]) * Rotation.from_rotvec(np.stack([np.sin(2 * t), t, 0.5 * t**2], axis=1))
+
+
+def skill(velocity):
+    t = np.linspace(0, 1.5, 120)
+    q = orientation.continuous(path(t).as_quat() * np.where(np.arange(120) % 3 == 0, -1, 1)[:, None])
+    auxiliary = q[60]
+    zeta = orientation.log(q, auxiliary)
+    mean = np.hstack([zeta, np.gradient(zeta, t, axis=0, edge_order=2)]) if velocity else zeta
+    variance = np.diag([1e-4] * 3 + [1e-2] * 3) if velocity else 1e-4 * np.eye(3)
+    kernel = VelocityKernel(5.0) if velocity else GaussianKernel(5.0)
+    reference = Gaussians(mean, np.tile(variance, (120, 1, 1)))
+    return OrientationKMP(KMP.fit(t[:, None], reference, kernel=kernel, lambda_mean=0.1), auxiliary)
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+def test_a_skill_reproduces_orientations_and_their_angular_velocity(velocity):
+    one, t, h = skill(velocity), np.linspace(0.1, 1.4, 20), 1e-5
+    q = one.mean(t[:, None])
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
+    same(q, path(t).as_quat(), atol=1e-4)
+    for now in t:
+        ahead, behind = (Rotation.from_quat(one.mean([[now + d]])[0]) for d in (h, -h))
+        omega = (ahead * behind.inv()).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(one.angular_velocity([now], [1.0]), omega, atol=1e-5)
+        np.testing.assert_allclose(one.angular_velocity([now], [-2.0]), -2 * omega, atol=1e-5)
+
+
+def test_via_points_in_orientation_are_met_whatever_their_sign():
+    one = skill(velocity=False)
+    wanted = (Rotation.from_rotvec([0.3, -0.2, 0.1]) * path(np.array([0.7]))).as_quat()
+    for sign in (1, -1):
+        adapted = one.adapt([[0.7]], sign * wanted, 1e-8 * np.eye(3), tolerance=0.02)
+        same(adapted.mean([[0.7]]), wanted)
+    np.testing.assert_allclose(one.mean([[0.7]]), skill(velocity=False).mean([[0.7]]))
+
+
+def test_a_via_point_can_fix_the_angular_velocity_too_or_leave_it_free():
+    one, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
+    wanted = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
+    free = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02)
+    same(free.mean([[0.7]]), wanted)
+    fixed = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02, angular_velocities=omega, velocity_covariance=1e-8 * np.eye(3))
+    same(fixed.mean([[0.7]]), wanted)
+    np.testing.assert_allclose(fixed.angular_velocity([0.7], [1.0]), omega[0], atol=1e-3)
+
+
+def test_the_covariance_is_of_small_rotations_in_the_world():
+    one = skill(velocity=False)
+    q, covariance = one.predict([[0.7], [0.9]])
+    same(q, one.mean([[0.7], [0.9]]))
+    zeta = one.primitive.predict([[0.7], [0.9]])
+    draws = np.random.default_rng(0).multivariate_normal(zeta.mean[0], 1e-6 * zeta.covariance[0], size=20_000)
+    turns = (Rotation.from_quat(orientation.exp(draws, one.auxiliary)) * Rotation.from_quat(q[0]).inv()).as_rotvec()
+    scale = np.abs(covariance[0]).max()
+    np.testing.assert_allclose(np.cov(turns.T) / 1e-6, covariance[0], atol=0.03 * scale)
+
+
+def test_it_is_pickled_read_only():
+    again = pickle.loads(pickle.dumps(skill(velocity=False)))
+    assert not again.auxiliary.flags.writeable
+
+
+def test_what_cannot_be_done_is_refused_with_what_could():
+    one = skill(velocity=False)
+    q = drawn(0, 1)
+    for call, says in (
+        (lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]), r"quaternions\[0\] has norm 2, and must have 1"),
+        (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
+        (lambda: OrientationKMP(one.primitive, [0, 0, 1.0]), r"auxiliary: shape \(1, 3\) given, \(T, 4\) needed"),
+        (lambda: one.adapt([[0.5]], q[:, :3], np.eye(3), tolerance=0), r"quaternions: shape \(1, 3\) given"),
+        (lambda: one.adapt([[0.5]], q, np.eye(2), tolerance=0), r"covariance: shape \(2, 2\) given, \(1, 3, 3\) needed"),
+        (
+            lambda: one.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
+            "this skill's outputs have no rates; fit it with a VelocityKernel",
+        ),
+    ):
+        with pytest.raises(ValueError, match=says):
+            call()
+    flat = KMP.fit([[0.0]], Gaussians([[0.0]], [[[1.0]]]), kernel=GaussianKernel(1.0), lambda_mean=1)
+    with pytest.raises(ValueError, match="primitive: 1 outputs given, 3 needed for an orientation"):
+        OrientationKMP(flat, [0, 0, 0, 1])

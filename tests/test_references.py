@@ -1,0 +1,144 @@
+"""Superposition by priority, and frames that move with the task."""
+
+import numpy as np
+import pytest
+
+from kmp import KMP, Frame, GaussianKernel, Gaussians, LocalKMP, VelocityKernel, superposed
+
+
+def some(seed, count=6, outputs=2):
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(count, outputs, outputs))
+    return Gaussians(random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs))
+
+
+def test_priority_one_is_the_reference_alone_and_its_covariance():
+    a, b = some(0), some(1)
+    for priorities, one in (([1, 0], a), ([0, 1], b)):
+        found = superposed([a, b], priorities)
+        np.testing.assert_allclose(found.mean, one.mean, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, one.covariance, atol=1e-12)
+
+
+def test_superposition_is_the_product_of_the_covariances_over_their_priorities():
+    a, b, g = some(0), some(1), [0.3, 0.7]
+    found = superposed([a, b], g)
+    product = Gaussians(a.mean, a.covariance / g[0]).product(Gaussians(b.mean, b.covariance / g[1]))
+    np.testing.assert_allclose(found.mean, product.mean, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, product.covariance, rtol=1e-9)
+
+
+def test_priorities_along_the_inputs_blend_from_one_reference_to_the_other():
+    t = np.linspace(0, 1, 50)[:, None]
+    flat = np.tile(1e-3 * np.eye(1), (50, 1, 1))
+    low, high = Gaussians(np.zeros((50, 1)), flat), Gaussians(np.ones((50, 1)), flat)
+    share = 1 / (1 + np.exp(-30 * (t[:, 0] - 0.5)))
+    blend = superposed([low, high], np.stack([1 - share, share]))
+    skill = KMP.fit(t, blend, kernel=GaussianKernel(30.0), lambda_mean=0.1)
+    np.testing.assert_allclose(skill.mean([[0.1], [0.5], [0.9]])[:, 0], [0, 0.5, 1], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("priorities", "says"),
+    [
+        ([0.5, 0.6], "of sum 1.1 given; needed are sums of 1, none below 0"),
+        ([-0.5, 1.5], "priorities: from -0.5"),
+        ([1.0], r"priorities: shape \(1, 1\) given, \(2, N\) needed"),
+        (np.full((2, 3), 0.5), r"priorities: shape \(2, 3\) given, \(2,\) or \(2, 6\) needed"),
+    ],
+)
+def test_priorities_that_are_none_are_refused(priorities, says):
+    with pytest.raises(ValueError, match=says):
+        superposed([some(0), some(1)], priorities)
+
+
+def test_references_over_unlike_inputs_are_refused():
+    with pytest.raises(ValueError, match=r"references\[1\]: means of shape \(5, 2\) given, \(6, 2\) needed"):
+        superposed([some(0), some(1, count=5)], [0.5, 0.5])
+    with pytest.raises(ValueError, match="references: none given"):
+        superposed([], [])
+
+
+def test_into_a_frame_and_back_changes_nothing():
+    frame = Frame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0])
+    normals = some(0)
+    back = frame.placed(frame.localised(normals))
+    np.testing.assert_allclose(back.mean, normals.mean, atol=1e-12)
+    np.testing.assert_allclose(back.covariance, normals.covariance, atol=1e-12)
+    np.testing.assert_allclose(frame.local(normals.mean), frame.localised(normals).mean, atol=1e-12)
+
+
+def test_a_velocity_is_turned_and_not_moved():
+    frame = Frame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0]).with_velocity()
+    placed = frame.placed(Gaussians([[1.0, 0, 1, 0]], [np.eye(4)]))
+    np.testing.assert_allclose(placed.mean, [[3.0, 5, 0, 1]])
+
+
+def reaching(random, start, goal, t):
+    bend = np.sin(np.pi * t)[:, None] * (np.array([0.0, 0.3]) + 0.02 * random.normal(size=2))
+    return start + (goal - start) * (10 * t**3 - 15 * t**4 + 6 * t**5)[:, None] + bend
+
+
+def learned(velocity=False):
+    random, t = np.random.default_rng(0), np.linspace(0, 1, 60)
+    paths = [reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + np.array([[0, 0], [1, 0]])), t) for _ in range(6)]
+    frames = [Frame.start_and_goal(path) for path in paths]
+    if velocity:
+        frames = [[frame.with_velocity() for frame in one] for one in frames]
+        paths = [np.hstack([path, np.gradient(path, t, axis=0)]) for path in paths]
+    skill = LocalKMP.learn(
+        [(t[:, None], path) for path in paths],
+        frames,
+        t[:, None],
+        kernel=VelocityKernel(20.0) if velocity else GaussianKernel(20.0),
+        lambda_mean=0.1,
+        components=8,
+        seed=0,
+        regularization=1e-5,
+    )
+    return skill, t[:, None]
+
+
+def test_start_and_goal_frames_carry_the_skill_to_new_places():
+    skill, t = learned()
+    start, goal = np.array([-0.6, 0.5]), np.array([1.5, -0.6])  # none of them demonstrated
+    path = skill.placed([Frame.at(start), Frame.at(goal)]).mean(t)
+    np.testing.assert_allclose(path[0], start, atol=0.02)
+    np.testing.assert_allclose(path[-1], goal, atol=0.02)
+
+
+def test_via_points_of_the_world_are_met_in_frames_elsewhere():
+    skill, t = learned()
+    desired = Gaussians([[0.4, 0.9]], [1e-8 * np.eye(2)])
+    placed = skill.placed([Frame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), Frame.at([1.5, -0.6])])
+    adapted = placed.adapt([[0.5]], desired, tolerance=0.01)
+    np.testing.assert_allclose(adapted.mean([[0.5]]), desired.mean, atol=1e-3)
+    np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
+
+
+def test_turning_the_frames_turns_positions_and_velocities():
+    skill, t = learned(velocity=True)
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    straight = skill.predict(t)
+    turned = skill.placed([Frame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]).predict(t)
+    both = np.kron(np.eye(2), turn)
+    np.testing.assert_allclose(turned.mean, straight.mean @ both.T, atol=1e-7)
+    np.testing.assert_allclose(turned.covariance, both @ straight.covariance @ both.T, atol=1e-7)
+
+
+def test_frames_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="must have an inverse"):
+        Frame(np.zeros((2, 2)), np.zeros(2))
+    skill, t = learned()
+    with pytest.raises(ValueError, match="frames: 1 given, 2 over 2 outputs needed"):
+        skill.placed([Frame.at([0.0, 0.0])])
+    with pytest.raises(ValueError, match=r"frames: \[1, 2\] given for 2 demonstrations, as many for each needed"):
+        LocalKMP.learn(
+            [(t, np.zeros((60, 2)))] * 2,
+            [[Frame.at([0, 0])], [Frame.at([0, 0])] * 2],
+            t,
+            kernel=GaussianKernel(1.0),
+            lambda_mean=1,
+            components=1,
+            seed=0,
+        )

@@ -1,0 +1,88 @@
+"""Hyper-parameters by leaving one demonstration out."""
+
+import numpy as np
+import pytest
+
+import kmp
+from kmp import GaussianKernel, VelocityKernel
+
+
+def driven_by_hands(seed=0, count=4):
+    """Two inputs of which only the first matters, on a long way; the second jitters."""
+    random, demonstrations = np.random.default_rng(seed), []
+    for _ in range(count):
+        t = np.linspace(0, 1, 80)
+        s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
+        demonstrations.append((s, np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1) + 0.01 * random.normal(size=(80, 2))))
+    return demonstrations
+
+
+def over_time(velocity=False):
+    random, t = np.random.default_rng(0), np.linspace(0, 2, 80)
+    paths = [np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2) for _ in range(3)]
+    return [(t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths]
+
+
+def chosen(demonstrations=None, **options):
+    return kmp.learn(demonstrations or driven_by_hands(), **{"components": 6, "seed": 0, "count": 60} | options)
+
+
+def test_an_input_that_says_nothing_gets_the_longer_length():
+    learned = chosen()
+    ell = learned.primitive.kernel.ell
+    scale = [np.var(np.concatenate([s for s, _ in driven_by_hands()])[:, i]) for i in range(2)]
+    assert ell[1] * scale[1] < 0.3 * ell[0] * scale[0]
+
+
+def test_what_is_chosen_scores_best_of_all_that_was_tried_and_predicts_a_new_demonstration():
+    learned = chosen()
+    best = learned.scores[0]
+    assert np.array_equal(best.ell, learned.primitive.kernel.ell)
+    assert best.lambda_mean == learned.primitive.lambda_mean
+    assert best.error == min(score.error for score in learned.scores)
+    assert best.error < 1.1 * learned.regression_error
+    surprises = [score for score in learned.scores if score.surprise is not None]
+    assert min(surprises, key=lambda one: one.surprise).lambda_covariance == learned.primitive.lambda_covariance
+    s, xi = driven_by_hands(seed=9, count=1)[0]
+    assert np.sqrt(((learned.primitive.mean(s) - xi) ** 2).sum(axis=1).mean()) < 2 * best.error
+    assert len(learned.report(3).splitlines()) == 5
+
+
+def test_the_choice_follows_the_units():
+    c, one = 100.0, chosen()
+    other = chosen([(c * s, c * xi) for s, xi in driven_by_hands()], regularization=1e-6 * c**2)
+    np.testing.assert_allclose(other.primitive.kernel.ell, np.asarray(one.primitive.kernel.ell) / c**2, rtol=1e-6)
+    np.testing.assert_allclose(other.primitive.lambda_mean, one.primitive.lambda_mean / c**2, rtol=1e-3)
+    np.testing.assert_allclose(other.scores[0].error, c * one.scores[0].error, rtol=1e-3)
+
+
+def test_what_is_given_is_kept():
+    learned = chosen(kernel=GaussianKernel(3.0))
+    assert learned.primitive.kernel == GaussianKernel(3.0)
+    learned = chosen(lambda_mean=0.7)
+    assert learned.primitive.lambda_mean == 0.7
+    learned = chosen(kernel=GaussianKernel(3.0), lambda_mean=0.7, lambda_covariance=0.9)
+    assert (learned.scores, learned.primitive.lambda_covariance) == ((), 0.9)
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+def test_skills_over_time_have_their_reference_evenly_spaced(velocity):
+    learned = chosen(over_time(velocity), velocity=velocity)
+    assert isinstance(learned.primitive.kernel, VelocityKernel if velocity else GaussianKernel)
+    np.testing.assert_allclose(learned.primitive.inputs[:, 0], np.linspace(0, 2, 60))
+    t = np.array([[0.5], [1.5]])
+    np.testing.assert_allclose(learned.primitive.mean(t)[:, :2], np.hstack([np.sin(3 * t), np.cos(2 * t)]), atol=0.08)
+
+
+def test_what_cannot_be_done_is_refused_with_what_could():
+    one = driven_by_hands(count=1)
+    with pytest.raises(ValueError, match=r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"):
+        chosen(one)
+    with pytest.raises(ValueError, match="demonstrations: none given"):
+        kmp.learn([], components=1, seed=0)
+    with pytest.raises(ValueError, match=r"demonstrations\[1\] outputs: shape \(80, 3\) given, \(80, 2\) needed"):
+        chosen([*one, (np.zeros((80, 2)), np.zeros((80, 3)))])
+    with pytest.raises(ValueError, match="160 samples given for 1000 components"):
+        chosen(driven_by_hands(count=2), components=1000)
+    alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
+    assert np.isnan(alone.regression_error)

@@ -1,0 +1,53 @@
+"""Files: exact to the bit, with units, without pickle."""
+
+import numpy as np
+import pytest
+
+import kmp
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+
+
+def primitives():
+    random = np.random.default_rng(0)
+    inputs, means = random.normal(size=(40, 2)), random.normal(size=(40, 2))
+    reference = Gaussians(means, np.tile(np.diag([0.1, 0.2]), (40, 1, 1)))
+    for representation in ("dense", "low_rank"):
+        for kernel in (GaussianKernel(0.3), GaussianKernel(np.array([0.3, 0.7]))):
+            yield KMP.fit(inputs, reference, kernel=kernel, lambda_mean=1.5, representation=representation)
+        yield KMP.fit(inputs[:, :1], reference, kernel=VelocityKernel(2.0), lambda_mean=1.5, representation=representation)
+
+
+@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("adapted", [False, True])
+def test_a_file_gives_the_primitive_and_its_units_back_bit_for_bit(tmp_path, number, adapted):
+    primitive = list(primitives())[number]
+    queries = np.linspace(-1, 1, 4 * primitive.inputs.shape[1]).reshape(4, -1)
+    if adapted:
+        primitive = primitive.adapt(queries[:1], Gaussians(primitive.mean(queries[:1]) + 0.05, [0.05 * np.eye(2)]), tolerance=0.3)
+    kmp.save(tmp_path / "skill", primitive, input_unit="m", output_unit="m, m/s")
+    stored = kmp.load(tmp_path / "skill")
+    assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
+    again = stored.primitive
+    assert again.representation == primitive.representation
+    for one in (queries, queries[:1]):
+        assert np.array_equal(again.mean(one), primitive.mean(one))
+        assert np.array_equal(again.predict(one).covariance, primitive.predict(one).covariance)
+    assert np.array_equal(again.jacobian(queries[0]), primitive.jacobian(queries[0]))
+    assert np.array_equal(again.base.mean(queries), primitive.base.mean(queries))
+
+
+def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
+    (tmp_path / "text").write_text("no")
+    with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):
+        kmp.load(tmp_path / "text")
+    np.savez(tmp_path / "other.npz", a=np.ones(3))
+    with pytest.raises(ValueError, match=r"other\.npz: format 0 given, 1 needed"):
+        kmp.load(tmp_path / "other.npz")
+    np.savez(tmp_path / "object.npz", a=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match=r"object\.npz: not an \.npz file"):
+        kmp.load(tmp_path / "object.npz")
+    np.savez(tmp_path / "half.npz", kmp_format=np.array(1))
+    with pytest.raises(ValueError, match=r"half\.npz: The primitive's arrays lack base_inputs"):
+        kmp.load(tmp_path / "half.npz")
+    with pytest.raises(FileNotFoundError):
+        kmp.load(tmp_path / "none.npz")
