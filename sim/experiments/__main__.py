@@ -19,7 +19,9 @@ ABOUT = {
     "statistics": "100 random scenes, side by side with GMR, a Gaussian process, ProMP and the paper's own numbers",
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
+    "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
     "phase": "hands that pause and go back pause and reverse the robot",
+    "orientation": "the tool turns the glass to the eyes: orientation predicted with the position, and followed by the arm",
     "demonstrations": "error against the number of demonstrations",
 }
 EXAMPLE = """example:

@@ -37,7 +37,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         report.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
     floor = _floor_mm(known, held_out)
     success = 100 * (events <= 1000 * GRASP_DISTANCE).all(axis=3).mean(axis=2)
-    _draw(report, counts, {"as learned": reproduction, "with the three places taught": taught}, success, floor)
+    _draw(report, counts, {"as learned": reproduction, "with the three places taught": taught}, events, floor)
     stream = report.recording()
     for name, values, colour in (("reproduction_mm", reproduction, OTHER), ("success_percent", success, TOOL)):
         stream.log(f"/{name}", rr.SeriesLines(colors=[rgb(colour)], names=[name]), static=True)
@@ -87,7 +87,7 @@ def _events_mm(skill: Skill, number: int) -> Array:
     return np.asarray(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
 
 
-def _draw(report: Report, counts: list[int], errors: dict[str, Array], success: Array, floor: float) -> None:
+def _draw(report: Report, counts: list[int], errors: dict[str, Array], events: Array, floor: float) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     for (label, values), style, colour in zip(errors.items(), ("o-", "s--"), (OTHER, TOOL), strict=True):
@@ -95,7 +95,11 @@ def _draw(report: Report, counts: list[int], errors: dict[str, Array], success: 
     left.axhline(floor, color=REFERENCE, ls="--", label="the demonstrations' own scatter")
     left.set(xlabel="demonstrations", ylabel="rms error on held-out demonstrations [mm]", xticks=counts, ylim=(0, None))
     left.legend(frameon=False)
-    right.errorbar(counts, success.mean(axis=1), success.std(axis=1), fmt="o-", color=TOOL, capsize=3)
-    right.set(xlabel="demonstrations", ylabel=f"scenes within {1000 * GRASP_DISTANCE:.0f} mm\nat all three events [%]", xticks=counts, ylim=(0, 105))
-    right.set_title("taught new places, up to 15 cm away", fontsize=9)
+    worst = events.max(axis=3).reshape(len(counts), -1)
+    for share, style, label in ((50, "o-", "median"), (95, "s--", "95th percentile"), (100, "^:", "largest")):
+        right.plot(counts, np.percentile(worst, share, axis=1), style, color=TOOL, label=label)
+    right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
+    right.set(xlabel="demonstrations", ylabel="largest error of the three events [mm]", xticks=counts, ylim=(0, 32))
+    right.set_title(f"new places up to 15 cm away, taught: {SCENES} scenes", fontsize=9)
+    right.legend(frameon=False)
     report.figure(figure)

@@ -36,6 +36,7 @@ class Rehearsed:
     time_s: Array = field(default_factory=lambda: np.empty(0))  # of the script; 0 before it begins
     hands: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # as they are, without noise [m]
     tool: Array = field(default_factory=lambda: np.empty((0, 3)))  # as measured in the simulation [m]
+    axis: Array = field(default_factory=lambda: np.empty((0, 3)))  # the tool's +z, as measured
 
     @property
     def errors_mm(self) -> tuple[float, float, float]:
@@ -50,13 +51,18 @@ def rehearse(
     rate_hz: int = 500,
     keep: bool = False,
     look: Callable[[Bench], None] = lambda bench: None,
+    more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
 ) -> Rehearsed:
-    """One run of a script through core and physics. `look` is shown the bench after each tick; `keep` keeps what was seen."""
+    """One run of a script through core and physics. `look` is shown the bench after each tick; `keep` keeps what was seen.
+
+    `more` makes further events of the newest frame, as often as hands are seen.
+    """
     settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
     tool: list[tuple[float, ...]] = []
+    axes: list[tuple[float, float, float]] = []
     held = 0
     with Bench(script, rate_hz=rate_hz) as bench:
 
@@ -70,17 +76,20 @@ def rehearse(
                 times.append(bench.time_s)
                 hands.append(np.stack([seen.hands.left.position, seen.hands.right.position]))
                 tool.append(seen.tool.position)
+                x, y, z, w = seen.tool.orientation
+                axes.append((2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)))
             look(bench)
 
         newest: list[Frame] = []
-        run(Controller(settings, skill_for(bench)), _ticks(bench, newest), [tap])
+        run(Controller(settings, skill_for(bench)), _ticks(bench, newest, more), [tap])
         result = Rehearsed(bench.events(), held * settings.period_s)
     if keep:
         result.frames, result.time_s, result.hands, result.tool = np.array(frames), np.array(times), np.array(hands), np.array(tool)
+        result.axis = np.array(axes)
     return result
 
 
-def _ticks(bench: Bench, newest: list[Frame]) -> Iterator[Tick]:
+def _ticks(bench: Bench, newest: list[Frame], more: Callable[[Frame], tuple[Event, ...]]) -> Iterator[Tick]:
     """What the bench's hands and arm say, tick by tick, while it follows the newest frame: as on the network."""
     rate_hz = round(1 / bench.period_s)
     every, begun = rate_hz // HANDS_HZ, False
@@ -100,6 +109,8 @@ def _ticks(bench: Bench, newest: list[Frame]) -> Iterator[Tick]:
             for side, pose in zip(("left", "right"), bench.script.sample(bench.time_s), strict=True):
                 x, y, z, *orientation = pose.tolist()
                 inbox.append(Event(f"hands/{side}", b"", wire.PoseStamped(stamp_ns, wire.BASE, (x, y, z), tuple(orientation))))
+            if frame is not None:
+                inbox += more(frame)
             inbox.append(Event("joints/state", b"", wire.JointState(stamp_ns, wire.JOINT_NAMES, seen.joints, seen.joint_velocities)))
         yield Tick(bench.tick, tuple(inbox))
 

@@ -77,7 +77,7 @@ def outcomes(tasks: list[tuple[str, int]], workers: int) -> Iterator[Outcome]:
 
 def run(report: Report, options: Options) -> dict[str, Any]:
     """The numbers."""
-    count = max(2, round(SCENES * options.share))
+    count = max(1, round(SCENES * options.share))
     live_count = LIVE_SCENES if options.share == 1 else 0
     tasks = [(method, number) for method in METHODS for number in range(count)]
     found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
