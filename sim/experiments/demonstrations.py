@@ -99,7 +99,7 @@ def _draw(report: Report, counts: list[int], errors: dict[str, Array], events: A
     for share, style, label in ((50, "o-", "median"), (95, "s--", "95th percentile"), (100, "^:", "largest")):
         right.plot(counts, np.percentile(worst, share, axis=1), style, color=TOOL, label=label)
     right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
-    right.set(xlabel="demonstrations", ylabel="largest error of the three events [mm]", xticks=counts, ylim=(0, 32))
+    right.set(xlabel="demonstrations", ylabel="largest error of the three events [mm]", xticks=counts, ylim=(0, 33))
     right.set_title(f"new places up to 15 cm away, taught: {SCENES} scenes", fontsize=9)
-    right.legend(frameon=False)
+    right.legend(frameon=False, loc=(0.55, 0.68))
     report.figure(figure)

@@ -41,6 +41,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
     """The numbers."""
     scratch = report.folder / "hands-live"
     found: dict[str, tuple[Ran | None, Traces]] = {}
+    tries: dict[str, int] = {}
     for name, drawn, taught in (("reproduction", NOMINAL, False), ("nominal", NOMINAL, True), ("adaptation", MOVED, True)):
         if options.share < 1:  # a quick look, in process
             found[name] = (None, _in_process(drawn, taught=taught))
@@ -50,6 +51,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
             made = next(scratch.glob(f"*{suffix}"))
             made.replace(report.folder / ("hands.rrd" if (suffix, name) == (".rrd", "adaptation") else f"hands-{name}{suffix}"))
         found[name] = (ran, _recorded(report.folder / f"hands-{name}.mcap"))
+        tries[name] = attempts
         report.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
     if scratch.is_dir():
         scratch.rmdir()
@@ -61,6 +63,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         "moved_cm": {
             n: 100 * float(np.linalg.norm(np.subtract(getattr(MOVED.scene, n), getattr(Scene(), n)))) for n in ("handover", "glass", "soldering")
         },
+        "attempts": tries,
         **{name: _numbers(ran) for name, (ran, _) in found.items() if ran is not None},
     }
 

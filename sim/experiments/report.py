@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import sys
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 LEFT, RIGHT, TOOL = "#D55E00", "#0072B2", "#009E73"  # as in the paper: the left hand red, the right one blue, the robot green
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
 SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-DPI = 110
+DPI, COLOURS = 110, 128
 
 
 class ExperimentError(ExplainedError):
@@ -63,7 +64,11 @@ class Report:
     def figure(self, figure: Figure, suffix: str = "") -> Path:
         """The path of a figure, saved as PNG."""
         path = self.folder / f"{self.name}{suffix and '-' + suffix}.png"
-        figure.savefig(path, dpi=DPI, bbox_inches="tight", metadata={"Software": None})
+        from PIL import Image
+
+        whole = io.BytesIO()
+        figure.savefig(whole, dpi=DPI, bbox_inches="tight")
+        Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)  # a third of the size
         figure.clear()
         self.figures.append(path.name)
         self.say(f"{path}")
