@@ -111,6 +111,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         "failed_scenes_of_ours": [one.number for one in found["ours"] if not one.success],
         "held_s_of_ours": max(one.held_s for one in found["ours"]),
         "in_real_time": in_real_time,
+        "errors_mm_by_scene": {method: [one.errors_mm for one in rows] for method, rows in found.items()},
     }
 
 
