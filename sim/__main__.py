@@ -13,7 +13,7 @@ import msgspec
 from service.client import endpoints, open_session
 from service.config import ENDPOINT
 from sim.bench import Bench
-from sim.hands import HandScript
+from sim.hands import Clock, HandScript, Pause
 from sim.live import BenchError, Dropout, Live, Report, run
 from sim.scene import Scene, SceneError
 
@@ -45,6 +45,18 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
     p.add_argument("--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)")
     p.add_argument("--speed", metavar="X", type=float, default=1.0, help="of the hands, 1 is as demonstrated")
+    p.add_argument(
+        "--pause",
+        metavar=("AT", "LASTS"),
+        type=float,
+        nargs=2,
+        action="append",
+        default=[],
+        help="seconds after the begin while the hands stop, 0.6 at least; may be repeated",
+    )
+    p.add_argument(
+        "--turn", metavar=("AT", "LASTS"), type=float, nargs=2, action="append", default=[], help="the same for hands that go back and come again"
+    )
     p.add_argument("--offset-mm", metavar="MM", type=float, default=8.0, help="scatter of the places, std per axis (default: %(default)s)")
     p.add_argument("--tremor-mm", metavar="MM", type=float, default=0.5, help="tremor of the hands, rms per axis (default: %(default)s)")
     p.add_argument("--noise-mm", metavar="MM", type=float, default=0.5, help="noise of the tracker, std per axis (default: %(default)s)")
@@ -68,6 +80,10 @@ def main(arguments: list[str] | None = None) -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    try:
+        Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
+    except ValueError as error:
+        p.error(f"--pause, --turn: {error}")
     dropout = Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
     live = Live(cell=args.cell, hands_hz=args.hands_rate, once=args.once, duration_s=args.duration, wait_s=args.wait, dropout=dropout)
     target = args.json or ("-" if args.once else None)
@@ -87,6 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
             scene,
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
+            pauses=[*(Pause(at, lasts) for at, lasts in args.pause), *(Pause(at, lasts, depth=2.0) for at, lasts in args.turn)],
             offset_std=args.offset_mm / 1000,
             tremor_rms=args.tremor_mm / 1000,
             noise_std=args.noise_mm / 1000,

@@ -41,10 +41,14 @@ class Hands(NamedTuple):
 
 
 class Pause(NamedTuple):
-    """A stop of the script: the hands begin to slow at `at_s` and are at full speed again `lasts_s` later (at least 0.6 s)."""
+    """A stop of the script: the hands begin to slow at `at_s` and are at full speed again `lasts_s` later (at least 0.6 s).
+
+    With a `depth` of 2 they do not stop but go back, as fast as they came, and then come again.
+    """
 
     at_s: float
     lasts_s: float
+    depth: float = 1.0
 
 
 class Clock:
@@ -56,6 +60,8 @@ class Clock:
         for pause in pauses:
             if pause.lasts_s < 2 * PAUSE_RAMP_S:
                 raise ValueError(f"a pause of {pause.lasts_s} s given, at least {2 * PAUSE_RAMP_S} s needed to stop and start")
+            if not 0.0 < pause.depth <= 2.0:
+                raise ValueError(f"a pause of depth {pause.depth} given, above 0 (slower) to 2 (back as fast) accepted")
         ordered = sorted(pauses)
         for one, other in itertools.pairwise(ordered):
             if other.at_s < one.at_s + one.lasts_s:
@@ -66,17 +72,20 @@ class Clock:
     def at(self, t: float) -> tuple[float, float, float]:
         """Script time [s], its rate and the rate's derivative [1/s] when `t` seconds have passed."""
         lost, slow, slow_rate = 0.0, 0.0, 0.0
-        for at_s, lasts_s in self.pauses:
+        for at_s, lasts_s, depth in self.pauses:
             stop, stop_rate, stop_area = _ramp((t - at_s) / PAUSE_RAMP_S)
             go, go_rate, go_area = _ramp((t - at_s - lasts_s) / PAUSE_RAMP_S + 1.0)
-            lost += PAUSE_RAMP_S * (stop_area - go_area)
-            slow += stop - go
-            slow_rate += (stop_rate - go_rate) / PAUSE_RAMP_S
+            lost += depth * PAUSE_RAMP_S * (stop_area - go_area)
+            slow += depth * (stop - go)
+            slow_rate += depth * (stop_rate - go_rate) / PAUSE_RAMP_S
         return self.speed * (t - lost), self.speed * (1.0 - slow), -self.speed * slow_rate
 
     def elapsed(self, script_s: float) -> float:
-        """Seconds after which the script has come to `script_s`."""
-        low, high = 0.0, script_s / self.speed + sum(p.lasts_s for p in self.pauses)
+        """Seconds after which the script has come to `script_s`, for good where the hands go back in between."""
+        low, high = 0.0, script_s / self.speed + sum(p.depth * p.lasts_s for p in self.pauses)
+        last = max((p.at_s + p.lasts_s for p in self.pauses), default=0.0)
+        if last < high and self.at(last)[0] < script_s:
+            low = last  # from here on it only grows
         for _ in range(60):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.at(middle)[0] < script_s else (low, middle)

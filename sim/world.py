@@ -7,8 +7,9 @@ what the arm grasps would push it away by centimetres.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import pybullet
 
 from service.arm import URDF
@@ -153,6 +154,17 @@ class World:
         """Smallest distance between the arm and a body with a shape [m]; `within` when there is more."""
         near = pybullet.getClosestPoints(self.arm, body, within, physicsClientId=self._id)
         return min((float(point[8]) for point in near), default=within)
+
+    def picture(self, *, eye: Vector, target: Vector, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
+        """What a camera sees: colours (height, width, 3), and the matrix (4, 4) from places [m] to where they are in it, -1 to 1 each way."""
+        width, height = size
+        view = pybullet.computeViewMatrix(eye, target, (0.0, 0.0, 1.0))
+        projection = pybullet.computeProjectionMatrixFOV(45.0, width / height, 0.1, 5.0)
+        seen = pybullet.getCameraImage(
+            width, height, view, projection, shadow=1, lightDirection=(1.0, -1.0, 3.0), renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._id
+        )
+        colours = np.reshape(np.asarray(seen[2], dtype=np.uint8), (height, width, 4))[:, :, :3]
+        return colours, np.reshape(projection, (4, 4)).T @ np.reshape(view, (4, 4)).T
 
     def close(self) -> None:
         """End the simulation."""

@@ -105,6 +105,16 @@ def test_a_pause_stops_the_hands_and_makes_the_script_longer() -> None:
     np.testing.assert_allclose(script.truth(script.duration_s).left.position, HandScript(SCENE, seed=1).truth(10.6).left.position)
 
 
+def test_in_a_deep_pause_the_hands_go_back_the_way_they_came_and_come_again() -> None:
+    clock = HandScript(SCENE, seed=1, pauses=(Pause(4.0, 1.5, depth=2.0),)).clock
+    before, turned, after = clock.at(3.9), clock.at(4.8), clock.at(6.0)
+    assert (before[1], turned[1], after[1]) == pytest.approx((1.0, -1.0, 1.0))
+    assert after[0] == pytest.approx(6.0 - 2 * (1.5 - 0.3))
+    assert clock.elapsed(SCENE.duration_s) == pytest.approx(SCENE.duration_s + 2 * (1.5 - 0.3))
+    assert clock.at(clock.elapsed(4.0))[0] == pytest.approx(4.0)
+    assert clock.elapsed(4.0) > 5.5  # for good
+
+
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"pauses": (Pause(1.0, 0.1),)}, {"pauses": (Pause(1.0, 2.0), Pause(2.0, 1.0))}])
 def test_a_clock_that_cannot_run_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"speed|pause"):

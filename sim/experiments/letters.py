@@ -1,0 +1,158 @@
+"""Letters adapted to new start-, via- and end-points (the paper, section III-A and Figure 1)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from sim.experiments.report import ADAPTED, DESIRED, REFERENCE, Array, Options, Report, ellipse, pyplot, rgb
+from sim.experiments.writing import DURATION_S, TARGETS, TIMES, recorded, write
+
+ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
+COMPONENTS, SEED = 8, 0
+REGULARIZATION = 1e-4  # [cm², s²]
+VIA_VARIANCE = 1e-6  # [cm²]
+TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
+NEAR_S = 0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
+
+
+class Case(NamedTuple):
+    """Desired points: times (V,) [s], and where the pen is to be, (V, 2) [cm]."""
+
+    name: str
+    times: Array
+    points: Array
+
+
+class Letter(NamedTuple):
+    """A letter's demonstrations (H, 200, 2) [cm], their mixture, reference and primitive."""
+
+    name: str
+    demonstrations: Array
+    mixture: GaussianMixture
+    primitive: KMP
+
+    @property
+    def reference(self) -> Array:
+        """The reference's mean (200, 2) [cm]."""
+        return self.primitive.reference.mean
+
+
+def learned(name: str, demonstrations: Array) -> Letter:
+    """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the paper's numbers."""
+    samples = np.concatenate([np.column_stack([TIMES, one]) for one in demonstrations])
+    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION)
+    primitive = KMP.fit(TIMES[:, None], mixture.regress(TIMES[:, None]), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA)
+    return Letter(name, demonstrations, mixture, primitive)
+
+
+def cases(letter: Letter) -> list[Case]:
+    """Three adaptations of one letter: a new start and a via-point; a via-point and a new end; a new start, via-point and end."""
+    random = np.random.default_rng([SEED, *map(ord, letter.name)])
+    size = float(np.ptp(letter.reference, axis=0).max())
+    chosen = (("start and via-point", (0, 110)), ("via-point and end", (70, 199)), ("start, via-point and end", (0, 90, 199)))
+    out = []
+    for name, rows in chosen:
+        angles = random.uniform(0, 2 * np.pi, len(rows))
+        steps = size * random.uniform(0.12, 0.25, (len(rows), 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+        out.append(Case(name, TIMES[list(rows)], letter.reference[list(rows)] + steps))
+    return out
+
+
+def adapted(letter: Letter, case: Case) -> KMP:
+    """The letter's primitive through the desired points."""
+    desired = Gaussians(case.points, np.tile(VIA_VARIANCE * np.eye(2), (len(case.times), 1, 1)))
+    return letter.primitive.adapt(case.times[:, None], desired, tolerance=TOLERANCE_S)
+
+
+def elsewhere(case: Case) -> Any:
+    """Which of the 200 times are far from every desired point."""
+    return np.abs(TIMES[:, None] - case.times).min(axis=1) > NEAR_S
+
+
+def gathered(options: Options) -> dict[str, dict[str, Array]]:
+    """The demonstrations of each set of letters: the model's, and the recorded ones where a folder is given."""
+    some = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
+    sets = {"model": {name: write(name) for name in some}}
+    if options.letters is not None:
+        real = recorded(options.letters)
+        sets["recorded"] = {name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]}
+    return sets
+
+
+def run(report: Report, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    numbers: dict[str, Any] = {"ell": ELL, "lambda": LAMBDA, "components": COMPONENTS, "duration_s": DURATION_S, "unit": "cm"}
+    stream = report.recording()
+    for name, letters in gathered(options).items():
+        rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
+        report.say(f"{len(rows)} letters learned ({name})")
+        numbers[name] = {row.name: [_measured(row, case) for case in cases(row)] for row in rows}
+        flat = [one for per in numbers[name].values() for one in per]
+        numbers[f"{name}_summary"] = {
+            "largest_miss_at_desired_points_cm": max(one["miss_cm"] for one in flat),
+            "rms_deviation_elsewhere_cm": float(np.sqrt(np.mean([one["rms_elsewhere_cm"] ** 2 for one in flat]))),
+            "largest_deviation_elsewhere_cm": max(one["largest_elsewhere_cm"] for one in flat),
+            "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
+        }
+        _draw(report, rows, name)
+        for row in rows:
+            _record(stream, row, name)
+    stream.disconnect()
+    return numbers
+
+
+def _measured(letter: Letter, case: Case) -> dict[str, Any]:
+    primitive = adapted(letter, case)
+    away = np.linalg.norm(primitive.mean(TIMES[:, None]) - letter.reference, axis=1)[elsewhere(case)]
+    return {
+        "case": case.name,
+        "miss_cm": float(np.linalg.norm(primitive.mean(case.times[:, None]) - case.points, axis=1).max()),
+        "rms_elsewhere_cm": float(np.sqrt(np.mean(away**2))),
+        "largest_elsewhere_cm": float(away.max()),
+    }
+
+
+def _draw(report: Report, letters: list[Letter], name: str) -> None:
+    plt = pyplot()
+    figure, grid = plt.subplots(len(letters), 4, figsize=(9, 2.15 * len(letters)), squeeze=False)
+    for axes, letter in zip(grid, letters, strict=True):
+        for demonstration in letter.demonstrations:
+            axes[0].plot(*demonstration.T, color=REFERENCE, lw=0.8)
+        for mean, covariance in zip(letter.mixture.means[:, 1:], letter.mixture.covariances[:, 1:, 1:], strict=True):
+            ellipse(axes[0], mean, covariance, facecolor=ADAPTED, edgecolor=ADAPTED, alpha=0.35)
+            axes[0].plot(*mean, ".", color=ADAPTED, ms=3)
+        axes[0].set_ylabel("y [cm]")
+        axes[0].text(-0.32, 1.0, letter.name, transform=axes[0].transAxes, fontweight="bold", fontsize=13)
+        for one, case in zip(axes[1:], cases(letter), strict=True):
+            one.plot(*letter.reference.T, "--", color=REFERENCE, lw=1.2)
+            one.plot(*adapted(letter, case).mean(TIMES[:, None]).T, color=ADAPTED, lw=1.6)
+            one.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8)
+        for one in axes:
+            one.set_aspect("equal", adjustable="datalim")
+    for one, title in zip(grid[0], ("demonstrations, mixture", "start, via-point", "via-point, end", "start, via-point, end"), strict=True):
+        one.set_title(title, fontsize=9)
+    for one in grid[-1]:
+        one.set_xlabel("x [cm]")
+    handles = [
+        plt.Line2D([], [], color=REFERENCE, lw=0.8, label="demonstrations"),
+        plt.Line2D([], [], color=ADAPTED, marker="o", ms=7, lw=0, alpha=0.5, label="Gaussians, 1 standard deviation"),
+        plt.Line2D([], [], color=REFERENCE, ls="--", label="reference (GMR)"),
+        plt.Line2D([], [], color=ADAPTED, label="adapted (KMP)"),
+        plt.Line2D([], [], color=DESIRED, marker="o", mfc="none", mew=2, ms=8, lw=0, label="desired points"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
+    report.figure(figure, "" if name == "model" else name)
+
+
+def _record(stream: rr.RecordingStream, letter: Letter, name: str) -> None:
+    path = f"/{name}/{letter.name}"
+    stream.log(f"{path}/demonstrations", rr.LineStrips2D(list(letter.demonstrations * (1, -1)), colors=[rgb(REFERENCE)], radii=[0.03]), static=True)
+    for number, case in enumerate(cases(letter)):
+        stream.set_time("case", sequence=number)
+        line = adapted(letter, case).mean(TIMES[:, None]) * (1, -1)  # Rerun's y axis points down
+        stream.log(f"{path}/adapted", rr.LineStrips2D([line], colors=[rgb(ADAPTED)], radii=[0.08]))
+        stream.log(f"{path}/desired", rr.Points2D(case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))

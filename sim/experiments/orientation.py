@@ -1,0 +1,175 @@
+"""The tool's orientation predicted with its position: over the board the glass faces the user's eyes, in places that were never demonstrated too.
+
+Orientation is a primitive of its own, in the tangent space of kmp.orientation, from the same two hands. The service's core takes it as the tool
+direction of the skill in force, renewed at the rate of the hands, and its arm follows position first and direction second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, OrientationKMP
+from kmp.orientation import continuous, exp, log, multiplied
+from service.frame import Event, Frame
+from service.skill import mean_orientation
+from sim.experiments.rehearsal import NOISE_M, TOLERANCE_M, TREMOR_M, Rehearsed, demonstrated, rehearse, shipped
+from sim.experiments.report import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Report, pyplot, rgb
+from sim.experiments.rivals import neighbourhoods
+from sim.experiments.scenes import OFFSET_M, draw
+from sim.hands import HandScript
+from sim.scene import TOOL_ORIENTATION, Scene
+
+EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
+SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
+COMPONENTS, POINTS, ELL, LAMBDA, SPREAD_RAD, VIA_STD_RAD = 10, 200, 20.0, 2.0, 0.03, 0.002
+SCENES, SEED, RATE_HZ = 5, 31, 250
+WORK_S = 3.0  # that the hands stay over the board
+
+
+def run(report: Report, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    count = round(SCENES * options.share)
+    scenes = {"nominal": Scene(), **{f"scene {number}": draw(number).scene for number in range(count)}}
+    scenes = {name: msgspec.structs.replace(scene, dwells_s=(*scene.dwells_s[:2], WORK_S)) for name, scene in scenes.items()}
+    learned, skill = learn(), shipped()
+    runs: dict[str, Rehearsed] = {}
+    for name, scene in scenes.items():
+        taught, turned = skill.adapted(scene.places(), tolerance=TOLERANCE_M), adapted(learned, scene)
+
+        def direct(frame: Frame) -> tuple[Event, ...]:
+            quaternion = turned.mean(frame["hands"].reshape(1, 6))[0]  # noqa: B023
+            return (Event("skill", b"", replace(taught, orientation=quaternion)),)  # noqa: B023
+
+        script = HandScript(scene, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M)
+        runs[name] = rehearse(script, lambda bench: taught, rate_hz=RATE_HZ, keep=True, more=direct)  # noqa: B023
+        report.say(f"{name}: {_measured(runs[name], scene)}")
+    nominal = scenes["nominal"]
+    fixed = rehearse(
+        HandScript(nominal, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M),
+        lambda bench: skill.adapted(nominal.places(), tolerance=TOLERANCE_M),
+        rate_hz=RATE_HZ,
+        keep=True,
+    )
+    _draw(report, runs["nominal"], fixed, nominal)
+    _record(report, runs["nominal"])
+    return {
+        "eyes_m": EYES,
+        "scenes": {name: _measured(one, scenes[name]) for name, one in runs.items()},
+        "nominal_with_a_constant_orientation": _measured(fixed, nominal),
+    }
+
+
+def facing(scene: Scene) -> Array:
+    """The orientation (4,) of a tool over the board whose +z points at the user's eyes: turned the shortest way from where it points elsewhere."""
+    wanted = EYES - np.array(scene.carry)
+    wanted /= np.linalg.norm(wanted)
+    now = _axis(np.array(TOOL_ORIENTATION))
+    turn = np.concatenate([np.cross(now, wanted), [1 + now @ wanted]])
+    return multiplied(turn / np.linalg.norm(turn), np.array(TOOL_ORIENTATION))
+
+
+def learn() -> OrientationKMP:
+    """The primitive of five demonstrations in which the tool turns to the eyes on the way from the glass to the board."""
+    scene = Scene()
+    begin, end = scene.segments[2]
+    there, back = np.array(TOOL_ORIENTATION), facing(scene)
+    whole = log(back[None], there)[0]
+    hands, quaternions = [], []
+    for number, one in enumerate(demonstrated(5)):
+        random = np.random.default_rng([number, SEED])
+        u = np.clip((np.arange(len(one.hands)) * one.period_s - begin) / (end - begin), 0, 1)
+        share = u**3 * (10 - 15 * u + 6 * u * u)
+        off = SCATTER_RAD / 2 * random.standard_normal((2, 3))
+        hands.append(one.hands)
+        quaternions.append(exp(share[:, None] * (whole + off[1]) + (1 - share[:, None]) * off[0], there))
+    auxiliary = mean_orientation(np.concatenate(quaternions))
+    samples = np.concatenate([np.hstack([s, log(continuous(q), auxiliary)]) for s, q in zip(hands, quaternions, strict=True)])
+    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=0)
+    inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=0)
+    reference = mixture.regress(inputs)
+    reference = Gaussians(reference.mean, reference.covariance + (SPREAD_RAD / 2) ** 2 * np.eye(3))
+    return OrientationKMP(KMP.fit(inputs, reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA), auxiliary)
+
+
+def adapted(learned: OrientationKMP, scene: Scene) -> OrientationKMP:
+    """The primitive that is told the orientation at a scene's three places, and around them."""
+    at, _ = neighbourhoods(scene.places())
+    each = len(at) // 3
+    quaternions = np.concatenate([np.tile(TOOL_ORIENTATION, (2 * each, 1)), np.tile(facing(scene), (each, 1))])
+    return learned.adapt(at, quaternions, VIA_STD_RAD**2 * np.eye(3), tolerance=TOLERANCE_M)
+
+
+def _axis(quaternion: Array) -> Array:
+    """The tool's +z (..., 3) of quaternions (..., 4)."""
+    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+def _angle_deg(a: Array, b: Array) -> Array:
+    """Between directions (..., 3), of any length [degrees]."""
+    cosine = np.sum(a * b, axis=-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _measured(one: Rehearsed, scene: Scene) -> dict[str, Any]:
+    moving = one.time_s > 0
+    begin, end = scene.dwells[2]
+    over = (one.time_s >= end - 1) & (one.time_s <= end)
+    turned = _angle_deg(one.axis, EYES - one.tool) < 10
+    return {
+        "within_10_deg_after_the_hands_rest_s": float(np.min(one.time_s[turned & (one.time_s > begin)], initial=np.inf) - begin),
+        "from_the_eyes_in_the_last_second_deg": float(_angle_deg(one.axis[over], EYES - one.tool[over]).mean()),
+        "arm_from_predicted_rms_deg": float(np.sqrt(np.mean(_angle_deg(one.axis[moving], _axis(one.frames["orientation"][moving])) ** 2))),
+        "errors_mm": one.errors_mm,
+        "success": one.events.success,
+    }
+
+
+def _draw(report: Report, ours: Rehearsed, fixed: Rehearsed, scene: Scene) -> None:
+    plt = pyplot()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1))
+    moving = ours.time_s > 0
+    t = ours.time_s[moving]
+    predicted = _axis(ours.frames["orientation"][moving])
+    for direction, style, colour, label in (
+        (predicted, "--", ADAPTED, "predicted"),
+        (ours.axis[moving], "-", TOOL, "the arm's tool"),
+        (fixed.axis[fixed.time_s > 0], ":", OTHER, "with a constant orientation"),
+    ):
+        tool = ours.tool[moving] if len(direction) == len(t) else fixed.tool[fixed.time_s > 0]
+        left.plot(t[: len(direction)], _angle_deg(direction, EYES - tool)[: len(t)], style, color=colour, label=label)
+    for (begin, end), name in zip(scene.dwells, ("handover", "glass", "over the board"), strict=True):
+        left.axvspan(begin, end, color=REFERENCE, alpha=0.2, lw=0)
+        left.text((begin + end) / 2, 26, name, rotation=90, ha="center", va="bottom", fontsize=8)
+    left.set(xlabel="time [s]", ylabel="angle between the tool's +z\nand the way to the eyes [°]", ylim=(0, None), xlim=(0, t[-1]))
+    left.legend(frameon=False)
+    rows = np.linspace(0, len(t) - 1, 26).round().astype(int)
+    tool, axis = ours.tool[moving][rows], ours.axis[moving][rows]
+    right.plot(*ours.tool[moving][:, [0, 2]].T, color=TOOL, lw=1)
+    right.quiver(tool[:, 0], tool[:, 2], axis[:, 0], axis[:, 2], color=TOOL, width=0.005, scale=12, label="the tool and its +z")
+    right.plot(*EYES[[0, 2]], "o", color="black", ms=9)
+    right.annotate("the user's eyes", EYES[[0, 2]], EYES[[0, 2]] + np.array([-0.03, 0.01]), ha="right")
+    right.plot(*np.array(scene.soldering)[[0, 2]], "s", color=REFERENCE)
+    right.annotate("board", np.array(scene.soldering)[[0, 2]] + np.array([0.015, 0.0]), va="center")
+    right.set_title("seen from the side", fontsize=9)
+    right.plot(*np.stack([np.array(scene.carry), EYES])[:, [0, 2]].T, ":", color=REFERENCE)
+    right.set(xlabel="x [m]", ylabel="z [m]")
+    right.set_aspect("equal", adjustable="datalim")
+    right.legend(frameon=False, loc="lower right", fontsize=8)
+    report.figure(figure)
+
+
+def _record(report: Report, one: Rehearsed) -> None:
+    stream = report.recording()
+    stream.log("/eyes", rr.Points3D([EYES], radii=[0.03], labels=["eyes"]), static=True)
+    for k in np.flatnonzero(one.time_s > 0)[::10]:
+        stream.set_time("time", duration=float(one.time_s[k]))
+        arrow = rr.Arrows3D(origins=[one.tool[k]], vectors=[0.1 * one.axis[k]], colors=[rgb(TOOL)])
+        stream.log("/tool", arrow)
+        stream.log("/hands", rr.Points3D(one.hands[k], radii=[0.015], colors=[rgb(ADAPTED), rgb(OTHER)]))
+    stream.disconnect()

@@ -1,0 +1,266 @@
+"""KMP beside ProMP on letters (the paper, section III-A and Figure 2), and what each costs as the input's dimension grows."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from kmp import KMP, GaussianKernel, GaussianMixture
+from sim.experiments.letters import Case, Letter, adapted, cases, elsewhere, gathered, learned
+from sim.experiments.report import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Report, pyplot, rgb
+from sim.experiments.rivals import RIDGE, learned_promp
+from sim.experiments.writing import DURATION_S, TIMES
+
+BASES = 20  # for each of x and y
+VIA_VARIANCE = 1e-6  # [cm²] as for KMP
+
+DIMENSIONS = (1, 2, 3, 6)
+PER_DIMENSION = (3, 5, 10)  # basis functions along each input
+MOST_BYTES = 2**30  # for the covariance of the weights; beyond it, it is not made
+ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
+SAMPLES, DEMONSTRATIONS = 200, 5
+FUNCTIONS = 5  # random ones, over which times and errors are averaged
+OUTPUTS = 3
+
+
+def run(report: Report, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    numbers: dict[str, Any] = {"unit": "cm", "promp_bases_per_output": BASES, "promp_ridge": RIDGE}
+    stream = report.recording()
+    for name, letters in gathered(options).items():
+        rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
+        report.say(f"{len(rows)} letters learned ({name})")
+        found = {row.name: [_compared(row, case) for case in cases(row)] for row in rows}
+        numbers[name] = {letter: [one.numbers() for one in per] for letter, per in found.items()}
+        numbers[f"{name}_summary"] = {**_summary([one for per in found.values() for one in per]), "promp_without_ridge": _bare(rows)}
+        _draw_letters(report, rows, found, name)
+        for row in rows:
+            _record(stream, row, found[row.name], name)
+    stream.disconnect()
+    functions = max(1, round(FUNCTIONS * options.share))
+    dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, seed) for seed in range(functions)])]
+    report.say("dimensions done")
+    numbers["dimensions"] = [one._asdict() for one in dimensions]
+    _draw_dimensions(report, dimensions)
+    return numbers
+
+
+class Compared(NamedTuple):
+    """One adaptation by both: trajectories (200, 2) [cm], and for each its miss and its deviations [cm]."""
+
+    case: Case
+    kmp: Array
+    promp: Array
+    miss: tuple[float, float]
+    deviation: tuple[float, float]  # rms from the mean of the demonstrations, far from the desired points
+    everywhere: tuple[float, float]  # rms from it, everywhere
+
+    def numbers(self) -> dict[str, Any]:
+        """By name."""
+        names = ("miss_cm", "rms_deviation_elsewhere_cm", "rms_deviation_cm")
+        values = (self.miss, self.deviation, self.everywhere)
+        return {"case": self.case.name, **{n: {"kmp": v[0], "promp": v[1]} for n, v in zip(names, values, strict=True)}}
+
+
+def _compared(letter: Letter, case: Case) -> Compared:
+    primitive = adapted(letter, case)
+    kmp, other = primitive.mean(TIMES[:, None]), _conditioned(letter, case, ridge=RIDGE)
+    mean, away = letter.demonstrations.mean(axis=0), elsewhere(case)
+    at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
+
+    def miss(line: Array) -> float:
+        return float(np.linalg.norm(line[at] - case.points, axis=1).max())
+
+    def rms(line: Array, where: Any) -> float:
+        return float(np.sqrt(np.mean(np.sum((line - mean)[where] ** 2, axis=1))))
+
+    everywhere = slice(None)
+    return Compared(case, kmp, other, (miss(kmp), miss(other)), (rms(kmp, away), rms(other, away)), (rms(kmp, everywhere), rms(other, everywhere)))
+
+
+def _conditioned(letter: Letter, case: Case, *, ridge: float) -> Array:
+    """The trajectory (200, 2) [cm] of the letter's ProMP through the desired points."""
+    primitive = learned_promp([TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES, ridge=ridge)
+    for t, point in zip(case.times, case.points, strict=True):
+        primitive = primitive.condition_position(point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S)
+    return np.asarray(primitive.mean_trajectory(TIMES.copy()))
+
+
+def _bare(letters: list[Letter]) -> dict[str, float]:
+    """ProMP with the covariance of its weights as the demonstrations leave it: largest miss, mean rms deviation elsewhere [cm]."""
+    misses, deviations = [], []
+    for letter in letters:
+        for case in cases(letter):
+            line = _conditioned(letter, case, ridge=0.0)
+            at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
+            misses.append(np.linalg.norm(line[at] - case.points, axis=1).max())
+            deviations.append(np.sqrt(np.mean(np.sum((line - letter.demonstrations.mean(axis=0))[elsewhere(case)] ** 2, axis=1))))
+    return {"largest_miss_cm": float(max(misses)), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
+
+
+def _summary(rows: list[Compared]) -> dict[str, Any]:
+    return {
+        who: {
+            "largest_miss_cm": max(one.miss[i] for one in rows),
+            "mean_rms_deviation_elsewhere_cm": float(np.mean([one.deviation[i] for one in rows])),
+            "mean_rms_deviation_cm": float(np.mean([one.everywhere[i] for one in rows])),
+        }
+        for i, who in enumerate(("kmp", "promp"))
+    }
+
+
+class Grown(NamedTuple):
+    """A method at one number of input dimensions: free numbers, bytes of its largest matrix, seconds, error in shares of the output's deviation."""
+
+    method: str
+    inputs: int
+    functions: int  # basis functions, or reference points
+    largest_matrix_bytes: float
+    seconds: float | None  # to learn; None: not possible
+    error: float | None
+
+
+def averaged(runs: list[list[Grown]]) -> list[Grown]:
+    """The means of runs that differ in the function only: of times, and of errors as geometric means."""
+    out = []
+    for same in zip(*runs, strict=True):
+        one = same[0]
+        if one.seconds is not None:
+            times, errors = [r.seconds for r in same], [r.error for r in same]
+            one = one._replace(seconds=float(np.mean(times)), error=float(np.exp(np.mean(np.log(errors)))))
+        out.append(one)
+    return out
+
+
+def grown(inputs: int, seed: int) -> list[Grown]:
+    """Both methods on a smooth function of so many inputs, known along five demonstrations, tried along a sixth."""
+    random = np.random.default_rng([seed, inputs])
+    lines = _lines(inputs, random)
+    function = _function(inputs, random)
+    train, test = lines[:-1].reshape(-1, inputs), lines[-1]
+    y, wanted = function(train), function(test)
+    scale = float(np.sqrt(np.mean((wanted - wanted.mean(axis=0)) ** 2)))
+
+    began = time.process_time()
+    mixture = GaussianMixture.fit(np.hstack([train, y]), components=COMPONENTS, seed=seed)
+    at = mixture.sample_inputs(POINTS, dimensions=inputs, seed=seed)
+    primitive = KMP.fit(at, mixture.regress(at), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=y.mean(axis=0))
+    error = float(np.sqrt(np.mean((primitive.mean(test) - wanted) ** 2))) / scale
+    rows = [Grown("KMP", inputs, POINTS, 8.0 * (POINTS * OUTPUTS) ** 2, time.process_time() - began, error)]
+    for each in PER_DIMENSION:
+        functions = each**inputs
+        size = 8.0 * (functions * OUTPUTS) ** 2
+        if size > MOST_BYTES:
+            rows.append(Grown(f"ProMP, {each} per input", inputs, functions, size, None, None))
+            continue
+        began = time.process_time()
+        guess = _basis_functions(lines, y.reshape(len(lines) - 1, SAMPLES, OUTPUTS), each)
+        seconds = time.process_time() - began
+        rows.append(Grown(f"ProMP, {each} per input", inputs, functions, size, seconds, float(np.sqrt(np.mean((guess - wanted) ** 2))) / scale))
+    return rows
+
+
+def _basis_functions(lines: Array, y: Array, each: int) -> Array:
+    """What a ProMP with a grid of basis functions over the inputs predicts along the last line: (200, O).
+
+    Weights by ridge regression for each demonstration, then their mean and covariance, as the paper's section IV describes it.
+    """
+    inputs = lines.shape[2]
+    grid = np.linspace(0, 1, each)
+    width = grid[1] - grid[0]
+
+    def phi(s: Array) -> Array:
+        rows = np.ones((len(s), 1))
+        for axis in range(inputs):
+            bumps = np.exp(-0.5 * ((s[:, axis : axis + 1] - grid) / width) ** 2)
+            rows = (rows[:, :, None] * (bumps / bumps.sum(axis=1, keepdims=True))[:, None, :]).reshape(len(s), -1)
+        return rows
+
+    weights = []
+    for line, wanted in zip(lines[:-1], y, strict=True):
+        design = phi(line)
+        dual = np.linalg.solve(design @ design.T + 1e-6 * np.eye(len(design)), wanted)  # ridge, in whichever form is smaller
+        weights.append((design.T @ dual).ravel())
+    stacked = np.array(weights)
+    covariance = np.cov(stacked.T)  # of all weights: what conditioning needs
+    assert covariance.shape == (stacked.shape[1],) * 2
+    return np.asarray(phi(lines[-1]) @ stacked.mean(axis=0).reshape(-1, OUTPUTS))
+
+
+def _lines(inputs: int, random: np.random.Generator) -> Array:
+    """Demonstrations' inputs (6, 200, I) in the unit cube: one smooth curve, scattered."""
+    t = np.linspace(0, 1, SAMPLES)[:, None]
+    phases = random.uniform(0, 2 * np.pi, (3, inputs))
+    sizes = random.uniform(0.3, 1.0, (3, inputs))
+    lines = []
+    for _ in range(DEMONSTRATIONS + 1):
+        shift = 0.15 * random.standard_normal((3, inputs))
+        curve = sum(sizes[k] / (k + 1) * np.sin((k + 1) * np.pi * t + phases[k] + shift[k]) for k in range(3))
+        lines.append(t[:, :1] if inputs == 1 else np.asarray(curve))
+    stacked = np.array(lines)
+    low, high = stacked.min(axis=(0, 1)), stacked.max(axis=(0, 1))
+    return np.asarray((stacked - low) / (high - low))
+
+
+def _function(inputs: int, random: np.random.Generator) -> Any:
+    """A smooth function from the cube to O outputs, as rough in every number of dimensions."""
+    directions = random.standard_normal((6, inputs)) / np.sqrt(inputs) * 4.0
+    phases, sizes = random.uniform(0, 2 * np.pi, 6), random.standard_normal((6, OUTPUTS))
+    return lambda s: np.sin(s @ directions.T + phases) @ sizes
+
+
+def _draw_letters(report: Report, letters: list[Letter], found: dict[str, list[Compared]], name: str) -> None:
+    plt = pyplot()
+    columns = min(4, len(letters))
+    figure, grid = plt.subplots(-(-len(letters) // columns), columns, figsize=(2.4 * columns, 2.5 * -(-len(letters) // columns)), squeeze=False)
+    for axes, letter in zip(grid.flat, letters, strict=False):
+        one = found[letter.name][2]
+        axes.plot(*letter.demonstrations.mean(axis=0).T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations")
+        axes.plot(*one.promp.T, color=OTHER, lw=1.8, label="ProMP")
+        axes.plot(*one.kmp.T, color=ADAPTED, lw=1.3, label="KMP")
+        axes.plot(*one.case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8, label="desired points")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(letter.name, loc="left", fontweight="bold")
+    for axes in grid.flat[len(letters) :]:
+        axes.set_axis_off()
+    for axes in grid[:, 0]:
+        axes.set_ylabel("y [cm]")
+    for axes in grid[-1]:
+        axes.set_xlabel("x [cm]")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    report.figure(figure, "" if name == "model" else name)
+
+
+def _draw_dimensions(report: Report, rows: list[Grown]) -> None:
+    plt = pyplot()
+    figure, (functions, seconds, error) = plt.subplots(1, 3, figsize=(10, 3.4))
+    methods = list(dict.fromkeys(one.method for one in rows))
+    styles = dict(zip(methods, (("o-", ADAPTED), ("s:", "#56B4E9"), ("^--", OTHER), ("D-.", "black")), strict=True))
+    for method in methods:
+        mine = [one for one in rows if one.method == method]
+        style, colour = styles[method]
+        functions.plot([one.inputs for one in mine], [one.functions for one in mine], style, color=colour, label=method)
+        possible = [one for one in mine if one.seconds is not None]
+        seconds.plot([one.inputs for one in possible], [one.seconds for one in possible], style, color=colour)
+        error.plot([one.inputs for one in possible], [100 * one.error for one in possible if one.error is not None], style, color=colour)
+    at = (MOST_BYTES / 8) ** 0.5 / OUTPUTS
+    functions.axhline(at, color=REFERENCE, lw=0.8)
+    functions.text(1, at * 1.4, "above: more than 1 GiB for the weights' covariance", fontsize=7.5, color=REFERENCE)
+    functions.set(yscale="log", ylabel="basis functions, or reference points")
+    seconds.set(yscale="log", ylabel="time to learn [s]")
+    error.set(yscale="log", ylabel="error along a held-out demonstration\n[% of the output's deviation]")
+    for axes in (functions, seconds, error):
+        axes.set(xlabel="input dimensions", xticks=DIMENSIONS)
+    figure.legend(*functions.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    report.figure(figure, "dimensions")
+
+
+def _record(stream: rr.RecordingStream, letter: Letter, rows: list[Compared], name: str) -> None:
+    for number, one in enumerate(rows):
+        stream.set_time("case", sequence=number)
+        for who, line, colour in (("kmp", one.kmp, ADAPTED), ("promp", one.promp, OTHER)):
+            stream.log(f"/{name}/{letter.name}/{who}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08]))
+        stream.log(f"/{name}/{letter.name}/desired", rr.Points2D(one.case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))
