@@ -41,7 +41,7 @@ class Rival(Skill):
 
     law: Law = field(kw_only=True)
 
-    def predict(self, hands: Array, velocities: Array, accelerations: Array) -> Prediction:
+    def predict(self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
         curve = STEP_S**2 / 2 * a
@@ -55,7 +55,7 @@ class TimeDriven(Skill):
     trajectory: Law = field(kw_only=True)  # from times (M, 1) [s] to tool (M, 3) [m]
     bench: Bench = field(kw_only=True)
 
-    def predict(self, hands: Array, velocities: Array, accelerations: Array) -> Prediction:
+    def predict(self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s
         rows = self.trajectory(np.array([[t - STEP_S], [t], [t + STEP_S]]))
