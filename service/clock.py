@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
@@ -14,7 +15,7 @@ from service.frame import Vector
 from service.wire import Percentiles
 
 SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
-FIFO_PRIORITY = 80
+FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
 
 
 class Deadlines:
@@ -70,6 +71,12 @@ def ask_for_real_time() -> bool:
     except (PermissionError, AttributeError, OSError):
         return False
     return True
+
+
+def run_beside_real_time() -> None:
+    """Lets this thread run before other processes, if that is granted: put aside while it holds the interpreter, it would hold up the loop."""
+    with contextlib.suppress(PermissionError, AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
 
 
 class Window:

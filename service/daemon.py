@@ -19,7 +19,7 @@ from zenoh.handlers import RingChannel
 
 from service import wire
 from service.client import endpoints, open_session
-from service.clock import SPIN_NS, Deadlines, Window, ask_for_real_time
+from service.clock import SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
 from service.config import Settings
 from service.controller import Controller, run
 from service.frame import FRAME, SIDES, STAGES, TIMING, Cause, Event, Flag, Frame, Mode, Reason, Tick, blank
@@ -180,6 +180,7 @@ class Daemon:
 
     def _report(self) -> None:
         """Publishes the status, says what changed, and keeps the scribe alive, ten times a second."""
+        run_beside_real_time()
         said: tuple[str, str] | None = None
         told: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):

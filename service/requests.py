@@ -18,6 +18,7 @@ import zenoh
 
 from service import wire
 from service.arm import Arm
+from service.clock import run_beside_real_time
 from service.config import Settings
 from service.frame import Event
 from service.skill import Skill, SkillError
@@ -144,6 +145,7 @@ class Requests:
             thread.join(ADOPTION_TIMEOUT_S + 1)
 
     def _serve(self, source: queue.SimpleQueue[Any]) -> None:
+        run_beside_real_time()
         while (item := source.get()) is not None:
             suffix, query = item
             if source is self._quick and suffix in ("via_points", "skill") and not self._is_list(query):
