@@ -22,7 +22,7 @@ from service.client import endpoints, open_session
 from service.clock import SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
 from service.config import Settings
 from service.controller import Controller, run
-from service.frame import FRAME, SIDES, STAGES, TIMING, Cause, Event, Flag, Frame, Mode, Reason, Tick, blank
+from service.frame import FRAME, SIDES, STAGES, TIMING, Cause, Event, Flag, Frame, Mode, Reason, Tick, blank, encode_setpoint, encode_target
 from service.requests import PlacesFile, Requests
 from service.scribe import Scribe
 from service.skill import Skill, SkillError
@@ -33,7 +33,6 @@ LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 DECIMATION = 5  # ticks to one tool/target and one tool/setpoint
 STOP_TIMEOUT_S = 3.0
 LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
-DECODERS = {"hands/left": wire.decode_pose, "hands/right": wire.decode_pose, "joints/state": wire.decode_joints}
 
 
 class Daemon:
@@ -57,7 +56,7 @@ class Daemon:
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         self._subscribers = [
             (kind, decode, self._session.declare_subscriber(wire.key(settings.cell, kind), RingChannel(1)))
-            for kind, decode in DECODERS.items()
+            for kind, decode in wire.DECODERS.items()
             if kind != "joints/state" or settings.arm.source == "state"
         ]
         self._publishers = {
@@ -225,20 +224,6 @@ class Daemon:
             endpoints=self.endpoints,
             version=version("thirdhand"),
         )
-
-
-def encode_target(stamp_ns: int, frame: Frame) -> bytes:
-    """The frame's target as CDR bytes of `tool/target`."""
-    covariance = [0.0] * 36
-    for i, row in enumerate(frame["covariance"].tolist()):
-        covariance[6 * i : 6 * i + 3] = row
-    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
-    return wire.encode_pose_with_covariance(wire.PoseWithCovarianceStamped(stamp_ns, wire.BASE, position, orientation, tuple(covariance)))
-
-
-def encode_setpoint(stamp_ns: int, frame: Frame) -> bytes:
-    """The frame's setpoint as CDR bytes of `tool/setpoint`."""
-    return wire.encode_pose(wire.PoseStamped(stamp_ns, wire.BASE, tuple(frame["setpoint"].tolist()), tuple(frame["orientation"].tolist())))
 
 
 def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:

@@ -14,7 +14,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import CDR_HEADER, WireError
+from service.wire import (
+    BASE,
+    CDR_HEADER,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    WireError,
+    encode_pose,
+    encode_pose_with_covariance,
+)
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
@@ -196,3 +204,17 @@ def differences(a: Record, b: Record) -> dict[str, float]:
         for field in a.dtype.names or ()
         if a[field].tobytes() != b[field].tobytes()
     }
+
+
+def encode_target(stamp_ns: int, frame: Frame) -> bytes:
+    """The frame's target as CDR bytes of `tool/target`."""
+    covariance = [0.0] * 36
+    for i, row in enumerate(frame["covariance"].tolist()):
+        covariance[6 * i : 6 * i + 3] = row
+    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
+    return encode_pose_with_covariance(PoseWithCovarianceStamped(stamp_ns, BASE, position, orientation, tuple(covariance)))
+
+
+def encode_setpoint(stamp_ns: int, frame: Frame) -> bytes:
+    """The frame's setpoint as CDR bytes of `tool/setpoint`."""
+    return encode_pose(PoseStamped(stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["orientation"].tolist())))

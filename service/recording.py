@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from service import schemas, wire
 from service.config import Settings
-from service.frame import EVENT_KINDS, FRAME, STATE, TIMING, Record, Tick, decode, encode
+from service.frame import EVENT_KINDS, FRAME, STATE, TIMING, Record, Tick, decode, encode, encode_setpoint, encode_target
 from service.schemas import McapFile, Messages, PoseStreams, RecordingError, Transform, ends_early, existing, machine, next_whole
 
 __all__ = [
@@ -132,17 +132,14 @@ class Recorder:
             transforms.append(Transform(wire.BASE, "tool", tuple(frame["tool"].tolist()), orientation))
         setpoint = tuple(frame["setpoint"].tolist())
         transforms.append(Transform(wire.BASE, "setpoint", setpoint, orientation))
-        put(self._topics["tool/setpoint"], wire.POSE, wire.encode_pose(wire.PoseStamped(time_ns, wire.BASE, setpoint, orientation)), time_ns, i)
+        put(self._topics["tool/setpoint"], wire.POSE, encode_setpoint(time_ns, frame), time_ns, i)
         seen = frame["hand_ages"] >= 0
         for side in (0, 1):
             if seen[side]:
                 transforms.append(Transform(wire.BASE, _HANDS[side], tuple(frame["hands"][side].tolist()), (0.0, 0.0, 0.0, 1.0)))
         if frame["covariance"].any():  # without both hands nothing is predicted
             target = tuple(frame["target"].tolist())
-            covariance = np.zeros((6, 6))
-            covariance[:3, :3] = frame["covariance"]
-            pose = wire.PoseWithCovarianceStamped(time_ns, wire.BASE, target, orientation, tuple(covariance.ravel().tolist()))
-            put(self._topics["tool/target"], wire.POSE_COV, wire.encode_pose_with_covariance(pose), time_ns, i)
+            put(self._topics["tool/target"], wire.POSE_COV, encode_target(time_ns, frame), time_ns, i)
             transforms.append(Transform(wire.BASE, "target", target, orientation))
         put("/tf", schemas.TF, schemas.encode_transforms(time_ns, transforms), time_ns, i)
 

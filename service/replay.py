@@ -17,7 +17,6 @@ from service.skill import Skill, SkillError
 
 TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
 POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
-DECODERS = {"hands/left": wire.decode_pose, "hands/right": wire.decode_pose, "joints/state": wire.decode_joints}
 
 
 @dataclass
@@ -115,7 +114,7 @@ def _event(kind: str, payload: bytes, skills: dict[bytes, Skill]) -> Event:
     try:
         if kind == "skill":
             return Event(kind, payload, _skill(payload, skills))
-        return Event(kind, payload, DECODERS[kind](payload) if kind in DECODERS else None)
+        return Event(kind, payload, wire.DECODERS[kind](payload) if kind in wire.DECODERS else None)
     except (wire.WireError, SkillError) as error:
         raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
 

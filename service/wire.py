@@ -40,7 +40,7 @@ from service.explain import explained
 __all__ = [
     "BASE",
     "CDR_HEADER",
-    "CHANNELS",
+    "CHANNELS", "DECODERS",
     "JOINTS",
     "JOINT_NAMES",
     "JSON",
@@ -122,6 +122,8 @@ CHANNELS = (
     Channel("resume", JSON, "request", "", True, "end an operator's hold"),
     Channel("reset", JSON, "request", "", True, "end a fault"),
 )
+
+DECODERS = {"hands/left": decode_pose, "hands/right": decode_pose, "joints/state": decode_joints}  # of what enters the loop
 
 
 def key(cell: str, suffix: str) -> str:
