@@ -1,4 +1,6 @@
-"""What a client of the daemon needs: a Zenoh session that announces nothing, and its requests as plain calls."""
+"""What a client of the daemon needs: a Zenoh session that announces nothing, and its requests as
+plain calls.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from typing import Any
 
 import zenoh
 
-from service import wire
-from service.config import ExplainedError
+from service.contract import channels, requests
+from service.contract.explain import ExplainedError
 
 
 class UnreachableError(ExplainedError, OSError):
@@ -23,7 +25,10 @@ class RefusedError(ExplainedError, ValueError):
 
 
 def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), timeout_s: float = 10.0) -> zenoh.Session:
-    """An open Zenoh session between named endpoints, without scouting. Close it. Raises UnreachableError."""
+    """An open Zenoh session between named endpoints, without scouting.
+
+    Close it. Raises UnreachableError.
+    """
     config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": "peer",
@@ -42,12 +47,23 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
         return zenoh.open(config)
     except zenoh.ZError as error:
         reason = str(error).split(" at ")[0]
-        wrong = next((endpoint for endpoint in (*connect, *listen) if not re.match(r"[a-z]+/.+:.+|unixsock-stream/.+", endpoint)), None)
+        wrong = next(
+            (
+                endpoint
+                for endpoint in (*connect, *listen)
+                if not re.match(r"[a-z]+/.+:.+|unixsock-stream/.+", endpoint)
+            ),
+            None,
+        )
         if wrong is not None:
             how = f"connect to {wrong}" if wrong in connect else f"listen on {wrong}"
-            raise UnreachableError(f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed") from None
+            raise UnreachableError(
+                f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed"
+            ) from None
         if connect and "connect" in reason:
-            raise UnreachableError(f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?") from None
+            raise UnreachableError(
+                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?"
+            ) from None
         raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
 
 
@@ -60,7 +76,10 @@ def endpoints(session: zenoh.Session) -> tuple[str, ...]:
 
 
 class Client:
-    """A running daemon's requests as calls. Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers."""
+    """A running daemon's requests as calls.
+
+    Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers.
+    """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
         self._session = session
@@ -69,23 +88,26 @@ class Client:
 
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
         """The reply to one request; `request` is anything that becomes JSON."""
-        payload = wire.encode_json({} if request is None else request)
-        for reply in self._session.get(wire.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
+        payload = requests.encode_json({} if request is None else request)
+        for reply in self._session.get(channels.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
             if reply.ok is not None:
                 answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
                 return answer
             text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else "no reason given"
             if text != "Timeout":
                 raise RefusedError(text)
-        raise UnreachableError(f"nobody answers on {wire.key(self._cell, suffix)}: is the daemon running there, and is the cell's name right?")
+        raise UnreachableError(
+            f"nobody answers on {channels.key(self._cell, suffix)}: "
+            "is the daemon running there, and is the cell's name right?"
+        )
 
     def status(self) -> dict[str, Any]:
         """What `<cell>/status` carries."""
         return self.ask("status")
 
-    def add(self, points: Iterable[wire.ViaPoint], *, tolerance: float = 0.05) -> dict[str, Any]:
-        """Teaches places; returns once they are in force."""
-        return self.ask("via_points", wire.Add(tuple(points), tolerance))
+    def add(self, points: Iterable[requests.ViaPoint], *, tolerance: float = 0.05) -> dict[str, Any]:
+        """Teaches via-points; returns once they are in force."""
+        return self.ask("via_points", requests.Add(tuple(points), tolerance))
 
     def wait_until_ready(self, *, timeout_s: float = 15.0) -> dict[str, Any]:
         """The status, once a daemon answers on this cell."""

@@ -1,4 +1,7 @@
-"""Settings of one cell: a TOML file, validated whole before anything starts. Units stand in the names, defaults are safe."""
+"""Settings of one cell: a TOML file, validated whole before anything starts.
+
+Units stand in the names, defaults are safe.
+"""
 
 from __future__ import annotations
 
@@ -10,44 +13,51 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from service.explain import explained
+from service.contract.channels import ENDPOINT
+from service.contract.explain import ExplainedError, explained
+from service.urdf import Urdf, UrdfError
 
-ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
+WAM = Path(__file__).with_name("arms") / "wam.urdf"
+FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
+NEAREST_POINT = 0.4
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Cell = Annotated[
     str,
-    msgspec.Meta(pattern=r"\A[^/*$?#\s\0]+(/[^/*$?#\s\0]+)*\Z", extra={"accepted": "words joined by single slashes, without spaces and * $ ? #,"}),
+    msgspec.Meta(
+        pattern=r"\A[^/*$?#\s\0]+(/[^/*$?#\s\0]+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces and * $ ? #,"},
+    ),
 ]
-Pose7 = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
-Joints7 = tuple[float, float, float, float, float, float, float]
-
-
-class ExplainedError(Exception):
-    """An error whose message tells people what failed, what was given and what is accepted: commands print it and exit 1."""
+Point = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
+PerJoint = tuple[float, ...]
 
 
 class SettingsError(ExplainedError, ValueError):
     """A configuration that cannot be used: names the field, what was given and what is accepted."""
 
 
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+
+
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One table of the file; an unknown name in it is an error."""
 
 
-class Hands(Section, frozen=True):
+class HandSettings(Section, frozen=True):
     """How a tracker's poses become hand positions in frame `base`."""
 
     unit: Literal["m", "cm", "mm"] = "m"
-    base_from_tracker: Pose7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
     noise_std_m: Positive = 0.0005  # of one sample, each axis
     jerk_density: Positive = 0.03  # [m²/s⁵] of the constant-acceleration Kalman filter
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 
-class Tool(Section, frozen=True):
+class ToolSettings(Section, frozen=True):
     """The tool: where it sits on the tool plate, and how fast it may move."""
 
-    plate_from_tool: Pose7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
@@ -55,32 +65,65 @@ class Tool(Section, frozen=True):
     bandwidth: Positive = 20.0  # [rad/s] of the critically damped tracker
 
 
-class Arm(Section, frozen=True):
-    """The arm: where its joint states come from, its posture when none come, and when following it is a fault."""
+class ArmSettings(Section, frozen=True):
+    """The arm: which, where its joint states come from, its posture when none come, and when
+    following it is a fault.
+    """
 
+    urdf: str = ""  # a file; empty: the shipped Barrett WAM
+    plate: str = "tool_plate"  # the link that carries the tool
     source: Literal["state", "assumed"] = "state"
-    posture: Joints7 = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] the null space's and the assumed one
+    posture: PerJoint = (
+        0.1761,
+        0.8604,
+        -0.5,
+        2.5414,
+        -0.4273,
+        -1.0823,
+        0.0,
+    )  # [rad] the null space's and the assumed one
     fault_error_rad: Positive = 0.1
     silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 
-class JointLimits(Section, frozen=True):
-    """The limits that no command ever leaves [rad, rad/s, rad/s², rad/s³]; all can be lowered."""
+class JointSettings(Section, frozen=True):
+    """The arm's joints in chain order, and the limits that no command ever leaves [rad, rad/s,
+    rad/s², rad/s³].
+    """
 
-    lower: Joints7 = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)
-    upper: Joints7 = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)
-    velocity: Joints7 = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)
-    acceleration: Joints7 = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)
-    jerk: Joints7 = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)
+    names: tuple[str, ...] = (
+        "wam/base_yaw_joint",
+        "wam/shoulder_pitch_joint",
+        "wam/shoulder_yaw_joint",
+        "wam/elbow_pitch_joint",
+        "wam/wrist_yaw_joint",
+        "wam/wrist_pitch_joint",
+        "wam/palm_yaw_joint",
+    )
+    lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)
+    upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)
+    velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)
+    acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)
+    jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)
 
 
 class Reach(Section, frozen=True):
-    """Where targets may lie: a shell around the shoulder, in front of the base plate and above the table [m]."""
+    """Where targets may lie: a shell around the shoulder, in front of the base plate and above the
+    table [m].
+    """
 
+    centre: Point = (0.0, 0.0, 0.346)  # of the shell: where the arm's first axes meet
     inner: Positive = 0.35
-    outer: Annotated[float, msgspec.Meta(gt=0, le=0.9)] = 0.88
+    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88
     min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15
     min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02
+
+
+class Table(Section, frozen=True):
+    """The table top, where pictures and the simulated bench have it [m]."""
+
+    centre: Point = (0.80, 0.0, 0.0)
+    half_size: tuple[Positive, Positive] = (0.45, 0.60)
 
 
 class Network(Section, frozen=True):
@@ -91,7 +134,7 @@ class Network(Section, frozen=True):
 
 
 class Files(Section, frozen=True):
-    """Where skills are read, and taught places, recordings and viewer files are written."""
+    """Where skills are read, and via-points, recordings and viewer files are written."""
 
     skills: str = ""  # a folder; empty: the shipped recordings
     state: str = "~/.local/state/thirdhand"
@@ -104,11 +147,12 @@ class Settings(Section, frozen=True):
 
     cell: Cell = "thirdhand"
     rate_hz: Annotated[int, msgspec.Meta(ge=50, le=1000)] = 500
-    hands: Hands = msgspec.field(default_factory=Hands)
-    tool: Tool = msgspec.field(default_factory=Tool)
-    arm: Arm = msgspec.field(default_factory=Arm)
-    joints: JointLimits = msgspec.field(default_factory=JointLimits)
+    hands: HandSettings = msgspec.field(default_factory=HandSettings)
+    tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
+    arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
+    joints: JointSettings = msgspec.field(default_factory=JointSettings)
     reach: Reach = msgspec.field(default_factory=Reach)
+    table: Table = msgspec.field(default_factory=Table)
     network: Network = msgspec.field(default_factory=Network)
     files: Files = msgspec.field(default_factory=Files)
 
@@ -118,33 +162,68 @@ class Settings(Section, frozen=True):
                 raise ValueError(f"{path}: {value} given; a finite number needed")
         if {".", ".."} & set(self.cell.split("/")):
             raise ValueError(f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted")
-        for path, pose in (("$.hands.base_from_tracker", self.hands.base_from_tracker), ("$.tool.plate_from_tool", self.tool.plate_from_tool)):
+        for path, pose in (
+            ("$.hands.base_from_tracker", self.hands.base_from_tracker),
+            ("$.tool.plate_from_tool", self.tool.plate_from_tool),
+        ):
             norm = math.hypot(*pose[3:])
             if abs(norm - 1.0) > 1e-3:
                 raise ValueError(f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)")
         if self.tool.fault_speed < self.tool.max_speed:
-            raise ValueError(f"$.tool.fault_speed: {self.tool.fault_speed} given; at least $.tool.max_speed = {self.tool.max_speed} needed")
+            raise ValueError(
+                f"$.tool.fault_speed: {self.tool.fault_speed} given; "
+                f"at least $.tool.max_speed = {self.tool.max_speed} needed"
+            )
         if self.reach.inner >= self.reach.outer:
-            raise ValueError(f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed")
-        widest = JointLimits.__struct_defaults__
-        for field, bounds in zip(JointLimits.__struct_fields__, widest, strict=True):
-            for i, (given, bound) in enumerate(zip(getattr(self.joints, field), bounds, strict=True)):
-                if field == "lower" and given < bound:
+            raise ValueError(
+                f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
+            )
+        count = len(self.joints.names)
+        if not count or len(set(self.joints.names)) < count:
+            raise ValueError(f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed")
+        fields = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS} | {
+            "$.arm.posture": self.arm.posture
+        }
+        for path, values in fields.items():
+            if len(values) != count:
+                raise ValueError(f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names")
+        widest = self._widest()
+        for name in LIMITS:
+            for i, (given, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
+                if name == "lower" and given < bound:
                     raise ValueError(f"$.joints.lower[{i}]: {given} given; {bound} or more accepted")
-                if field == "upper" and given > bound:
+                if name == "upper" and given > bound:
                     raise ValueError(f"$.joints.upper[{i}]: {given} given; {bound} or less accepted")
-                if field not in ("lower", "upper") and not 0 < given <= bound:
-                    raise ValueError(f"$.joints.{field}[{i}]: {given} given; above 0, up to {bound} accepted")
+                if name not in ("lower", "upper") and not 0 < given <= bound:
+                    raise ValueError(f"$.joints.{name}[{i}]: {given} given; above 0, up to {bound} accepted")
         for i, (low, high, at) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
             if not low < high:
                 raise ValueError(f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed")
             if not low <= at <= high:
                 raise ValueError(f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted")
 
+    def _widest(self) -> dict[str, PerJoint]:
+        """The widest limits that are accepted: the shipped arm's own, and what is safe for any
+        other is its owner's to say.
+        """
+        if not self.arm.urdf:
+            return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
+        n = len(self.joints.names)
+        return {name: (-math.inf if name == "lower" else math.inf,) * n for name in LIMITS}
+
     @property
     def period_s(self) -> float:
         """Duration of one tick [s]."""
         return 1.0 / self.rate_hz
+
+
+def robot_description(settings: Settings) -> str:
+    """The text of the arm's URDF. Raises SettingsError."""
+    path = Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"$.arm.urdf: cannot read {path}: {error}") from None
 
 
 def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
@@ -159,11 +238,77 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
 
 
 def converted(given: Any, *, origin: str) -> Settings:
-    """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError."""
+    """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
+
+    What is not said of an arm with a URDF of its own is taken from there; no limit may be wider
+    than the URDF's.
+    """
     try:
-        return msgspec.convert(given, Settings)
+        arm = given.get("arm") if isinstance(given, dict) else None
+        if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
+            given = _completed(given)
+        settings = msgspec.convert(given, Settings)
+        _check_against_urdf(settings)
     except msgspec.ValidationError as error:
         raise SettingsError(f"{origin}: {explained(error, given, Settings)}") from None
+    except (UrdfError, SettingsError) as error:
+        raise SettingsError(f"{origin}: {error}") from None
+    return settings
+
+
+def _completed(given: dict[str, Any]) -> dict[str, Any]:
+    """The settings of an arm with a URDF of its own, with what that says where they are silent."""
+    arm, joints, reach = (
+        {**part} if isinstance(part := given.get(name, {}), dict) else {} for name in ("arm", "joints", "reach")
+    )
+    urdf = Urdf(robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"]))), origin=arm["urdf"])
+    if "plate" not in arm:
+        raise SettingsError(
+            f"$.arm.plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
+        )
+    moving = urdf.movable(str(arm["plate"]))
+    joints.setdefault("names", [joint.name for joint in moving])
+    for name in ("lower", "upper", "velocity"):
+        joints.setdefault(name, [getattr(joint, name) for joint in moving])
+    for path, section, name in (
+        ("joints", joints, "acceleration"),
+        ("joints", joints, "jerk"),
+        ("arm", arm, "posture"),
+    ):
+        if name not in section:
+            raise SettingsError(
+                f"$.{path}.{name}: missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
+            )
+    lengths = [math.hypot(*joint.translation) for joint in urdf.chain(str(arm["plate"]))]
+    reach.setdefault("centre", [0.0, 0.0, lengths[0]])
+    reach.setdefault("outer", FARTHEST_POINT * sum(lengths[1:]))
+    reach.setdefault("inner", NEAREST_POINT * float(reach["outer"]))
+    return {**given, "arm": arm, "joints": joints, "reach": reach}
+
+
+def _check_against_urdf(settings: Settings) -> None:
+    """Raises SettingsError for joints that the arm does not have, and for limits wider than the
+    URDF's.
+    """
+    urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
+    moving = urdf.movable(settings.arm.plate)
+    names = tuple(joint.name for joint in moving)
+    if settings.joints.names != names:
+        raise SettingsError(
+            f"$.joints.names: {list(settings.joints.names)} given; the chain's {list(names)} in this order needed"
+        )
+    for i, joint in enumerate(moving):
+        for name, low, high in (
+            ("lower", joint.lower, math.inf),
+            ("upper", -math.inf, joint.upper),
+            ("velocity", 0, joint.velocity),
+        ):
+            given = getattr(settings.joints, name)[i]
+            if not low <= given <= high:
+                accepted = f"{low} or more" if name == "lower" else f"up to {high}"
+                raise SettingsError(
+                    f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}"
+                )
 
 
 def parse(text: str, *, origin: str) -> Settings:

@@ -1,1 +1,3 @@
-"""The soldering bench in simulation: scene, scripted hands, a teacher and its demonstrations, and the physics around the arm."""
+"""The soldering bench in simulation: scene, scripted hands, a teacher and its demonstrations, and
+the physics around the arm.
+"""

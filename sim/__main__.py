@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import argparse
 import signal
 import sys
@@ -11,11 +14,11 @@ from pathlib import Path
 import msgspec
 
 from service.client import endpoints, open_session
-from service.config import ENDPOINT
+from service.contract.channels import ENDPOINT
 from sim.bench import Bench
-from sim.hands import Clock, HandScript, Pause
-from sim.live import BenchError, Dropout, Live, Report, run
+from sim.network import BenchError, Dropout, Live, RunReport, run
 from sim.scene import Scene, SceneError
+from sim.script import Clock, HandScript, Pause
 
 EXAMPLE = """example:
   thirdhand serve &
@@ -27,23 +30,40 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="python -m sim",
-        description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the soldering scene "
-        "over and over (with --once: once). Progress goes to standard error, reports to --json.",
+        description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the "
+        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --json.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
-        "--connect", metavar="EP", action="append", default=[], help=f"Zenoh endpoint of the service; may be repeated (default: {ENDPOINT})"
+        "--connect",
+        metavar="EP",
+        action="append",
+        default=[],
+        help=f"Zenoh endpoint of the service; may be repeated (default: {ENDPOINT})",
     )
-    p.add_argument("--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated")
+    p.add_argument(
+        "--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated"
+    )
     p.add_argument("--cell", default="thirdhand", help="prefix of all keys (default: %(default)s)")
-    p.add_argument("--scene", metavar="FILE", type=Path, help="TOML file with places [x, y, z] in metres; the nominal scene otherwise")
+    p.add_argument(
+        "--scene",
+        metavar="FILE",
+        type=Path,
+        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+    )
     p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
-    p.add_argument("--once", action="store_true", help="end after one run; its report goes to standard output unless --json says otherwise")
+    p.add_argument(
+        "--once",
+        action="store_true",
+        help="end after one run; its report goes to standard output unless --json says otherwise",
+    )
     p.add_argument("--json", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
     p.add_argument("--duration", metavar="S", type=float, default=float("inf"), help="end after so many seconds")
     p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
-    p.add_argument("--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)")
+    p.add_argument(
+        "--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)"
+    )
     p.add_argument("--speed", metavar="X", type=float, default=1.0, help="of the hands, 1 is as demonstrated")
     p.add_argument(
         "--pause",
@@ -55,12 +75,42 @@ def parser() -> argparse.ArgumentParser:
         help="seconds after the begin while the hands stop, 0.6 at least; may be repeated",
     )
     p.add_argument(
-        "--turn", metavar=("AT", "LASTS"), type=float, nargs=2, action="append", default=[], help="the same for hands that go back and come again"
+        "--turn",
+        metavar=("AT", "LASTS"),
+        type=float,
+        nargs=2,
+        action="append",
+        default=[],
+        help="the same for hands that go back and come again",
     )
-    p.add_argument("--offset-mm", metavar="MM", type=float, default=8.0, help="scatter of the places, std per axis (default: %(default)s)")
-    p.add_argument("--tremor-mm", metavar="MM", type=float, default=0.5, help="tremor of the hands, rms per axis (default: %(default)s)")
-    p.add_argument("--noise-mm", metavar="MM", type=float, default=0.5, help="noise of the tracker, std per axis (default: %(default)s)")
-    p.add_argument("--dropout", metavar=("START", "DURATION"), type=float, nargs=2, help="seconds of the script while one hand is not seen")
+    p.add_argument(
+        "--offset-mm",
+        metavar="MM",
+        type=float,
+        default=8.0,
+        help="scatter of the places, std per axis (default: %(default)s)",
+    )
+    p.add_argument(
+        "--tremor-mm",
+        metavar="MM",
+        type=float,
+        default=0.5,
+        help="tremor of the hands, rms per axis (default: %(default)s)",
+    )
+    p.add_argument(
+        "--noise-mm",
+        metavar="MM",
+        type=float,
+        default=0.5,
+        help="noise of the tracker, std per axis (default: %(default)s)",
+    )
+    p.add_argument(
+        "--dropout",
+        metavar=("START", "DURATION"),
+        type=float,
+        nargs=2,
+        help="seconds of the script while one hand is not seen",
+    )
     p.add_argument("--dropout-hand", choices=("left", "right"), default="left", help="which one (default: %(default)s)")
     return p
 
@@ -84,11 +134,20 @@ def main(arguments: list[str] | None = None) -> int:
         Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
         p.error(f"--pause, --turn: {error}")
-    dropout = Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
-    live = Live(cell=args.cell, hands_hz=args.hands_rate, once=args.once, duration_s=args.duration, wait_s=args.wait, dropout=dropout)
+    dropout = (
+        Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
+    )
+    live = Live(
+        cell=args.cell,
+        hands_hz=args.hands_rate,
+        once=args.once,
+        duration_s=args.duration,
+        wait_s=args.wait,
+        dropout=dropout,
+    )
     target = args.json or ("-" if args.once else None)
 
-    def report(result: Report) -> None:
+    def report(result: RunReport) -> None:
         line = msgspec.json.encode(result).decode() + "\n"
         if target == "-":
             sys.stdout.write(line)
@@ -103,7 +162,10 @@ def main(arguments: list[str] | None = None) -> int:
             scene,
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
-            pauses=[*(Pause(at, lasts) for at, lasts in args.pause), *(Pause(at, lasts, depth=2.0) for at, lasts in args.turn)],
+            pauses=[
+                *(Pause(at, lasts) for at, lasts in args.pause),
+                *(Pause(at, lasts, depth=2.0) for at, lasts in args.turn),
+            ],
             offset_std=args.offset_mm / 1000,
             tremor_rms=args.tremor_mm / 1000,
             noise_std=args.noise_mm / 1000,

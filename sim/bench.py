@@ -1,4 +1,6 @@
-"""The bench: arm, hands and things in step with a script, and whether the task succeeds. No network, no clock: `step` is one period.
+"""The bench: arm, hands and things in step with a script, and whether the task succeeds.
+
+No network, no clock: `step` is one period.
 
 bench = Bench(HandScript(Scene(), seed=1))
 bench.begin()
@@ -17,29 +19,31 @@ import numpy as np
 import numpy.typing as npt
 
 from service.config import Settings
-from sim.hands import Hands, HandScript
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION
-from sim.world import BOARD_FROM_TOOL, LEVEL, Pose, Vector, World, carried_by, seen_from
+from sim.script import HandMotions, HandScript
+from sim.world import BOARD_FROM_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
 
 BRAKE_AFTER_S = 0.020  # without a command
 TAIL_S = 0.5  # watched after the script's end
 STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
 
 
-class Event(msgspec.Struct, frozen=True):
-    """How one event went: whether the tool was there, its smallest distance [mm], and when: first near enough, or nearest [s of the script]."""
+class TaskEvent(msgspec.Struct, frozen=True):
+    """How one event went: whether the tool was there, its smallest distance [mm], and when: first
+    near enough, or nearest [s of the script].
+    """
 
     reached: bool
     error_mm: float
     time_s: float
 
 
-class Events(msgspec.Struct, frozen=True):
+class TaskEvents(msgspec.Struct, frozen=True):
     """The three events of a run."""
 
-    handover: Event
-    grasp: Event
-    carry: Event
+    handover: TaskEvent
+    grasp: TaskEvent
+    carry: TaskEvent
 
     @property
     def success(self) -> bool:
@@ -48,15 +52,17 @@ class Events(msgspec.Struct, frozen=True):
 
 
 class Observation(NamedTuple):
-    """The bench after a step: steps done, seconds since the script began (0 before), joints [rad, rad/s], tool [m, m/s], hands."""
+    """The bench after a step: steps done, seconds since the script began (0 before), joints [rad,
+    rad/s], tool [m, m/s], hands.
+    """
 
     tick: int
     time_s: float
-    joints: Vector
-    joint_velocities: Vector
+    joints: Floats
+    joint_velocities: Floats
     tool: Pose
-    tool_velocity: Vector
-    hands: Hands
+    tool_velocity: Floats
+    hands: HandMotions
 
 
 class _Watch:
@@ -74,19 +80,25 @@ class _Watch:
             self.reached_s = time_s
         return first
 
-    def event(self) -> Event:
+    def event(self) -> TaskEvent:
         reached = not math.isnan(self.reached_s)
-        return Event(reached, round(1000 * self.nearest, 3), round(self.reached_s if reached else self.nearest_s, 3))
+        return TaskEvent(
+            reached, round(1000 * self.nearest, 3), round(self.reached_s if reached else self.nearest_s, 3)
+        )
 
 
 class Bench:
-    """The arm at its posture with the board in its tool, the hands at the script's start, waiting for `begin`."""
+    """The arm at its posture with the board in its tool, the hands at the script's start, waiting
+    for `begin`.
+    """
 
-    def __init__(self, script: HandScript, *, posture: Vector | None = None, rate_hz: int = 500) -> None:
+    def __init__(self, script: HandScript, *, posture: Floats | None = None, rate_hz: int = 500) -> None:
         self.script = script
         self.scene = script.scene
         self.period_s = 1.0 / rate_hz
-        self.world = World(self.scene, posture=posture or Settings().arm.posture, rate_hz=rate_hz)
+        settings = Settings()
+        self.joint_names = settings.joints.names
+        self.world = World(self.scene, settings, posture=posture or settings.arm.posture, rate_hz=rate_hz)
         self.tick = 0
         self._ticks_since_begin = 0
         self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
@@ -100,7 +112,9 @@ class Bench:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def _lay_out(self) -> None:
@@ -119,7 +133,9 @@ class Bench:
         self._ticks_since_begin, self._direction = 0, 1
 
     def turn_back(self) -> None:
-        """Let the hands go back the way they came, which keeps them where the skill knows the way; then `begin` can follow."""
+        """Let the hands go back the way they came, which keeps them where the skill knows the way;
+        then `begin` can follow.
+        """
         self._ticks_since_begin = min(self._ticks_since_begin, math.ceil(self.script.duration_s / self.period_s))
         self._direction = -1
 
@@ -132,6 +148,11 @@ class Bench:
     def finished(self) -> bool:
         """Whether the script and the tail after it are over."""
         return self._direction == 1 and self.time_s >= self.script.duration_s + TAIL_S
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the script has not begun."""
+        return self._direction == 0
 
     @property
     def back(self) -> bool:
@@ -147,7 +168,7 @@ class Bench:
         """What the last step left."""
         return self._observation
 
-    def step(self, position: Vector | None = None, velocity: Vector | None = None) -> Observation:
+    def step(self, position: Floats | None = None, velocity: Floats | None = None) -> Observation:
         """The bench one period later, after a command of seven joints [rad, rad/s], or none."""
         self._follow(position, velocity)
         self.world.step()
@@ -163,12 +184,13 @@ class Bench:
         self._observation = seen
         return seen
 
-    def _follow(self, position: Vector | None, velocity: Vector | None) -> None:
+    def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
         if position is not None:
             self._command = (position, velocity or (0.0,) * len(position))
             self._since_command = 0
         else:
-            # Two clocks beat: a period without a command is ordinary, and the arm goes on as commanded until it is too long.
+            # Two clocks beat: a period without a command is ordinary, and the arm goes on as
+            # commanded until it is too long.
             self._since_command += 1
             age_s = self._since_command * self.period_s
             if self._since_command == round(BRAKE_AFTER_S / self.period_s):
@@ -219,9 +241,11 @@ class Bench:
             carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
         self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
 
-    def events(self) -> Events:
-        """How the run went, so far as it went: an event that was not watched yet has an infinite distance."""
-        return Events(*(watch.event() for watch in self._watches))
+    def events(self) -> TaskEvents:
+        """How the run went, so far as it went: an event that was not watched yet has an infinite
+        distance.
+        """
+        return TaskEvents(*(watch.event() for watch in self._watches))
 
     def close(self) -> None:
         """End the simulation."""

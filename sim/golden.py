@@ -1,124 +1,147 @@
-"""`python -m sim.golden`: the golden session, about 20 s in process with everything in it that the core has to cope with.
+"""`python -m sim.golden`: the golden session, about 20 s in process with everything in it that the
+core has to cope with.
 
-Made anew it is a new session; with `--refresh` its ticks are kept and only the frames are computed again, for a change of behaviour that is meant.
+Made anew it is a new session; with `--refresh` its ticks are kept and only the frames are computed
+again, for a change of behaviour that is meant.
 """
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import argparse
+import itertools
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from service import wire
 from service.config import Settings
-from service.controller import Controller, Tap, run
-from service.frame import Event, Frame, Tick, differences
-from service.recording import Recorder, Recording, RecordingError
-from service.replay import ticks
-from service.skill import Skill, SkillError
+from service.contract import cdr
+from service.core.controller import Controller, Tap, run
+from service.core.frame import Event, Frame, Tick, differences
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError, decoded
+from service.learning.via_points import adapted
+from service.recorder.mcap_file import RecordingError
+from service.recorder.recording import Recorder, Recording
+from service.recorder.replay import ticks
 from sim.bench import Bench
-from sim.hands import HandScript
+from sim.closed_loop import START_NS, ClosedLoop, hand_event
 from sim.scene import Scene
+from sim.script import HandScript
 
-START_NS = 1_000_000_000_000
 STATE_EVERY = 500  # ticks
 SECONDS = 20.0
 MOVED = Scene(handover=(0.66, -0.22, 0.33))
 # What happens when [s].
-TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = 0.5, 2.0, (6.5, 7.0), (9.0, 9.6), (10.0, 10.5), (13.2, 13.8), 14.5
+TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
+    0.5,
+    2.0,
+    (6.5, 7.0),
+    (9.0, 9.6),
+    (10.0, 10.5),
+    (13.2, 13.8),
+    14.5,
+)
 
 
-def session(bench: Bench, skill: Skill, newest: list[Frame], period_s: float) -> Iterator[Tick]:
-    """The ticks of the session, closed over the bench by the frames that come of them."""
-    nominal = skill.adapted(bench.scene.places(), tolerance=0.05)
-    moved = skill.adapted(MOVED.places(), tolerance=0.05)
-    at = {round(TEACH_S / period_s): nominal, round(RETEACH_S / period_s): moved}
-    orders = {round(HOLD_S[0] / period_s): "hold", round(HOLD_S[1] / period_s): "resume"}
-    jump = 0
-    for k in range(round(SECONDS / period_s)):
-        t = k * period_s
-        if k == round(BEGIN_S / period_s):
+class Session:
+    """The golden session: a bench in closed loop with all that happens to it, at its times."""
+
+    def __init__(self, bench: Bench, skill: Skill) -> None:
+        self._bench = bench
+        self._adopted = {
+            self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=0.05),
+            self._tick(RETEACH_S): adapted(skill, MOVED.via_points(), tolerance=0.05),
+        }
+        self._orders = {self._tick(HOLD_S[0]): "hold", self._tick(HOLD_S[1]): "resume"}
+        self.loop = ClosedLoop(bench, direct=self._direct, spoil=self._spoil)
+
+    def _tick(self, t: float) -> int:
+        return round(t / self._bench.period_s)
+
+    def ticks(self) -> Iterator[Tick]:
+        """The ticks of the session; now and then deadlines are missed."""
+        jump = 0
+        for tick in itertools.islice(self.loop.ticks(), self._tick(SECONDS)):
+            events, k = list(tick.inbox), tick.index
+            if k in self._adopted:
+                events.append(Event("skill", self._adopted[k].file, self._adopted[k]))
+            if k in self._orders:
+                events.append(Event(self._orders[k], cdr.encode_string("{}"), None))
+            if k % 1777 == 1776:
+                jump += 3
+            yield Tick(k + jump, tuple(events))
+
+    def _direct(self, bench: Bench) -> None:
+        if bench.tick == self._tick(BEGIN_S):
             bench.begin()
         if bench.finished:
             bench.turn_back()
-        commanded = bool(newest) and bool(newest[-1]["commanded"])
-        seen = bench.step(newest[-1]["joints"].tolist(), newest[-1]["joint_velocities"].tolist()) if commanded else bench.step()
-        stamp_ns = START_NS + k * round(period_s * 1e9)
-        inbox = []
-        if k % 5 == 0:
-            inbox += _hands(bench, t, stamp_ns)
-            joints = wire.JointState(stamp_ns, wire.JOINT_NAMES, seen.joints, seen.joint_velocities)
-            inbox.append(Event("joints/state", wire.encode_joints(joints), joints))
-        if k in at:
-            inbox.append(Event("skill", at[k].to_bytes(), at[k]))
-        if k in orders:
-            inbox.append(Event(orders[k], wire.encode_string("{}"), None))
-        if k % 1777 == 1776:  # deadlines that were missed
-            jump += 3
-        yield Tick(k + jump, tuple(inbox))
+
+    def _spoil(self, event: Event) -> tuple[Event, ...]:
+        """The left hand is missing, spoilt or far away in parts of the session."""
+        pose, t = event.value, self._bench.tick * self._bench.period_s
+        if event.kind != "hands/left":
+            return (event,)
+        if DROPOUT_S[0] <= t < DROPOUT_S[1]:
+            return ()
+        if BAD_S[0] <= t < BAD_S[1]:
+            spoilt = (
+                pose._replace(position=(math.nan, 0.0, 0.0)),
+                pose._replace(orientation=(0.0, 0.0, 0.0, 0.0)),
+                pose._replace(position=(1000.0 * pose.position[0], 0.0, 0.0)),
+                pose._replace(stamp_ns=pose.stamp_ns - 10_000_000_000),
+            )
+            bad = spoilt[round(t * 100) % 4]
+            return (Event(event.kind, cdr.encode_pose(bad), bad), event)
+        if AWAY_S[0] <= t < AWAY_S[1]:
+            x, y, z = pose.position
+            return (hand_event("left", (x, y - 0.2, z + 0.5), pose.stamp_ns, pose.orientation),)
+        return (event,)
 
 
-def _hands(bench: Bench, t: float, stamp_ns: int) -> list[Event]:
-    """Both hands' samples at one time: in parts of the session one is missing, spoilt or far away."""
-    events = []
-    for side, values in zip(("left", "right"), (pose.tolist() for pose in bench.script.sample(bench.time_s)), strict=True):
-        pose = wire.PoseStamped(stamp_ns, wire.BASE, tuple(values[:3]), tuple(values[3:]))
-        if side == "left":
-            if DROPOUT_S[0] <= t < DROPOUT_S[1]:
-                continue
-            if BAD_S[0] <= t < BAD_S[1]:
-                spoilt = (
-                    pose._replace(position=(math.nan, 0.0, 0.0)),
-                    pose._replace(orientation=(0.0, 0.0, 0.0, 0.0)),
-                    pose._replace(position=(1000.0 * pose.position[0], 0.0, 0.0)),
-                    pose._replace(stamp_ns=stamp_ns - 10_000_000_000),
-                )
-                bad = spoilt[round(t * 100) % 4]
-                events.append(Event("hands/left", wire.encode_pose(bad), bad))
-                events.append(Event("hands/left", wire.encode_pose(pose), pose))
-            if AWAY_S[0] <= t < AWAY_S[1]:
-                pose = pose._replace(position=(pose.position[0], pose.position[1] - 0.2, pose.position[2] + 0.5))
-        events.append(Event(f"hands/{side}", wire.encode_pose(pose), pose))
-    return events
-
-
-def record(path: Path, settings: Settings, skill: Skill, source: Iterator[Tick], frames: list[Frame]) -> None:
-    """Runs the core on ticks and writes what came of it; `frames` grows as it runs."""
+def record(
+    path: Path, settings: Settings, skill: Skill, source: Iterable[Tick], *, follow: Tap = lambda tick, frame: None
+) -> list[Frame]:
+    """The frames of the core run on ticks, which are recorded and shown to `follow`."""
+    frames: list[Frame] = []
     controller = Controller(settings, skill)
-    with Recorder(path, settings=settings, skill=skill.to_bytes(), state=controller.state) as recorder:
+    with Recorder(path, settings=settings, skill=skill.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
             frames.append(frame)
             after = controller.state if len(frames) % STATE_EVERY == 0 else None
-            recorder.write(tick, frame, time_ns=START_NS + tick.index * round(settings.period_s * 1e9), state=after)
+            time_ns = START_NS + tick.index * round(settings.period_s * 1e9)
+            recorder.write(tick, frame, time_ns=time_ns, state=after)
 
-        taps: list[Tap] = [keep]
-        run(controller, source, taps)
+        run(controller, source, [keep, follow])
+    return frames
 
 
 def make(path: Path, skill: Skill) -> None:
     """Writes a new golden session."""
-    settings, frames = Settings(), list[Frame]()
-    scene = Scene()
+    settings, scene = Settings(), Scene()
     with Bench(HandScript(scene, seed=scene.seed), rate_hz=settings.rate_hz) as bench:
-        record(path, settings, skill, session(bench, skill, frames, settings.period_s), frames)
+        session = Session(bench, skill)
+        record(path, settings, skill, session.ticks(), follow=session.loop.follow)
 
 
 def refresh(path: Path) -> dict[str, float]:
-    """Computes the frames of a golden session anew from its ticks; the largest change in each field that changed."""
+    """Computes the frames of a golden session anew from its ticks; the largest change in each field
+    that changed.
+    """
     old = Recording.open(path)
     try:
         before = [step.frame for step in old.steps() if step.frame is not None]
     except RecordingError:  # frames or states had another layout then: there is nothing to compare with
         before = []
-    frames: list[Frame] = []
     beside = path.with_suffix(".new")
-    skill = Skill.from_bytes(old.skill, origin=str(path))
-    record(beside, old.settings, skill, ticks(old), frames)
+    frames = record(beside, old.settings, decoded(old.skill, origin=str(path)), ticks(old))
     beside.replace(path)
     changes: dict[str, float] = {}
     for was, now in zip(before, frames, strict=bool(before)):
@@ -132,19 +155,39 @@ def main(arguments: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(
         prog="python -m sim.golden",
         description="The golden session: what every later version must decide alike.",
-        epilog="example:\n  python -m sim.golden --output recordings/golden.mcap --skill recordings/soldering.npz\n  python -m sim.golden --refresh",
+        epilog="example:\n  python -m sim.golden --output recordings/golden.mcap --skill recordings/soldering.npz\n"
+        "  python -m sim.golden --refresh",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--output", metavar="FILE", type=Path, default=Path("recordings/golden.mcap"), help="the recording (default: %(default)s)")
-    p.add_argument("--skill", metavar="FILE", type=Path, default=Path("recordings/soldering.npz"), help="the skill (default: %(default)s)")
-    p.add_argument("--refresh", action="store_true", help="keep the ticks, compute the frames anew, print the largest change per field")
+    p.add_argument(
+        "--output",
+        metavar="FILE",
+        type=Path,
+        default=Path("recordings/golden.mcap"),
+        help="the recording (default: %(default)s)",
+    )
+    p.add_argument(
+        "--skill",
+        metavar="FILE",
+        type=Path,
+        default=Path("recordings/soldering.npz"),
+        help="the skill (default: %(default)s)",
+    )
+    p.add_argument(
+        "--refresh",
+        action="store_true",
+        help="keep the ticks, compute the frames anew, print the largest change per field",
+    )
     args = p.parse_args(arguments)
     try:
         if args.refresh:
             changes = refresh(args.output)
-            print("\n".join(f"{name:<24} changed by at most {value:.3g}" for name, value in sorted(changes.items())) or "nothing changed")
+            print(
+                "\n".join(f"{name:<24} changed by at most {value:.3g}" for name, value in sorted(changes.items()))
+                or "nothing changed"
+            )
         else:
-            make(args.output, Skill.from_bytes(args.skill.read_bytes(), origin=str(args.skill)))
+            make(args.output, decoded(args.skill.read_bytes(), origin=str(args.skill)))
             print(args.output)
     except (OSError, RecordingError, SkillError) as error:
         print(f"python -m sim.golden: {error}", file=sys.stderr)

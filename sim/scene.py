@@ -1,10 +1,15 @@
-"""The soldering scene: where things lie, how long each phase lasts, and the three places taught to the service.
+"""The soldering scene: where things lie, how long each phase lasts, and the three places taught to
+the service.
 
-Frame `base`: metres, z up, the arm's base plate at the origin, the table top at z = 0. The user sits at +x and faces -x, so left is -y.
+Frame `base`: metres, z up, the arm's base plate at the origin, the table top at z = 0. The user
+sits at +x and faces -x, so left is -y.
 """
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import argparse
 import math
 import sys
@@ -14,8 +19,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from service import wire
-from service.explain import explained
+from service.contract import requests
+from service.contract.explain import explained
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -23,7 +28,8 @@ Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] where the tool holds the glass, seen from the soldering place
 RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] where the right hand holds the iron, seen from the soldering place
 GRASP_DISTANCE = 0.03  # [m] within it, a thing can be taken over or is held where it is wanted
-# The tool's +z points 45° forward and down, its y axis stays level: a turn of 135° about y (x y z w).
+# The tool's +z points 45° forward and down, its y axis stays level: a turn of 135° about y (x y z
+# w).
 TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radians(67.5)))
 # Both hands point at the robot, palms down: half a turn about z.
 HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
@@ -56,7 +62,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     solder: Point = (0.88, 0.22, 0.015)
     left_start: Point = (0.98, -0.32, 0.06)
     right_start: Point = (0.98, 0.32, 0.06)
-    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)  # board to the left hand; glass; work over the board
+    phases_s: tuple[Duration, Duration, Duration] = (
+        3.0,
+        3.5,
+        3.0,
+    )  # board to the left hand; glass; work over the board
     dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)  # the hands rest after each phase
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
@@ -67,10 +77,14 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             moved = math.dist(given, nominal)
             if not moved <= MOST_MOVED + 1e-9:
                 raise ValueError(
-                    f"{name}: {list(given)} lies {100 * moved:.1f} cm from the nominal {list(nominal)}; up to {100 * MOST_MOVED:.0f} cm is reachable"
+                    f"{name}: {list(given)} lies {100 * moved:.1f} cm from the nominal {list(nominal)}; "
+                    f"up to {100 * MOST_MOVED:.0f} cm is reachable"
                 )
             if given[2] < lowest:
-                raise ValueError(f"{name}: {list(given)} lies {100 * given[2]:.1f} cm above the table; at least {100 * lowest:.0f} cm is needed")
+                raise ValueError(
+                    f"{name}: {list(given)} lies {100 * given[2]:.1f} cm above the table; "
+                    f"at least {100 * lowest:.0f} cm is needed"
+                )
 
     @property
     def right_final(self) -> Point:
@@ -101,18 +115,23 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """Script time from the first motion to the end of the last rest [s]."""
         return self.dwells[-1][1]
 
-    def places(self) -> tuple[wire.ViaPoint, ...]:
-        """The three taught places, each a flat neighbourhood of 3 cm: handover, glass and soldering."""
+    def via_points(self) -> tuple[requests.ViaPoint, ...]:
+        """The three via-points, each with a flat neighbourhood of 3 cm: handover, glass and
+        soldering.
+        """
         s = self
         return (
-            _place("handover", left=s.handover, right=s.right_start, tool=s.handover, follow="left"),
-            _place("glass", left=s.soldering, right=s.iron, tool=s.glass),
-            _place("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
+            _via_point("handover", left=s.handover, right=s.right_start, tool=s.handover, follow="left"),
+            _via_point("glass", left=s.soldering, right=s.iron, tool=s.glass),
+            _via_point("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
         )
 
     @staticmethod
     def load(path: Path) -> Scene:
-        """The scene in a TOML file, the nominal one where the file says nothing. Raises SceneError."""
+        """The scene in a TOML file, the nominal one where the file says nothing.
+
+        Raises SceneError.
+        """
         given: Any = None
         try:
             given = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -126,21 +145,30 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the request that teaches a scene's places. The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Prints the request that teaches a scene's places.
+
+    The exit code: 0, 1 on failure, 2 on bad usage.
+    """
     p = argparse.ArgumentParser(
         prog="python -m sim.scene",
         description="The places of a scene as a `via_points` request.",
         epilog="example:\n  python -m sim.scene my-scene.toml | thirdhand via-points add --file -",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("scene", metavar="FILE", nargs="?", type=Path, help="TOML file with places [x, y, z] in metres; the nominal scene otherwise")
+    p.add_argument(
+        "scene",
+        metavar="FILE",
+        nargs="?",
+        type=Path,
+        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+    )
     args = p.parse_args(arguments)
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
     except SceneError as error:
         print(error, file=sys.stderr)
         return 1
-    print(wire.encode_json(wire.Add(scene.places())).decode())
+    print(requests.encode_json(requests.Add(scene.via_points())).decode())
     return 0
 
 
@@ -149,8 +177,8 @@ def _add(a: Point, b: Point) -> Point:
     return (round(a[0] + b[0], 6), round(a[1] + b[1], 6), round(a[2] + b[2], 6))
 
 
-def _place(name: str, *, left: Point, right: Point, tool: Point, follow: str = "none") -> wire.ViaPoint:
-    return wire.ViaPoint(name=name, left=left, right=right, tool=tool, std=0.001, radius=0.03, follow=follow)  # type: ignore[arg-type]
+def _via_point(name: str, *, left: Point, right: Point, tool: Point, follow: str = "none") -> requests.ViaPoint:
+    return requests.ViaPoint(name=name, left=left, right=right, tool=tool, std=0.001, radius=0.03, follow=follow)  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

@@ -1,18 +1,22 @@
-"""`python -m sim.teach --output DIR`: demonstrations of the soldering scene as MCAP files, the same bytes for the same seed."""
+"""`python -m sim.teach --output DIR`: demonstrations of the soldering scene as MCAP files, the same
+bytes for the same seed.
+"""
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import argparse
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from service.recording import write_demonstration
-from sim.hands import Array, HandScript, Teacher
+from service.learning.demonstration import Demonstration
+from service.recorder.demonstrations import write_demonstration
 from sim.scene import Scene, SceneError
+from sim.script import HandScript, Teacher
 
 EXAMPLE = """example:
   python -m sim.teach --output demonstrations --count 6
@@ -20,22 +24,15 @@ EXAMPLE = """example:
 """
 
 
-class Taught(NamedTuple):
-    """One demonstration: stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, x y z [m] and quaternion x y z w."""
-
-    stamps_ns: npt.NDArray[np.int64]
-    left: Array
-    right: Array
-    tool: Array
-
-
-def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0) -> Taught:
-    """One demonstration of a scene, sampled at `rate_hz`: hands as a tracker sees them, the tool as the arm measures it."""
+def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0) -> Demonstration:
+    """One demonstration of a scene, sampled at `rate_hz`: hands as a tracker sees them, the tool as
+    the arm measures it.
+    """
     script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
     steps = np.arange(round(scene.duration_s * rate_hz) + 1)
     times = (steps / rate_hz).tolist()
     hands = [script.sample(t) for t in times]
-    return Taught(
+    return Demonstration(
         begin_s * 1_000_000_000 + steps * 1_000_000_000 // rate_hz,
         np.array([left for left, _ in hands]),
         np.array([right for _, right in hands]),
@@ -43,8 +40,10 @@ def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0
     )
 
 
-def demonstrations(scene: Scene, *, count: int, seed: int) -> list[Taught]:
-    """Several demonstrations of a scene, one a minute; the first ones do not depend on how many there are."""
+def demonstrations(scene: Scene, *, count: int, seed: int) -> list[Demonstration]:
+    """Several demonstrations of a scene, one a minute; the first ones do not depend on how many
+    there are.
+    """
     return [demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number) for number in range(1, count + 1)]
 
 
@@ -56,10 +55,21 @@ def main(arguments: list[str] | None = None) -> int:
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder for demonstration-1.mcap and so on; made if missing")
+    p.add_argument(
+        "--output",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="folder for demonstration-1.mcap and so on; made if missing",
+    )
     p.add_argument("--count", type=int, default=6, help="how many (default: %(default)s)")
     p.add_argument("--seed", type=int, help="of their scatter (default: the scene's)")
-    p.add_argument("--scene", metavar="FILE", type=Path, help="TOML file with places [x, y, z] in metres; the nominal scene otherwise")
+    p.add_argument(
+        "--scene",
+        metavar="FILE",
+        type=Path,
+        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+    )
     p.add_argument("--cell", default="thirdhand", help="prefix of the topics (default: %(default)s)")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
@@ -72,7 +82,7 @@ def main(arguments: list[str] | None = None) -> int:
         seed = scene.seed if args.seed is None else args.seed
         for number, taught in enumerate(demonstrations(scene, count=args.count, seed=seed), start=1):
             path = args.output / f"demonstration-{number}.mcap"
-            write_demonstration(path, *taught, cell=args.cell)
+            write_demonstration(path, taught, cell=args.cell)
             print(path)
     except (SceneError, OSError) as error:
         print(f"python -m sim.teach: {error}", file=sys.stderr)

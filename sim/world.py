@@ -1,7 +1,9 @@
-"""The bodies around the arm in PyBullet: table, board, magnifying glass, iron, solder and two hands. Headless, one step at a time.
+"""The bodies around the arm in PyBullet: table, board, magnifying glass, iron, solder and two
+hands. Headless, one step at a time.
 
-Only the arm is dynamic, and only the table stops it. Things that are held are moved with their holder: there is no grip to tune, and contact with
-what the arm grasps would push it away by centimetres.
+Only the arm is dynamic, and only the table stops it. Things that are held are moved with their
+holder: there is no grip to tune, and contact with what the arm grasps would push it away by
+centimetres.
 """
 
 from __future__ import annotations
@@ -12,14 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pybullet
 
-from service.arm import URDF
-from service.wire import JOINT_NAMES
+from service.config import WAM, Settings, Table
 from sim.scene import HAND_ORIENTATION, Scene
 
-Vector = tuple[float, ...]
-TOOL_LINK = "tool_plate"
+Floats = tuple[float, ...]
 ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule's own axis is z
 LEVEL = (0.0, 0.0, 0.0, 1.0)
+TABLE_THICKNESS = 0.04  # [m]
 BOARD_FROM_TOOL = (0.0, 0.0, 0.03)  # [m] in front of the tool plate
 GREEN, STEEL, WOOD, SKIN, BLUE = (
     (0.1, 0.5, 0.2, 1.0),
@@ -33,34 +34,43 @@ GREEN, STEEL, WOOD, SKIN, BLUE = (
 class Pose(NamedTuple):
     """Position [m] and quaternion x y z w."""
 
-    position: Vector
-    orientation: Vector
+    position: Floats
+    orientation: Floats
 
 
 class World:
-    """The simulated bench: an arm that follows joint commands, and bodies that are put where they are wanted."""
+    """The simulated bench: an arm that follows joint commands, and bodies that are put where they
+    are wanted.
+    """
 
-    def __init__(self, scene: Scene, *, posture: Vector, rate_hz: int) -> None:
+    def __init__(self, scene: Scene, settings: Settings, *, posture: Floats, rate_hz: int) -> None:
+        names = settings.joints.names
         self._id: int = pybullet.connect(pybullet.DIRECT)
         pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=self._id)
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._id)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self._id)
-        self.arm: int = pybullet.loadURDF(str(URDF), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._id)
+        self.arm: int = pybullet.loadURDF(
+            settings.arm.urdf or str(WAM),
+            useFixedBase=True,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=self._id,
+        )
         count = pybullet.getNumJoints(self.arm, physicsClientId=self._id)
         joints = [pybullet.getJointInfo(self.arm, j, physicsClientId=self._id) for j in range(count)]
         index = {info[1].decode(): info[0] for info in joints}
-        self._tool = next(info[0] for info in joints if info[12].decode() == TOOL_LINK)
-        self._joints = [index[name] for name in JOINT_NAMES]
+        self._tool = next(info[0] for info in joints if info[12].decode() == settings.arm.plate)
+        self._joints = [index[name] for name in names]
         self._efforts = [joints[j][10] for j in self._joints]  # [N m]
         # With the velocity fed forward, this much of a position error is made up in one step.
-        self._position_gains, self._velocity_gains = [0.3] * len(JOINT_NAMES), [1.0] * len(JOINT_NAMES)
+        self._position_gains, self._velocity_gains = [0.3] * len(names), [1.0] * len(names)
         for joint, angle in zip(self._joints, posture, strict=True):
             pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self._id)
-        self.follow(posture, (0.0,) * len(JOINT_NAMES))
-        self._furnish(scene)
+        self.follow(posture, (0.0,) * len(names))
+        self._furnish(scene, settings.table)
 
-    def _furnish(self, scene: Scene) -> None:
-        self._box((0.45, 0.60, 0.02), (0.80, 0.0, -0.02), WOOD, solid=True)
+    def _furnish(self, scene: Scene, table: Table) -> None:
+        x, y, top = table.centre
+        self._box((*table.half_size, TABLE_THICKNESS / 2), (x, y, top - TABLE_THICKNESS / 2), WOOD, solid=True)
         for at in (scene.soldering, scene.glass, scene.iron):  # what things rest on
             self._box((0.03, 0.03, at[2] / 2), (at[0], at[1], at[2] / 2), WOOD)
         self.board = self._box((0.04, 0.025, 0.001), self.tool()[0].position, GREEN)
@@ -70,17 +80,26 @@ class World:
         self.left = self._hand(scene.left_start)
         self.right = self._hand(scene.right_start)
 
-    def _box(self, half: Vector, at: Vector, colour: Vector, *, solid: bool = False) -> int:
-        look = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=colour, physicsClientId=self._id)
-        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._id) if solid else -1
+    def _box(self, half: Floats, at: Floats, colour: Floats, *, solid: bool = False) -> int:
+        look = pybullet.createVisualShape(
+            pybullet.GEOM_BOX, halfExtents=half, rgbaColor=colour, physicsClientId=self._id
+        )
+        shape = (
+            pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._id)
+            if solid
+            else -1
+        )
         return self._body(look, shape, Pose(at, LEVEL))
 
-    def _cylinder(self, radius: float, length: float, at: Vector, colour: Vector) -> int:
-        look = pybullet.createVisualShape(pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=colour, physicsClientId=self._id)
+    def _cylinder(self, radius: float, length: float, at: Floats, colour: Floats) -> int:
+        look = pybullet.createVisualShape(
+            pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=colour, physicsClientId=self._id
+        )
         return self._body(look, -1, Pose(at, LEVEL))
 
-    def _hand(self, at: Vector) -> int:
-        # A capsule from the palm back along the forearm; its shape is there to measure distances, and pushes nothing.
+    def _hand(self, at: Floats) -> int:
+        # A capsule from the palm back along the forearm; its shape is there to measure distances,
+        # and pushes nothing.
         back = (-0.12, 0.0, 0.0)
         look = pybullet.createVisualShape(
             pybullet.GEOM_CAPSULE,
@@ -114,8 +133,8 @@ class World:
         )
         return body
 
-    def follow(self, position: Vector, velocity: Vector) -> None:
-        """Set where the seven motors go: [rad] with [rad/s] fed forward."""
+    def follow(self, position: Floats, velocity: Floats) -> None:
+        """Set where the motors go: [rad] with [rad/s] fed forward."""
         pybullet.setJointMotorControlArray(
             self.arm,
             self._joints,
@@ -132,14 +151,16 @@ class World:
         """One period of physics."""
         pybullet.stepSimulation(physicsClientId=self._id)
 
-    def joints(self) -> tuple[Vector, Vector]:
-        """Position [rad] and velocity [rad/s] of the seven joints in chain order."""
+    def joints(self) -> tuple[Floats, Floats]:
+        """Position [rad] and velocity [rad/s] of the joints in chain order."""
         states = pybullet.getJointStates(self.arm, self._joints, physicsClientId=self._id)
         return tuple(state[0] for state in states), tuple(state[1] for state in states)
 
-    def tool(self) -> tuple[Pose, Vector]:
+    def tool(self) -> tuple[Pose, Floats]:
         """The tool plate's pose and velocity [m/s]."""
-        state = pybullet.getLinkState(self.arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id)
+        state = pybullet.getLinkState(
+            self.arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
+        )
         return Pose(state[4], state[5]), state[6]
 
     def pose(self, body: int) -> Pose:
@@ -151,17 +172,28 @@ class World:
         pybullet.resetBasePositionAndOrientation(body, pose.position, pose.orientation, physicsClientId=self._id)
 
     def clearance(self, body: int, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body with a shape [m]; `within` when there is more."""
+        """Smallest distance between the arm and a body with a shape [m]; `within` when there is
+        more.
+        """
         near = pybullet.getClosestPoints(self.arm, body, within, physicsClientId=self._id)
         return min((float(point[8]) for point in near), default=within)
 
-    def picture(self, *, eye: Vector, target: Vector, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
-        """What a camera sees: colours (height, width, 3), and the matrix (4, 4) from places [m] to where they are in it, -1 to 1 each way."""
+    def picture(self, *, eye: Floats, target: Floats, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
+        """What a camera sees: colours (height, width, 3), and the matrix (4, 4) from places [m] to
+        where they are in it, -1 to 1 each way.
+        """
         width, height = size
         view = pybullet.computeViewMatrix(eye, target, (0.0, 0.0, 1.0))
         projection = pybullet.computeProjectionMatrixFOV(45.0, width / height, 0.1, 5.0)
         seen = pybullet.getCameraImage(
-            width, height, view, projection, shadow=1, lightDirection=(1.0, -1.0, 3.0), renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._id
+            width,
+            height,
+            view,
+            projection,
+            shadow=1,
+            lightDirection=(1.0, -1.0, 3.0),
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=self._id,
         )
         colours = np.reshape(np.asarray(seen[2], dtype=np.uint8), (height, width, 4))[:, :, :3]
         return colours, np.reshape(projection, (4, 4)).T @ np.reshape(view, (4, 4)).T

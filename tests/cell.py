@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import signal
 import subprocess
 import sys
 import threading
@@ -16,8 +15,9 @@ from typing import Any
 import zenoh
 from tests_paths import ROOT
 
-from service import wire
 from service.client import Client, open_session
+from service.contract import cdr, messages
+from service.launch import Launched, launched
 
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
 
@@ -31,9 +31,10 @@ def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.C
 class Daemon:
     """A running `thirdhand serve` and a client's session to it."""
 
-    def __init__(self, process: subprocess.Popen[str], endpoint: str, session: zenoh.Session) -> None:
-        self.process, self.endpoint, self.session = process, endpoint, session
+    def __init__(self, service: Launched, session: zenoh.Session) -> None:
+        self.process, self.endpoint, self.session = service.process, service.endpoint, session
         self.client = Client(session)
+        self.end = service.stop  # the exit code after being asked to stop
 
     def until(self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0) -> dict[str, Any]:
         """The first status of which something is true."""
@@ -42,32 +43,18 @@ class Daemon:
             assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
         return status
 
-    def end(self) -> int:
-        """The exit code after being asked to stop."""
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(30)
-
 
 @contextlib.contextmanager
 def serving(folder: Path, *arguments: str) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port."""
-    config = folder / "cell.toml"
-    config.write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = {json.dumps(str(folder / "state"))}\n')
-    command = [sys.executable, "-m", "service", "serve", "--config", str(config), *arguments]
-    with (folder / "serve.log").open("a") as log, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.startswith("listening on "), (folder / "serve.log").read_text()
-            endpoint = line.split()[2]
-            with open_session(connect=[endpoint]) as session:
-                yield Daemon(process, endpoint, session)
-        finally:
-            process.kill()
+    with launched(folder, *arguments) as service, open_session(connect=[service.endpoint]) as session:
+        yield Daemon(service, session)
 
 
 class Tracker:
-    """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not seen."""
+    """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not
+    seen.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.left: tuple[float, float, float] | None = LEFT
@@ -82,8 +69,8 @@ class Tracker:
             stamp_ns = time.time_ns()
             for side, position in (("left", self.left), ("right", self.right)):
                 if position is not None:
-                    pose = wire.PoseStamped(stamp_ns, wire.BASE, position, (0.0, 0.0, 0.0, 1.0))
-                    self._publishers[side].put(wire.encode_pose(pose))
+                    pose = messages.PoseStamped(stamp_ns, messages.BASE, position, (0.0, 0.0, 0.0, 1.0))
+                    self._publishers[side].put(cdr.encode_pose(pose))
 
     def __enter__(self) -> Tracker:
         return self

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
+from service import one_blas_thread  # noqa: F401
 
-for _library in ("OPENBLAS", "OMP", "MKL"):  # before NumPy loads, as the commands do
-    os.environ[f"{_library}_NUM_THREADS"] = "1"
-
-
+# isort: split
 import pytest
 from tests_paths import RECORDINGS
 
-from service.skill import Skill
+from service.core.skill import Skill
+from service.learning.skill_file import decoded
 
 
 @pytest.fixture(scope="session")
 def skill() -> Skill:
     """The shipped soldering skill, without places."""
     path = RECORDINGS / "soldering.npz"
-    return Skill.from_bytes(path.read_bytes(), origin=str(path))
+    return decoded(path.read_bytes(), origin=str(path))

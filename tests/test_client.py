@@ -1,4 +1,6 @@
-"""The client's side: sessions between named endpoints, and requests as calls that end in an answer or in words."""
+"""The client's side: sessions between named endpoints, and requests as calls that end in an answer
+or in words.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import pytest
 import zenoh
 
 from service.client import Client, RefusedError, UnreachableError, endpoints, open_session
-from service.wire import ViaPoint
+from service.contract.requests import ViaPoint
 
 Answer = Callable[[zenoh.Query], object]
 
@@ -50,7 +52,7 @@ def ready(query: zenoh.Query) -> None:
     query.reply(query.key_expr, b'{"mode": "hold"}')
 
 
-# --- sessions ----------------------------------------------------------------------------------------------------------------
+# --- sessions ------------------------------------------------------------------------------------
 
 
 def test_the_endpoint_is_told_with_the_port_that_was_given(daemon: zenoh.Session) -> None:
@@ -65,7 +67,9 @@ def test_a_session_that_does_not_listen_has_no_endpoints() -> None:
 
 
 def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
-    with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127.0.0.1:1: is a daemon running and listening there"):
+    with pytest.raises(
+        UnreachableError, match=r"nobody answers at tcp/127.0.0.1:1: is a daemon running and listening there"
+    ):
         open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 
 
@@ -81,7 +85,7 @@ def test_an_endpoint_of_no_form_is_told(what: str) -> None:
         open_session(**{what: ["somewhere"]}, timeout_s=0.2)  # type: ignore[arg-type]
 
 
-# --- requests ----------------------------------------------------------------------------------------------------------------
+# --- requests ------------------------------------------------------------------------------------
 
 
 def test_a_reply_ends_the_call_at_once(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
@@ -93,7 +97,9 @@ def test_a_reply_ends_the_call_at_once(session: zenoh.Session, answering: Callab
     assert time.monotonic() - begin < 2
 
 
-def test_a_refusal_is_raised_with_the_daemons_words(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+def test_a_refusal_is_raised_with_the_daemons_words(
+    session: zenoh.Session, answering: Callable[[str, Answer], None]
+) -> None:
     answering("bench/status", ready)
     answering("bench/hold", lambda query: query.reply_err("not now: º".encode()))
     client = Client(session, "bench")
@@ -102,7 +108,9 @@ def test_a_refusal_is_raised_with_the_daemons_words(session: zenoh.Session, answ
         client.ask("hold")
 
 
-def test_places_are_asked_for_as_the_wire_says(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+def test_places_are_asked_for_as_the_wire_says(
+    session: zenoh.Session, answering: Callable[[str, Answer], None]
+) -> None:
     asked: list[bytes] = []
 
     def take(query: zenoh.Query) -> None:
@@ -114,7 +122,9 @@ def test_places_are_asked_for_as_the_wire_says(session: zenoh.Session, answering
     answering("bench/via_points", take)
     client = Client(session, "bench")
     client.wait_until_ready()
-    assert client.add([ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))], tolerance=0.1) == {"tick": 3}
+    assert client.add([ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))], tolerance=0.1) == {
+        "tick": 3
+    }
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
@@ -127,7 +137,9 @@ def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:
         Client(session, "nowhere", timeout_s=0.1).wait_until_ready(timeout_s=0.0)
 
 
-def test_a_cell_with_slashes_is_a_cell_of_its_own(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
+def test_a_cell_with_slashes_is_a_cell_of_its_own(
+    session: zenoh.Session, answering: Callable[[str, Answer], None]
+) -> None:
     answering("lab/bench2/status", ready)
     assert Client(session, "lab/bench2").wait_until_ready() == {"mode": "hold"}
     with pytest.raises(UnreachableError):

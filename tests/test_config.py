@@ -43,7 +43,25 @@ def test_a_cell_may_hold_slashes(name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["", "/", "a/", "/a", "*", "a/*/b", "a/**", "a$*", "a?", "a#", "a b", r"a\nb", "a//b", r"a\n", r"a\u0000b", "..", "a/../b"],
+    [
+        "",
+        "/",
+        "a/",
+        "/a",
+        "*",
+        "a/*/b",
+        "a/**",
+        "a$*",
+        "a?",
+        "a#",
+        "a b",
+        r"a\nb",
+        "a//b",
+        r"a\n",
+        r"a\u0000b",
+        "..",
+        "a/../b",
+    ],
 )
 def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
     assert refusal(f'cell = "{name}"').startswith("cell.toml: $.cell: ")

@@ -1,4 +1,6 @@
-"""Replay: the golden session and what was recorded are decided alike, bit for bit, from any state and with any number of BLAS threads."""
+"""Replay: the golden session and what was recorded are decided alike, bit for bit, from any state
+and with any number of BLAS threads.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_in_process import ASSUMED, ticks_of
+from in_process import ASSUMED, ticks_of
 
-from service.controller import Controller, run
-from service.frame import Frame, Mode, Reason, Tick
-from service.recording import Recorder, Recording
-from service.replay import replay
-from service.skill import Skill
+from service.contract.records import Mode, Reason
+from service.core.controller import Controller, run
+from service.core.frame import Frame, Tick
+from service.core.skill import Skill
+from service.learning.via_points import adapted
+from service.recorder.recording import Recorder, Recording
+from service.recorder.replay import replay
 from sim.golden import refresh
-from sim.hands import HandScript
 from sim.scene import Scene
+from sim.script import HandScript
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"
 GOLDEN = RECORDINGS / "golden.mcap"
@@ -57,12 +61,14 @@ def test_the_golden_session_holds_what_it_is_meant_to() -> None:
 def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short session, with states, recorded in process."""
     path = tmp_path_factory.mktemp("recorded") / "short.mcap"
-    taught = skill.adapted(Scene().places(), tolerance=0.05)
+    taught = adapted(skill, Scene().via_points(), tolerance=0.05)
     controller = Controller(ASSUMED, taught)
-    with Recorder(path, settings=ASSUMED, skill=taught.to_bytes(), state=controller.state) as recorder:
+    with Recorder(path, settings=ASSUMED, skill=taught.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
-            recorder.write(tick, frame, time_ns=tick.index * 2_000_000, state=controller.state if tick.index % 250 == 0 else None)
+            recorder.write(
+                tick, frame, time_ns=tick.index * 2_000_000, state=controller.state if tick.index % 250 == 0 else None
+            )
 
         run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:1000], [keep])
     return path
@@ -102,7 +108,13 @@ def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Pa
     with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
         for tick, step in zip(ticks, steps[1:], strict=True):
             if not 400 <= tick.index < 500:
-                recorder.write(tick, step.frame, time_ns=step.tick * 2_000_000, state=step.state, lost=100 if tick.index == 500 else 0)
+                recorder.write(
+                    tick,
+                    step.frame,
+                    time_ns=step.tick * 2_000_000,
+                    state=step.state,
+                    lost=100 if tick.index == 500 else 0,
+                )
     result = replay(path)
     assert result.exact
     assert result.gaps == 1

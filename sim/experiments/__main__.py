@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import argparse
 import importlib
 import os
@@ -9,19 +12,17 @@ import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: with more, results depend on the machine's load
-
-from service.config import ExplainedError
-from sim.experiments.report import ExperimentError, Options, Report, pyplot
+from service.contract.explain import ExplainedError
+from sim.experiments.results import ExperimentError, Options, Results, pyplot
 
 ABOUT = {
-    "hands": "the soldering task through the running service: reproduction, and adaptation to new places (the paper's Figures 4 and 5)",
+    "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
     "statistics": "100 random scenes, side by side with GMR, a Gaussian process, ProMP and the paper's own numbers",
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
     "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
     "phase": "hands that pause and go back pause and reverse the robot",
-    "orientation": "the tool turns the glass to the eyes: orientation predicted with the position, and followed by the arm",
+    "orientation": "the tool turns the glass to the eyes: orientation predicted with the position, and followed",
     "demonstrations": "error against the number of demonstrations",
 }
 EXAMPLE = """example:
@@ -35,15 +36,29 @@ def parser() -> argparse.ArgumentParser:
     names = "\n".join(f"  {name:<15} {about}" for name, about in ABOUT.items())
     p = argparse.ArgumentParser(
         prog="python -m sim.experiments",
-        description=f"The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun recording each.\n\n{names}",
+        description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
+        f"recording each.\n\n{names}",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("name", metavar="NAME", choices=[*ABOUT, "all"], help="one of the above, or all")
     p.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder for the results; made if missing")
-    p.add_argument("--letters", metavar="DIR", type=Path, help="recorded letters to use besides the shipped model's: X.npz with demo00, demo01, ...")
-    p.add_argument("--workers", metavar="N", type=int, default=min(2, os.cpu_count() or 1), help="processes, where that helps (default: %(default)s)")
-    p.add_argument("--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1")
+    p.add_argument(
+        "--letters",
+        metavar="DIR",
+        type=Path,
+        help="recorded letters to use besides the shipped model's: X.npz with demo00, demo01, ...",
+    )
+    p.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=min(2, os.cpu_count() or 1),
+        help="processes, where that helps (default: %(default)s)",
+    )
+    p.add_argument(
+        "--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1"
+    )
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
 
@@ -61,10 +76,10 @@ def main(arguments: list[str] | None = None) -> int:
         pyplot()  # what is missing is said now, not after an hour
         for name in ABOUT if args.name == "all" else [args.name]:
             began = time.monotonic()
-            report = Report(args.output, name, said=not args.quiet)
-            report.say(ABOUT[name])
-            numbers = importlib.import_module(f"sim.experiments.{name}").run(report, options)
-            print(f"{report.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
+            results = Results(args.output, name, said=not args.quiet)
+            results.say(ABOUT[name])
+            numbers = importlib.import_module(f"sim.experiments.{name}").run(results, options)
+            print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
     except (ExplainedError, ExperimentError, OSError) as error:
         print(f"python -m sim.experiments: {error}", file=sys.stderr)
         return 1

@@ -1,4 +1,6 @@
-"""Correlations learned from a reward (the paper, section III-B and Figure 3): a 3-D letter D that costs the arm's joints less and less motion."""
+"""Correlations learned from a reward (the paper, section III-B and Figure 3): a 3-D letter D that
+costs the arm's joints less and less motion.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,8 @@ import rerun as rr
 from scipy.stats import ttest_1samp, wilcoxon
 
 from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, improve
-from service.arm import URDF
-from service.config import Settings
-from sim.experiments.report import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Report, equal_box, pyplot, rgb
+from service.config import WAM, Settings
+from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
 from sim.experiments.writing import write
 
 ELL, LAMBDA, SHARPNESS = 0.1, 2.0, 5.0  # the paper's ell, lambda and gamma; here over seconds and centimetres
@@ -27,21 +28,23 @@ TIMES = np.linspace(0.0, DURATION_S, POINTS)
 VIA_S = float(TIMES[VIA_ROW])
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     runs, updates = max(2, round(RUNS * options.share)), max(2, round(UPDATES * options.share))
     shown = letter()
     demonstrations, _, base = shown
     at = base.mean([[VIA_S]])[0] + VIA_STEP_CM
-    primitive = base.adapt([[VIA_S]], Gaussians(at[None], VIA_VARIANCE * np.eye(3)[None]), tolerance=DURATION_S / POINTS)
+    primitive = base.adapt(
+        [[VIA_S]], Gaussians(at[None], VIA_VARIANCE * np.eye(3)[None]), tolerance=DURATION_S / POINTS
+    )
     joints = Joints()
     learned = []
     for seed in range(runs):
         learned.append(_learned(primitive, joints, updates=updates, seed=seed))
-        report.say(f"run {seed + 1} of {runs}: cost {learned[-1].costs[0]:.3f} to {learned[-1].costs[-1]:.3f} rad")
+        results.say(f"run {seed + 1} of {runs}: cost {learned[-1].costs[0]:.3f} to {learned[-1].costs[-1]:.3f} rad")
     costs = np.array([one.costs for one in learned])
-    _draw(report, shown, at, learned[0].trajectories, costs)
-    _record(report, demonstrations, learned[0].trajectories, at, costs)
+    _draw(results, shown, at, learned[0].trajectories, costs)
+    _record(results, demonstrations, learned[0].trajectories, at, costs)
     falls = costs[:, 0] - costs[:, -1]
     final = [one.trajectories[-1] for one in learned]
     return {
@@ -58,8 +61,12 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         "wilcoxon_p": float(wilcoxon(falls, alternative="greater").pvalue),
         "t_test_p": float(ttest_1samp(falls, 0.0, alternative="greater").pvalue),
         "largest_miss_of_the_via_point_cm": max(one.largest_miss for one in learned),
-        "deviation_from_the_reference_rms_cm": float(np.mean([np.sqrt(np.mean(np.sum((f - base.reference.mean) ** 2, axis=1))) for f in final])),
-        "deviation_before_learning_rms_cm": float(np.sqrt(np.mean(np.sum((learned[0].trajectories[0] - base.reference.mean) ** 2, axis=1)))),
+        "deviation_from_the_reference_rms_cm": float(
+            np.mean([np.sqrt(np.mean(np.sum((f - base.reference.mean) ** 2, axis=1))) for f in final])
+        ),
+        "deviation_before_learning_rms_cm": float(
+            np.sqrt(np.mean(np.sum((learned[0].trajectories[0] - base.reference.mean) ** 2, axis=1)))
+        ),
     }
 
 
@@ -72,7 +79,9 @@ class Letter(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run of the learning: the policy's cost [rad] and trajectory (M, 3) [cm] before the first update and after each; the largest miss [cm]."""
+    """One run of the learning: the policy's cost [rad] and trajectory (M, 3) [cm] before the first
+    update and after each; the largest miss [cm].
+    """
 
     costs: Array
     trajectories: list[Array]
@@ -88,7 +97,16 @@ def _learned(primitive: KMP, joints: Joints, *, updates: int, seed: int) -> Run:
 
     centres = np.linspace(0.0, DURATION_S, BASES)[:, None]
     start = Correlation.neutral(centres, width=DURATION_S / BASES, outputs=3)
-    found = improve(primitive, reward, TIMES[:, None], correlation=start, exploration=EXPLORATION, updates=updates, rollouts=ROLLOUTS, seed=seed)
+    found = improve(
+        primitive,
+        reward,
+        TIMES[:, None],
+        correlation=start,
+        exploration=EXPLORATION,
+        updates=updates,
+        rollouts=ROLLOUTS,
+        seed=seed,
+    )
     policies = seen[:: ROLLOUTS + 1]  # before the first update, and after the rollouts of each
     wanted = primitive.via_points.mean[0]
     miss = float(np.linalg.norm(found.primitive.mean([[VIA_S]])[0] - wanted))
@@ -99,13 +117,15 @@ class Joints:
     """The WAM's joints along a trajectory of its tool, by the pseudo-inverse of the Jacobian."""
 
     def __init__(self) -> None:
-        self._model = pin.buildModelFromUrdf(str(URDF))
+        self._model = pin.buildModelFromUrdf(str(WAM))
         self._data = self._model.createData()
         self._tool = self._model.getFrameId("tool_plate")
         self._posture = np.array(Settings().arm.posture)
 
     def _jacobian(self, q: Array) -> Array:
-        jacobian: Array = pin.computeFrameJacobian(self._model, self._data, q, self._tool, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3]
+        jacobian: Array = pin.computeFrameJacobian(
+            self._model, self._data, q, self._tool, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )[:3]
         return jacobian
 
     def _step(self, q: Array, way: Array) -> Array:
@@ -113,7 +133,9 @@ class Joints:
         return np.asarray(q + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, way))
 
     def along(self, trajectory: Array) -> Array:
-        """Joints (M, 7) [rad] for the tool (M, 3) [cm], as the paper moves them: q + J^+ (xi' - xi), from the posture's nearest at the start."""
+        """Joints (M, 7) [rad] for the tool (M, 3) [cm], as the paper moves them: q + J^+ (xi' -
+        xi), from the posture's nearest at the start.
+        """
         metres = trajectory / 100
         q = self._posture
         for _ in range(20):
@@ -136,7 +158,9 @@ def letter() -> Letter:
     phase = np.linspace(0, 1, flat.shape[1])
     demonstrations = []
     for one in flat:
-        depth = 3.0 * np.sin(np.pi * phase) + DEPTH_STD_CM * sum(random.standard_normal() * np.sin((k + 1) * np.pi * phase) for k in range(3))
+        depth = 3.0 * np.sin(np.pi * phase) + DEPTH_STD_CM * sum(
+            random.standard_normal() * np.sin((k + 1) * np.pi * phase) for k in range(3)
+        )
         across, up, out = one[:, 0], one[:, 1], depth
         x = up * np.cos(TILT) - out * np.sin(TILT)
         z = up * np.sin(TILT) + out * np.cos(TILT)
@@ -145,11 +169,13 @@ def letter() -> Letter:
     samples = np.concatenate([np.column_stack([TIMES, one]) for one in stacked])
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=0, regularization=1e-4)
     reference = mixture.regress(TIMES[:, None])
-    base = KMP.fit(TIMES[:, None], reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=stacked.mean(axis=(0, 1)))
+    base = KMP.fit(
+        TIMES[:, None], reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=stacked.mean(axis=(0, 1))
+    )
     return Letter(stacked, mixture, base)
 
 
-def _draw(report: Report, shown_letter: Letter, via: Array, trajectories: list[Array], costs: Array) -> None:
+def _draw(results: Results, shown_letter: Letter, via: Array, trajectories: list[Array], costs: Array) -> None:
     demonstrations, mixture, base = shown_letter
     plt = pyplot()
     figure = plt.figure(figsize=(12, 4.4))
@@ -160,7 +186,12 @@ def _draw(report: Report, shown_letter: Letter, via: Array, trajectories: list[A
         first.plot(*one.T, color=REFERENCE, lw=0.9)
     sphere = _sphere()
     for mean, covariance in zip(mixture.means[:, 1:], mixture.covariances[:, 1:, 1:], strict=True):
-        first.plot_surface(*(mean[:, None, None] + np.einsum("ij,jkl->ikl", np.linalg.cholesky(covariance), sphere)), color=ADAPTED, alpha=0.35, lw=0)
+        first.plot_surface(
+            *(mean[:, None, None] + np.einsum("ij,jkl->ikl", np.linalg.cholesky(covariance), sphere)),
+            color=ADAPTED,
+            alpha=0.35,
+            lw=0,
+        )
     first.set_title("(a) demonstrations and mixture", loc="left")
     shown = np.unique(np.linspace(0, len(trajectories) - 1, 8).round().astype(int))
     for shade, k in zip(np.linspace(0.25, 1.0, len(shown)), shown, strict=True):
@@ -177,10 +208,12 @@ def _draw(report: Report, shown_letter: Letter, via: Array, trajectories: list[A
         axes.view_init(elev=18, azim=-30)
         axes.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]")
         axes.tick_params(labelsize=7)
-    third.errorbar(range(costs.shape[1]), costs.mean(axis=0), costs.std(axis=0), color=OTHER, ecolor="#56B4E9", capsize=2)
+    third.errorbar(
+        range(costs.shape[1]), costs.mean(axis=0), costs.std(axis=0), color=OTHER, ecolor="#56B4E9", capsize=2
+    )
     third.set(xlabel="updates", ylabel="cost of the joints' motion [rad]")
     third.set_title(f"(c) {len(costs)} runs: mean, standard deviation", loc="left")
-    report.figure(figure)
+    results.figure(figure)
 
 
 def _sphere() -> Array:
@@ -188,9 +221,13 @@ def _sphere() -> Array:
     return np.array([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
 
 
-def _record(report: Report, demonstrations: Array, trajectories: list[Array], via: Array, costs: Array) -> None:
-    stream = report.recording()
-    stream.log("/letter/demonstrations", rr.LineStrips3D(list(demonstrations), colors=[rgb(REFERENCE)], radii=[0.05]), static=True)
+def _record(results: Results, demonstrations: Array, trajectories: list[Array], via: Array, costs: Array) -> None:
+    stream = results.recording()
+    stream.log(
+        "/letter/demonstrations",
+        rr.LineStrips3D(list(demonstrations), colors=[rgb(REFERENCE)], radii=[0.05]),
+        static=True,
+    )
     stream.log("/letter/via_point", rr.Points3D([via], colors=[rgb(DESIRED)], radii=[0.4]), static=True)
     for k, trajectory in enumerate(trajectories):
         stream.set_time("update", sequence=k)

@@ -1,4 +1,6 @@
-"""How many demonstrations are enough: the error on tasks that were not demonstrated against their number, 1 to 10."""
+"""How many demonstrations are enough: the error on tasks that were not demonstrated against their
+number, 1 to 10.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +9,24 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.skill import Demonstrated, Skill, learn
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
+from service.learning.via_points import adapted
 from sim.experiments.rehearsal import TOLERANCE_M, demonstrated
-from sim.experiments.report import OTHER, REFERENCE, TOOL, Array, Options, Report, pyplot, rgb
+from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
-from sim.hands import HandScript
 from sim.scene import GRASP_DISTANCE, Scene
+from sim.script import HandScript
 
 MOST, DRAWS, HELD_OUT, SCENES = 10, 4, 5, 40
 EVERY = 4  # of the samples, to save time
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     most, draws = max(2, round(MOST * options.share)), max(1, round(DRAWS * options.share))
-    pool = [Demonstrated(d.hands[::EVERY], d.tool[::EVERY], EVERY * d.period_s) for d in demonstrated(2 * MOST + HELD_OUT)]
+    pool = [one.every(EVERY) for one in demonstrated(2 * MOST + HELD_OUT)]
     known, held_out = pool[:-HELD_OUT], pool[-HELD_OUT:]
     random = np.random.default_rng(0)
     counts = list(range(1, most + 1))
@@ -32,13 +37,15 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         for count in counts:
             skill = learn([known[k] for k in order[:count]], seed=draw_number)
             reproduction[count - 1, draw_number] = _reproduction_mm(skill, held_out)
-            taught[count - 1, draw_number] = _reproduction_mm(skill.adapted(Scene().places(), tolerance=TOLERANCE_M), held_out)
+            taught[count - 1, draw_number] = _reproduction_mm(
+                adapted(skill, Scene().via_points(), tolerance=TOLERANCE_M), held_out
+            )
             events[count - 1, draw_number] = [_events_mm(skill, number) for number in range(SCENES)]
-        report.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
+        results.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
     floor = _floor_mm(known, held_out)
     success = 100 * (events <= 1000 * GRASP_DISTANCE).all(axis=3).mean(axis=2)
-    _draw(report, counts, {"as learned": reproduction, "with the three places taught": taught}, events, floor)
-    stream = report.recording()
+    _draw(results, counts, {"as learned": reproduction, "with the three places taught": taught}, events, floor)
+    stream = results.recording()
     for name, values, colour in (("reproduction_mm", reproduction, OTHER), ("success_percent", success, TOOL)):
         stream.log(f"/{name}", rr.SeriesLines(colors=[rgb(colour)], names=[name]), static=True)
         for count in counts:
@@ -64,22 +71,26 @@ def run(report: Report, options: Options) -> dict[str, Any]:
     }
 
 
-def _reproduction_mm(skill: Skill, held_out: list[Demonstrated]) -> float:
+def _reproduction_mm(skill: Skill, held_out: list[Demonstration]) -> float:
     """Root mean square distance along demonstrations that the skill does not know."""
     squares = [np.sum((skill.primitive.mean(one.hands) - one.tool[:, :3]) ** 2, axis=1) for one in held_out]
     return float(1000 * np.sqrt(np.mean(np.concatenate(squares))))
 
 
-def _floor_mm(known: list[Demonstrated], held_out: list[Demonstrated]) -> float:
-    """What no skill can better: the distance of held-out demonstrations from the mean of all known ones at the same time."""
+def _floor_mm(known: list[Demonstration], held_out: list[Demonstration]) -> float:
+    """What no skill can better: the distance of held-out demonstrations from the mean of all known
+    ones at the same time.
+    """
     mean = np.mean([one.tool[:, :3] for one in known], axis=0)
     return float(1000 * np.sqrt(np.mean([np.sum((one.tool[:, :3] - mean) ** 2, axis=1) for one in held_out])))
 
 
 def _events_mm(skill: Skill, number: int) -> Array:
-    """Of the skill taught the places of a random scene: how far its target is at each event (3,), hands off by 8 mm per axis."""
+    """Of the skill taught the places of a random scene: how far its target is at each event (3,),
+    hands off by 8 mm per axis.
+    """
     scene = draw(number).scene
-    taught = skill.adapted(scene.places(), tolerance=TOLERANCE_M)
+    taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
     script = HandScript(scene, seed=number, offset_std=OFFSET_M)
     at = [script.truth(end) for _, end in scene.dwells]
     hands = np.array([np.concatenate([one.left.position, one.right.position]) for one in at])
@@ -87,7 +98,7 @@ def _events_mm(skill: Skill, number: int) -> Array:
     return np.asarray(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
 
 
-def _draw(report: Report, counts: list[int], errors: dict[str, Array], events: Array, floor: float) -> None:
+def _draw(results: Results, counts: list[int], errors: dict[str, Array], events: Array, floor: float) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     for (label, values), style, colour in zip(errors.items(), ("o-", "s--"), (OTHER, TOOL), strict=True):
@@ -102,4 +113,4 @@ def _draw(report: Report, counts: list[int], errors: dict[str, Array], events: A
     right.set(xlabel="demonstrations", ylabel="largest error of the three events [mm]", xticks=counts, ylim=(0, 33))
     right.set_title(f"new places up to 15 cm away, taught: {SCENES} scenes", fontsize=9)
     right.legend(frameon=False, loc=(0.55, 0.68))
-    report.figure(figure)
+    results.figure(figure)

@@ -1,4 +1,6 @@
-"""The soldering task driven by two hands, through the running service in real time (the paper, section III-C, Figures 4 and 5)."""
+"""The soldering task driven by two hands, through the running service in real time (the paper,
+section III-C, Figures 4 and 5).
+"""
 
 from __future__ import annotations
 
@@ -7,26 +9,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.frame import Mode
-from service.recording import Recording
-from service.skill import Demonstrated
-from sim.bench import Bench, Events
+from service.contract.records import Mode
+from service.learning.demonstration import Demonstration
+from service.recorder.recording import Recording
+from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse, shipped
-from sim.experiments.report import LEFT, RIGHT, TOOL, Array, Options, Report, equal_box, pyplot
+from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
 from sim.experiments.scenes import Drawn
-from sim.live import Report as Ran
+from sim.network import RunReport
 from sim.scene import Scene
 
 SEED = 7
 NOMINAL = Drawn(Scene(), 1.0, (), SEED)
-MOVED = Drawn(Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED)
+MOVED = Drawn(
+    Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED
+)
 MOVING_M_S = 0.05  # a hand this fast has begun
-ATTEMPTS, SKIPPED = 3, 25  # a run in which the bench skipped more periods is no evidence: the machine was too busy for real time
+ATTEMPTS, SKIPPED = (
+    3,
+    25,
+)  # a run in which the bench skipped more periods is no evidence: the machine was too busy for real time
 EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.20), (640, 460)
 THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
-EVENTS = Events.__struct_fields__
+EVENTS = TaskEvents.__struct_fields__
 
 
 class Traces(NamedTuple):
@@ -37,39 +44,48 @@ class Traces(NamedTuple):
     tool: Array
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    scratch = report.folder / "hands-live"
-    found: dict[str, tuple[Ran | None, Traces]] = {}
+    scratch = results.folder / "hands-live"
+    found: dict[str, tuple[RunReport | None, Traces]] = {}
     tries: dict[str, int] = {}
-    for name, drawn, taught in (("reproduction", NOMINAL, False), ("nominal", NOMINAL, True), ("adaptation", MOVED, True)):
+    for name, drawn, taught in (
+        ("reproduction", NOMINAL, False),
+        ("nominal", NOMINAL, True),
+        ("adaptation", MOVED, True),
+    ):
         if options.share < 1:  # a quick look, in process
             found[name] = (None, _in_process(drawn, taught=taught))
             continue
         ran, attempts = _steady(drawn, scratch, taught=taught)
         for suffix in (".mcap", ".rrd"):
             made = next(scratch.glob(f"*{suffix}"))
-            made.replace(report.folder / ("hands.rrd" if (suffix, name) == (".rrd", "adaptation") else f"hands-{name}{suffix}"))
-        found[name] = (ran, _recorded(report.folder / f"hands-{name}.mcap"))
+            made.replace(
+                results.folder / ("hands.rrd" if (suffix, name) == (".rrd", "adaptation") else f"hands-{name}{suffix}")
+            )
+        found[name] = (ran, _recorded(results.folder / f"hands-{name}.mcap"))
         tries[name] = attempts
-        report.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
+        results.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
     if scratch.is_dir():
         scratch.rmdir()
     demonstrations = demonstrated(5)
-    _draw_stages(report)
-    _draw_traces(report, demonstrations, {name: traces for name, (_, traces) in found.items()})
+    _draw_stages(results)
+    _draw_traces(results, demonstrations, {name: traces for name, (_, traces) in found.items()})
     return {
         "seed": SEED,
         "moved_cm": {
-            n: 100 * float(np.linalg.norm(np.subtract(getattr(MOVED.scene, n), getattr(Scene(), n)))) for n in ("handover", "glass", "soldering")
+            n: 100 * float(np.linalg.norm(np.subtract(getattr(MOVED.scene, n), getattr(Scene(), n))))
+            for n in ("handover", "glass", "soldering")
         },
         "attempts": tries,
         **{name: _numbers(ran) for name, (ran, _) in found.items() if ran is not None},
     }
 
 
-def _steady(drawn: Drawn, scratch: Path, *, taught: bool) -> tuple[Ran, int]:
-    """A run in which the machine kept real time, or the last attempt at one; and which attempt it is."""
+def _steady(drawn: Drawn, scratch: Path, *, taught: bool) -> tuple[RunReport, int]:
+    """A run in which the machine kept real time, or the last attempt at one; and which attempt it
+    is.
+    """
     for attempt in range(1, ATTEMPTS + 1):
         for old in scratch.glob("*"):
             old.unlink()
@@ -79,7 +95,7 @@ def _steady(drawn: Drawn, scratch: Path, *, taught: bool) -> tuple[Ran, int]:
     raise AssertionError
 
 
-def _numbers(ran: Ran) -> dict[str, Any]:
+def _numbers(ran: RunReport) -> dict[str, Any]:
     return {
         "success": ran.success,
         **{f"{name}_mm": getattr(ran.events, name).error_mm for name in EVENTS},
@@ -104,7 +120,7 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
     return Traces(seen.hands[began::5, 0], seen.hands[began::5, 1], seen.tool[began::5])
 
 
-def _draw_traces(report: Report, demonstrations: list[Demonstrated], runs: dict[str, Traces]) -> None:
+def _draw_traces(results: Results, demonstrations: list[Demonstration], runs: dict[str, Traces]) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.4), subplot_kw={"projection": "3d"})
     everything = []
@@ -124,13 +140,25 @@ def _draw_traces(report: Report, demonstrations: list[Demonstrated], runs: dict[
         axes.view_init(elev=28, azim=-122)
         axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
         axes.tick_params(labelsize=7)
-    handles = [plt.Line2D([], [], color=c, label=n) for c, n in ((LEFT, "left hand"), (RIGHT, "right hand"), (TOOL, "robot's tool"))]
+    handles = [
+        plt.Line2D([], [], color=c, label=n)
+        for c, n in ((LEFT, "left hand"), (RIGHT, "right hand"), (TOOL, "robot's tool"))
+    ]
     handles += [plt.Line2D([], [], color="black", marker=m, lw=0, label=n) for m, n in (("*", "start"), ("+", "end"))]
     handles.append(
-        plt.Line2D([], [], color="black", marker="o", mfc="none", lw=0, ms=8, label="new places for the tool: handover, glass, over the board")
+        plt.Line2D(
+            [],
+            [],
+            color="black",
+            marker="o",
+            mfc="none",
+            lw=0,
+            ms=8,
+            label="new places for the tool: handover, glass, over the board",
+        )
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
-    report.figure(figure)
+    results.figure(figure)
 
 
 def _trace(axes: Any, traces: Traces, style: str, width: float) -> None:
@@ -140,11 +168,16 @@ def _trace(axes: Any, traces: Traces, style: str, width: float) -> None:
         axes.plot(*line[-1:].T, "+", color=colour, ms=9, mew=1.8)
 
 
-def _draw_stages(report: Report) -> None:
+def _draw_stages(results: Results) -> None:
     """Pictures of the four stages as in Figure 4, from a run in process."""
     scene = MOVED.scene
     middle = [0.0, *(sum(dwell) / 2 for dwell in scene.dwells)]
-    titles = ("(a) at the start", "(b) the board is handed over", "(c) the robot grasps the glass", "(d) glass, board and iron in place")
+    titles = (
+        "(a) at the start",
+        "(b) the board is handed over",
+        "(c) the robot grasps the glass",
+        "(d) glass, board and iron in place",
+    )
     shots: list[tuple[Any, Any, Traces]] = []
     so_far: list[Array] = []
     things: list[Any] = []
@@ -181,10 +214,11 @@ def _draw_stages(report: Report) -> None:
     for at, name in zip(_pixels(np.array(things), shots[0][1]), THINGS.values(), strict=True):
         grid[0, 0].annotate(name, at, at + np.array([25, -38]), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
     handles = [
-        plt.Line2D([], [], color=c, label=n) for c, n in ((LEFT, "way of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
+        plt.Line2D([], [], color=c, label=n)
+        for c, n in ((LEFT, "way of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-    report.figure(figure, "stages")
+    results.figure(figure, "stages")
 
 
 def _pixels(points: Array, matrix: Array) -> Array:

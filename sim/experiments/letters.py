@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
-from sim.experiments.report import ADAPTED, DESIRED, REFERENCE, Array, Options, Report, ellipse, pyplot, rgb
+from sim.experiments.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
 from sim.experiments.writing import DURATION_S, TARGETS, TIMES, recorded, write
 
 ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
@@ -42,7 +42,9 @@ class Letter(NamedTuple):
 
 
 def learned(name: str, demonstrations: Array) -> Letter:
-    """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the paper's numbers."""
+    """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the
+    paper's numbers.
+    """
     samples = np.concatenate([np.column_stack([TIMES, one]) for one in demonstrations])
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION)
     primitive = KMP.fit(TIMES[:, None], mixture.regress(TIMES[:, None]), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA)
@@ -50,10 +52,16 @@ def learned(name: str, demonstrations: Array) -> Letter:
 
 
 def cases(letter: Letter) -> list[Case]:
-    """Three adaptations of one letter: a new start and a via-point; a via-point and a new end; a new start, via-point and end."""
+    """Three adaptations of one letter: a new start and a via-point; a via-point and a new end; a
+    new start, via-point and end.
+    """
     random = np.random.default_rng([SEED, *map(ord, letter.name)])
     size = float(np.ptp(letter.reference, axis=0).max())
-    chosen = (("start and via-point", (0, 110)), ("via-point and end", (70, 199)), ("start, via-point and end", (0, 90, 199)))
+    chosen = (
+        ("start and via-point", (0, 110)),
+        ("via-point and end", (70, 199)),
+        ("start, via-point and end", (0, 90, 199)),
+    )
     out = []
     for name, rows in chosen:
         angles = random.uniform(0, 2 * np.pi, len(rows))
@@ -74,7 +82,9 @@ def elsewhere(case: Case) -> Any:
 
 
 def gathered(options: Options) -> dict[str, dict[str, Array]]:
-    """The demonstrations of each set of letters: the model's, and the recorded ones where a folder is given."""
+    """The demonstrations of each set of letters: the model's, and the recorded ones where a folder
+    is given.
+    """
     some = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
     sets = {"model": {name: write(name) for name in some}}
     if options.letters is not None:
@@ -83,13 +93,19 @@ def gathered(options: Options) -> dict[str, dict[str, Array]]:
     return sets
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    numbers: dict[str, Any] = {"ell": ELL, "lambda": LAMBDA, "components": COMPONENTS, "duration_s": DURATION_S, "unit": "cm"}
-    stream = report.recording()
+    numbers: dict[str, Any] = {
+        "ell": ELL,
+        "lambda": LAMBDA,
+        "components": COMPONENTS,
+        "duration_s": DURATION_S,
+        "unit": "cm",
+    }
+    stream = results.recording()
     for name, letters in gathered(options).items():
         rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
-        report.say(f"{len(rows)} letters learned ({name})")
+        results.say(f"{len(rows)} letters learned ({name})")
         numbers[name] = {row.name: [_measured(row, case) for case in cases(row)] for row in rows}
         flat = [one for per in numbers[name].values() for one in per]
         numbers[f"{name}_summary"] = {
@@ -98,7 +114,7 @@ def run(report: Report, options: Options) -> dict[str, Any]:
             "largest_deviation_elsewhere_cm": max(one["largest_elsewhere_cm"] for one in flat),
             "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
         }
-        _draw(report, rows, name)
+        _draw(results, rows, name)
         for row in rows:
             _record(stream, row, name)
     stream.disconnect()
@@ -116,7 +132,7 @@ def _measured(letter: Letter, case: Case) -> dict[str, Any]:
     }
 
 
-def _draw(report: Report, letters: list[Letter], name: str) -> None:
+def _draw(results: Results, letters: list[Letter], name: str) -> None:
     plt = pyplot()
     figure, grid = plt.subplots(len(letters), 4, figsize=(9, 2.15 * len(letters)), squeeze=False)
     for axes, letter in zip(grid, letters, strict=True):
@@ -133,7 +149,9 @@ def _draw(report: Report, letters: list[Letter], name: str) -> None:
             one.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8)
         for one in axes:
             one.set_aspect("equal", adjustable="datalim")
-    for one, title in zip(grid[0], ("demonstrations, mixture", "start, via-point", "via-point, end", "start, via-point, end"), strict=True):
+    for one, title in zip(
+        grid[0], ("demonstrations, mixture", "start, via-point", "via-point, end", "start, via-point, end"), strict=True
+    ):
         one.set_title(title, fontsize=9)
     for one in grid[-1]:
         one.set_xlabel("x [cm]")
@@ -145,12 +163,16 @@ def _draw(report: Report, letters: list[Letter], name: str) -> None:
         plt.Line2D([], [], color=DESIRED, marker="o", mfc="none", mew=2, ms=8, lw=0, label="desired points"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
-    report.figure(figure, "" if name == "model" else name)
+    results.figure(figure, "" if name == "model" else name)
 
 
 def _record(stream: rr.RecordingStream, letter: Letter, name: str) -> None:
     path = f"/{name}/{letter.name}"
-    stream.log(f"{path}/demonstrations", rr.LineStrips2D(list(letter.demonstrations * (1, -1)), colors=[rgb(REFERENCE)], radii=[0.03]), static=True)
+    stream.log(
+        f"{path}/demonstrations",
+        rr.LineStrips2D(list(letter.demonstrations * (1, -1)), colors=[rgb(REFERENCE)], radii=[0.03]),
+        static=True,
+    )
     for number, case in enumerate(cases(letter)):
         stream.set_time("case", sequence=number)
         line = adapted(letter, case).mean(TIMES[:, None]) * (1, -1)  # Rerun's y axis points down

@@ -1,7 +1,9 @@
-"""The tool's orientation predicted with its position: over the board the glass faces the user's eyes, in places that were never demonstrated too.
+"""The tool's orientation predicted with its position: over the board the glass faces the user's
+eyes, in places that were never demonstrated too.
 
-Orientation is a primitive of its own, in the tangent space of kmp.orientation, from the same two hands. The service's core takes it as the tool
-direction of the skill in force, renewed at the rate of the hands, and its arm follows position first and direction second.
+Orientation is a primitive of its own, in the tangent space of kmp.orientation, from the same two
+hands. The service's core takes it as the tool direction of the skill in force, renewed at the rate
+of the hands, and its arm follows position first and direction second.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, OrientationKMP
 from kmp.orientation import continuous, exp, log, multiplied
-from service.frame import Event, Frame
-from service.skill import mean_orientation
+from service.core.frame import Event, Frame
+from service.learning.learn import mean_orientation
+from service.learning.via_points import adapted, neighbourhoods
 from sim.experiments.rehearsal import NOISE_M, TOLERANCE_M, TREMOR_M, Rehearsed, demonstrated, rehearse, shipped
-from sim.experiments.report import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Report, pyplot, rgb
-from sim.experiments.rivals import neighbourhoods
+from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
-from sim.hands import HandScript
 from sim.scene import TOOL_ORIENTATION, Scene
+from sim.script import HandScript
 
 EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
 SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
@@ -31,15 +33,17 @@ SCENES, SEED, RATE_HZ = 5, 31, 250
 WORK_S = 3.0  # that the hands stay over the board
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     count = round(SCENES * options.share)
     scenes = {"nominal": Scene(), **{f"scene {number}": draw(number).scene for number in range(count)}}
-    scenes = {name: msgspec.structs.replace(scene, dwells_s=(*scene.dwells_s[:2], WORK_S)) for name, scene in scenes.items()}
+    scenes = {
+        name: msgspec.structs.replace(scene, dwells_s=(*scene.dwells_s[:2], WORK_S)) for name, scene in scenes.items()
+    }
     learned, skill = learn(), shipped()
     runs: dict[str, Rehearsed] = {}
     for name, scene in scenes.items():
-        taught, turned = skill.adapted(scene.places(), tolerance=TOLERANCE_M), adapted(learned, scene)
+        taught, turned = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M), turned_to(learned, scene)
 
         def direct(frame: Frame) -> tuple[Event, ...]:
             quaternion = turned.mean(frame["hands"].reshape(1, 6))[0]  # noqa: B023
@@ -47,16 +51,16 @@ def run(report: Report, options: Options) -> dict[str, Any]:
 
         script = HandScript(scene, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M)
         runs[name] = rehearse(script, lambda bench: taught, rate_hz=RATE_HZ, keep=True, more=direct)  # noqa: B023
-        report.say(f"{name}: {_measured(runs[name], scene)}")
+        results.say(f"{name}: {_measured(runs[name], scene)}")
     nominal = scenes["nominal"]
     fixed = rehearse(
         HandScript(nominal, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M),
-        lambda bench: skill.adapted(nominal.places(), tolerance=TOLERANCE_M),
+        lambda bench: adapted(skill, nominal.via_points(), tolerance=TOLERANCE_M),
         rate_hz=RATE_HZ,
         keep=True,
     )
-    _draw(report, runs["nominal"], fixed, nominal)
-    _record(report, runs["nominal"])
+    _draw(results, runs["nominal"], fixed, nominal)
+    _record(results, runs["nominal"])
     return {
         "eyes_m": EYES,
         "scenes": {name: _measured(one, scenes[name]) for name, one in runs.items()},
@@ -65,7 +69,9 @@ def run(report: Report, options: Options) -> dict[str, Any]:
 
 
 def facing(scene: Scene) -> Array:
-    """The orientation (4,) of a tool over the board whose +z points at the user's eyes: turned the shortest way from where it points elsewhere."""
+    """The orientation (4,) of a tool over the board whose +z points at the user's eyes: turned the
+    shortest way from where it points elsewhere.
+    """
     wanted = EYES - np.array(scene.carry)
     wanted /= np.linalg.norm(wanted)
     now = _axis(np.array(TOOL_ORIENTATION))
@@ -74,7 +80,9 @@ def facing(scene: Scene) -> Array:
 
 
 def learn() -> OrientationKMP:
-    """The primitive of five demonstrations in which the tool turns to the eyes on the way from the glass to the board."""
+    """The primitive of five demonstrations in which the tool turns to the eyes on the way from the
+    glass to the board.
+    """
     scene = Scene()
     begin, end = scene.segments[2]
     there, back = np.array(TOOL_ORIENTATION), facing(scene)
@@ -88,7 +96,9 @@ def learn() -> OrientationKMP:
         hands.append(one.hands)
         quaternions.append(exp(share[:, None] * (whole + off[1]) + (1 - share[:, None]) * off[0], there))
     auxiliary = mean_orientation(np.concatenate(quaternions))
-    samples = np.concatenate([np.hstack([s, log(continuous(q), auxiliary)]) for s, q in zip(hands, quaternions, strict=True)])
+    samples = np.concatenate(
+        [np.hstack([s, log(continuous(q), auxiliary)]) for s, q in zip(hands, quaternions, strict=True)]
+    )
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=0)
     inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=0)
     reference = mixture.regress(inputs)
@@ -96,9 +106,9 @@ def learn() -> OrientationKMP:
     return OrientationKMP(KMP.fit(inputs, reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA), auxiliary)
 
 
-def adapted(learned: OrientationKMP, scene: Scene) -> OrientationKMP:
+def turned_to(learned: OrientationKMP, scene: Scene) -> OrientationKMP:
     """The primitive that is told the orientation at a scene's three places, and around them."""
-    at, _ = neighbourhoods(scene.places())
+    at, _, _ = neighbourhoods(scene.via_points())
     each = len(at) // 3
     quaternions = np.concatenate([np.tile(TOOL_ORIENTATION, (2 * each, 1)), np.tile(facing(scene), (each, 1))])
     return learned.adapt(at, quaternions, VIA_STD_RAD**2 * np.eye(3), tolerance=TOLERANCE_M)
@@ -122,15 +132,19 @@ def _measured(one: Rehearsed, scene: Scene) -> dict[str, Any]:
     over = (one.time_s >= end - 1) & (one.time_s <= end)
     turned = _angle_deg(one.axis, EYES - one.tool) < 10
     return {
-        "within_10_deg_after_the_hands_rest_s": float(np.min(one.time_s[turned & (one.time_s > begin)], initial=np.inf) - begin),
+        "within_10_deg_after_the_hands_rest_s": float(
+            np.min(one.time_s[turned & (one.time_s > begin)], initial=np.inf) - begin
+        ),
         "from_the_eyes_in_the_last_second_deg": float(_angle_deg(one.axis[over], EYES - one.tool[over]).mean()),
-        "arm_from_predicted_rms_deg": float(np.sqrt(np.mean(_angle_deg(one.axis[moving], _axis(one.frames["orientation"][moving])) ** 2))),
+        "arm_from_predicted_rms_deg": float(
+            np.sqrt(np.mean(_angle_deg(one.axis[moving], _axis(one.frames["orientation"][moving])) ** 2))
+        ),
         "errors_mm": one.errors_mm,
         "success": one.events.success,
     }
 
 
-def _draw(report: Report, ours: Rehearsed, fixed: Rehearsed, scene: Scene) -> None:
+def _draw(results: Results, ours: Rehearsed, fixed: Rehearsed, scene: Scene) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1))
     moving = ours.time_s > 0
@@ -146,12 +160,19 @@ def _draw(report: Report, ours: Rehearsed, fixed: Rehearsed, scene: Scene) -> No
     for (begin, end), name in zip(scene.dwells, ("handover", "glass", "over the board"), strict=True):
         left.axvspan(begin, end, color=REFERENCE, alpha=0.2, lw=0)
         left.text((begin + end) / 2, 26, name, rotation=90, ha="center", va="bottom", fontsize=8)
-    left.set(xlabel="time [s]", ylabel="angle between the tool's +z\nand the way to the eyes [°]", ylim=(0, None), xlim=(0, t[-1]))
+    left.set(
+        xlabel="time [s]",
+        ylabel="angle between the tool's +z\nand the way to the eyes [°]",
+        ylim=(0, None),
+        xlim=(0, t[-1]),
+    )
     left.legend(frameon=False)
     rows = np.linspace(0, len(t) - 1, 26).round().astype(int)
     tool, axis = ours.tool[moving][rows], ours.axis[moving][rows]
     right.plot(*ours.tool[moving][:, [0, 2]].T, color=TOOL, lw=1)
-    right.quiver(tool[:, 0], tool[:, 2], axis[:, 0], axis[:, 2], color=TOOL, width=0.005, scale=12, label="the tool and its +z")
+    right.quiver(
+        tool[:, 0], tool[:, 2], axis[:, 0], axis[:, 2], color=TOOL, width=0.005, scale=12, label="the tool and its +z"
+    )
     right.plot(*EYES[[0, 2]], "o", color="black", ms=9)
     right.annotate("the user's eyes", EYES[[0, 2]], EYES[[0, 2]] + np.array([-0.03, 0.01]), ha="right")
     right.plot(*np.array(scene.soldering)[[0, 2]], "s", color=REFERENCE)
@@ -161,11 +182,11 @@ def _draw(report: Report, ours: Rehearsed, fixed: Rehearsed, scene: Scene) -> No
     right.set(xlabel="x [m]", ylabel="z [m]")
     right.set_aspect("equal", adjustable="datalim")
     right.legend(frameon=False, loc="lower right", fontsize=8)
-    report.figure(figure)
+    results.figure(figure)
 
 
-def _record(report: Report, one: Rehearsed) -> None:
-    stream = report.recording()
+def _record(results: Results, one: Rehearsed) -> None:
+    stream = results.recording()
     stream.log("/eyes", rr.Points3D([EYES], radii=[0.03], labels=["eyes"]), static=True)
     for k in np.flatnonzero(one.time_s > 0)[::10]:
         stream.set_time("time", duration=float(one.time_s[k]))

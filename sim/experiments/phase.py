@@ -1,4 +1,6 @@
-"""No segmentation and no phase: hands that pause pause the robot, hands that go back take it back, where a trajectory over time goes on."""
+"""No segmentation and no phase: hands that pause pause the robot, hands that go back take it back,
+where a trajectory over time goes on.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,16 @@ import rerun as rr
 
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse, shipped
-from sim.experiments.report import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Report, pyplot, rgb
-from sim.hands import PAUSE_RAMP_S, HandScript, Pause
+from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
 from sim.scene import Scene
+from sim.script import PAUSE_RAMP_S, HandScript, Pause
 
 STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
 SEED, RATE_HZ = 11, 500
 SETTLED_S = 0.3  # after the hands have stopped
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     rate_hz = RATE_HZ if options.share == 1 else 250
     skill, scene = shipped(), Scene()
@@ -29,9 +31,9 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         script = HandScript(scene, seed=SEED, pauses=(STOP, BACK), tremor_rms=TREMOR_M, noise_std=NOISE_M)
         runs[name] = rehearse(script, adapt(scene), rate_hz=rate_hz, keep=True)
         progress[name] = np.array([script.clock.at(t)[0] for t in runs[name].time_s])
-        report.say(f"{name}: {runs[name].errors_mm} mm")
-    _draw(report, runs, progress["ours"])
-    _record(report, runs, progress["ours"])
+        results.say(f"{name}: {runs[name].errors_mm} mm")
+    _draw(results, runs, progress["ours"])
+    _record(results, runs, progress["ours"])
     numbers = {name: _measured(one, progress[name]) for name, one in runs.items()}
     return {"pause": STOP._asdict(), "back": BACK._asdict(), "tremor_mm": 1000 * TREMOR_M, **numbers}
 
@@ -50,11 +52,17 @@ def _measured(one: Rehearsed, script_s: Array) -> dict[str, Any]:
 
     def along(which: Any, at: Array) -> Array:
         order = np.argsort(script_s[which])
-        return np.stack([np.interp(at, script_s[which][order], one.tool[which][order, axis]) for axis in range(3)], axis=1)
+        return np.stack(
+            [np.interp(at, script_s[which][order], one.tool[which][order, axis]) for axis in range(3)], axis=1
+        )
 
-    at = np.linspace(max(script_s[w].min() for w in (forth, back, again)), min(script_s[w].max() for w in (forth, back, again)), 500)
+    at = np.linspace(
+        max(script_s[w].min() for w in (forth, back, again)), min(script_s[w].max() for w in (forth, back, again)), 500
+    )
     way = along(forth, at)
-    paused = (one.time_s > STOP.at_s + PAUSE_RAMP_S + SETTLED_S) & (one.time_s < STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S)
+    paused = (one.time_s > STOP.at_s + PAUSE_RAMP_S + SETTLED_S) & (
+        one.time_s < STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S
+    )
     resting = one.tool[paused]
     third = np.array_split(resting, 3)
 
@@ -66,13 +74,15 @@ def _measured(one: Rehearsed, script_s: Array) -> dict[str, Any]:
         "again_against_forth_rms_mm": rms(along(again, at)),
         "way_gone_back_mm": float(1000 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
         "drift_in_the_pause_mm": float(1000 * np.linalg.norm(third[-1].mean(axis=0) - third[0].mean(axis=0))),
-        "tremor_of_the_tool_in_the_pause_rms_mm": float(1000 * np.sqrt(np.mean(np.sum((resting - resting.mean(axis=0)) ** 2, axis=1)))),
+        "tremor_of_the_tool_in_the_pause_rms_mm": float(
+            1000 * np.sqrt(np.mean(np.sum((resting - resting.mean(axis=0)) ** 2, axis=1)))
+        ),
         "errors_mm": one.errors_mm,
         "success": one.events.success,
     }
 
 
-def _draw(report: Report, runs: dict[str, Rehearsed], script_s: Array) -> None:
+def _draw(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None:
     plt = pyplot()
     figure, (top, middle, bottom) = plt.subplots(3, 1, figsize=(9, 7.5), height_ratios=(1, 1.6, 1.6))
     ours, other = runs["ours"], runs["promp"]
@@ -83,7 +93,12 @@ def _draw(report: Report, runs: dict[str, Rehearsed], script_s: Array) -> None:
     for axis, name in enumerate("xyz"):
         middle.plot(t, ours.tool[on, axis], color=SERIES[axis], label=f"{name}, ours")
         middle.plot(
-            other.time_s[other.time_s > 0], other.tool[other.time_s > 0, axis], "--", lw=1.1, color=SERIES[axis], label=f"{name}, ProMP over time"
+            other.time_s[other.time_s > 0],
+            other.tool[other.time_s > 0, axis],
+            "--",
+            lw=1.1,
+            color=SERIES[axis],
+            label=f"{name}, ProMP over time",
         )
     middle.set(ylabel="tool [m]", xlabel="time [s]")
     middle.legend(ncols=3, frameon=False, fontsize=8)
@@ -93,20 +108,33 @@ def _draw(report: Report, runs: dict[str, Rehearsed], script_s: Array) -> None:
         axes.set_xlim(0, t[-1])
     top.text(STOP.at_s + STOP.lasts_s / 2, script_s.max(), "the hands pause", ha="center", va="top", fontsize=8)
     top.text(BACK.at_s + BACK.lasts_s / 2, 0.2, "they go back", ha="center", va="bottom", fontsize=8)
-    for which, style, label in zip(_passes(ours.time_s, script_s), ("-", "--", ":"), ("forth", "back", "forth again"), strict=True):
+    for which, style, label in zip(
+        _passes(ours.time_s, script_s), ("-", "--", ":"), ("forth", "back", "forth again"), strict=True
+    ):
         order = np.argsort(script_s[which])
         for axis in range(3):
-            bottom.plot(script_s[which][order], ours.tool[which][order, axis], style, color=SERIES[axis], lw=1.8, label=label if axis == 2 else None)
+            bottom.plot(
+                script_s[which][order],
+                ours.tool[which][order, axis],
+                style,
+                color=SERIES[axis],
+                lw=1.8,
+                label=label if axis == 2 else None,
+            )
     bottom.set(ylabel="tool, ours [m]", xlabel="progress of the hands [s]: the same place, whichever way they come")
     bottom.legend(frameon=False, fontsize=8)
-    report.figure(figure)
+    results.figure(figure)
 
 
-def _record(report: Report, runs: dict[str, Rehearsed], script_s: Array) -> None:
-    stream = report.recording()
+def _record(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None:
+    stream = results.recording()
     for name, one in runs.items():
         colour = TOOL if name == "ours" else OTHER
-        stream.log(f"/{name}/way", rr.LineStrips3D([one.tool[one.time_s > 0]], colors=[rgb(colour)], radii=[0.001]), static=True)
+        stream.log(
+            f"/{name}/way",
+            rr.LineStrips3D([one.tool[one.time_s > 0]], colors=[rgb(colour)], radii=[0.001]),
+            static=True,
+        )
         for k in range(0, len(one.tool), 20):
             stream.set_time("time", duration=float(k / len(one.tool) * one.time_s[-1]))
             stream.log(f"/{name}/tool", rr.Points3D([one.tool[k]], colors=[rgb(colour)], radii=[0.01]))

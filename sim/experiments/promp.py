@@ -1,4 +1,6 @@
-"""KMP beside ProMP on letters (the paper, section III-A and Figure 2), and what each costs as the input's dimension grows."""
+"""KMP beside ProMP on letters (the paper, section III-A and Figure 2), and what each costs as the
+input's dimension grows.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture
 from sim.experiments.letters import Case, Letter, adapted, cases, elsewhere, gathered, learned
-from sim.experiments.report import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Report, pyplot, rgb
+from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
 from sim.experiments.rivals import RIDGE, learned_promp
 from sim.experiments.writing import DURATION_S, TIMES
 
@@ -26,30 +28,35 @@ FUNCTIONS = 5  # random ones, over which times and errors are averaged
 OUTPUTS = 3
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     numbers: dict[str, Any] = {"unit": "cm", "promp_bases_per_output": BASES, "promp_ridge": RIDGE}
-    stream = report.recording()
+    stream = results.recording()
     for name, letters in gathered(options).items():
         rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
-        report.say(f"{len(rows)} letters learned ({name})")
+        results.say(f"{len(rows)} letters learned ({name})")
         found = {row.name: [_compared(row, case) for case in cases(row)] for row in rows}
         numbers[name] = {letter: [one.numbers() for one in per] for letter, per in found.items()}
-        numbers[f"{name}_summary"] = {**_summary([one for per in found.values() for one in per]), "promp_without_ridge": _bare(rows)}
-        _draw_letters(report, rows, found, name)
+        numbers[f"{name}_summary"] = {
+            **_summary([one for per in found.values() for one in per]),
+            "promp_without_ridge": _bare(rows),
+        }
+        _draw_letters(results, rows, found, name)
         for row in rows:
             _record(stream, row, found[row.name], name)
     stream.disconnect()
     functions = max(1, round(FUNCTIONS * options.share))
     dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, seed) for seed in range(functions)])]
-    report.say("dimensions done")
+    results.say("dimensions done")
     numbers["dimensions"] = [one._asdict() for one in dimensions]
-    _draw_dimensions(report, dimensions)
+    _draw_dimensions(results, dimensions)
     return numbers
 
 
 class Compared(NamedTuple):
-    """One adaptation by both: trajectories (200, 2) [cm], and for each its miss and its deviations [cm]."""
+    """One adaptation by both: trajectories (200, 2) [cm], and for each its miss and its deviations
+    [cm].
+    """
 
     case: Case
     kmp: Array
@@ -78,26 +85,39 @@ def _compared(letter: Letter, case: Case) -> Compared:
         return float(np.sqrt(np.mean(np.sum((line - mean)[where] ** 2, axis=1))))
 
     everywhere = slice(None)
-    return Compared(case, kmp, other, (miss(kmp), miss(other)), (rms(kmp, away), rms(other, away)), (rms(kmp, everywhere), rms(other, everywhere)))
+    return Compared(
+        case,
+        kmp,
+        other,
+        (miss(kmp), miss(other)),
+        (rms(kmp, away), rms(other, away)),
+        (rms(kmp, everywhere), rms(other, everywhere)),
+    )
 
 
 def _conditioned(letter: Letter, case: Case, *, ridge: float) -> Array:
     """The trajectory (200, 2) [cm] of the letter's ProMP through the desired points."""
-    primitive = learned_promp([TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES, ridge=ridge)
+    primitive = learned_promp(
+        [TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES, ridge=ridge
+    )
     for t, point in zip(case.times, case.points, strict=True):
         primitive = primitive.condition_position(point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S)
     return np.asarray(primitive.mean_trajectory(TIMES.copy()))
 
 
 def _bare(letters: list[Letter]) -> dict[str, float]:
-    """ProMP with the covariance of its weights as the demonstrations leave it: largest miss, mean rms deviation elsewhere [cm]."""
+    """ProMP with the covariance of its weights as the demonstrations leave it: largest miss, mean
+    rms deviation elsewhere [cm].
+    """
     misses, deviations = [], []
     for letter in letters:
         for case in cases(letter):
             line = _conditioned(letter, case, ridge=0.0)
             at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
             misses.append(np.linalg.norm(line[at] - case.points, axis=1).max())
-            deviations.append(np.sqrt(np.mean(np.sum((line - letter.demonstrations.mean(axis=0))[elsewhere(case)] ** 2, axis=1))))
+            deviations.append(
+                np.sqrt(np.mean(np.sum((line - letter.demonstrations.mean(axis=0))[elsewhere(case)] ** 2, axis=1)))
+            )
     return {"largest_miss_cm": float(max(misses)), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
 
 
@@ -113,7 +133,9 @@ def _summary(rows: list[Compared]) -> dict[str, Any]:
 
 
 class Grown(NamedTuple):
-    """A method at one number of input dimensions: free numbers, bytes of its largest matrix, seconds, error in shares of the output's deviation."""
+    """A method at one number of input dimensions: free numbers, bytes of its largest matrix,
+    seconds, error in shares of the output's deviation.
+    """
 
     method: str
     inputs: int
@@ -124,7 +146,9 @@ class Grown(NamedTuple):
 
 
 def averaged(runs: list[list[Grown]]) -> list[Grown]:
-    """The means of runs that differ in the function only: of times, and of errors as geometric means."""
+    """The means of runs that differ in the function only: of times, and of errors as geometric
+    means.
+    """
     out = []
     for same in zip(*runs, strict=True):
         one = same[0]
@@ -136,7 +160,9 @@ def averaged(runs: list[list[Grown]]) -> list[Grown]:
 
 
 def grown(inputs: int, seed: int) -> list[Grown]:
-    """Both methods on a smooth function of so many inputs, known along five demonstrations, tried along a sixth."""
+    """Both methods on a smooth function of so many inputs, known along five demonstrations, tried
+    along a sixth.
+    """
     random = np.random.default_rng([seed, inputs])
     lines = _lines(inputs, random)
     function = _function(inputs, random)
@@ -147,7 +173,9 @@ def grown(inputs: int, seed: int) -> list[Grown]:
     began = time.process_time()
     mixture = GaussianMixture.fit(np.hstack([train, y]), components=COMPONENTS, seed=seed)
     at = mixture.sample_inputs(POINTS, dimensions=inputs, seed=seed)
-    primitive = KMP.fit(at, mixture.regress(at), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=y.mean(axis=0))
+    primitive = KMP.fit(
+        at, mixture.regress(at), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=y.mean(axis=0)
+    )
     error = float(np.sqrt(np.mean((primitive.mean(test) - wanted) ** 2))) / scale
     rows = [Grown("KMP", inputs, POINTS, 8.0 * (POINTS * OUTPUTS) ** 2, time.process_time() - began, error)]
     for each in PER_DIMENSION:
@@ -159,14 +187,26 @@ def grown(inputs: int, seed: int) -> list[Grown]:
         began = time.process_time()
         guess = _basis_functions(lines, y.reshape(len(lines) - 1, SAMPLES, OUTPUTS), each)
         seconds = time.process_time() - began
-        rows.append(Grown(f"ProMP, {each} per input", inputs, functions, size, seconds, float(np.sqrt(np.mean((guess - wanted) ** 2))) / scale))
+        rows.append(
+            Grown(
+                f"ProMP, {each} per input",
+                inputs,
+                functions,
+                size,
+                seconds,
+                float(np.sqrt(np.mean((guess - wanted) ** 2))) / scale,
+            )
+        )
     return rows
 
 
 def _basis_functions(lines: Array, y: Array, each: int) -> Array:
-    """What a ProMP with a grid of basis functions over the inputs predicts along the last line: (200, O).
+    """What a ProMP with a grid of basis functions over the inputs predicts along the last line:
 
-    Weights by ridge regression for each demonstration, then their mean and covariance, as the paper's section IV describes it.
+    (200, O).
+
+    Weights by ridge regression for each demonstration, then their mean and covariance, as the
+    paper's section IV describes it.
     """
     inputs = lines.shape[2]
     grid = np.linspace(0, 1, each)
@@ -182,7 +222,9 @@ def _basis_functions(lines: Array, y: Array, each: int) -> Array:
     weights = []
     for line, wanted in zip(lines[:-1], y, strict=True):
         design = phi(line)
-        dual = np.linalg.solve(design @ design.T + 1e-6 * np.eye(len(design)), wanted)  # ridge, in whichever form is smaller
+        dual = np.linalg.solve(
+            design @ design.T + 1e-6 * np.eye(len(design)), wanted
+        )  # ridge, in whichever form is smaller
         weights.append((design.T @ dual).ravel())
     stacked = np.array(weights)
     covariance = np.cov(stacked.T)  # of all weights: what conditioning needs
@@ -212,13 +254,17 @@ def _function(inputs: int, random: np.random.Generator) -> Any:
     return lambda s: np.sin(s @ directions.T + phases) @ sizes
 
 
-def _draw_letters(report: Report, letters: list[Letter], found: dict[str, list[Compared]], name: str) -> None:
+def _draw_letters(results: Results, letters: list[Letter], found: dict[str, list[Compared]], name: str) -> None:
     plt = pyplot()
     columns = min(4, len(letters))
-    figure, grid = plt.subplots(-(-len(letters) // columns), columns, figsize=(2.4 * columns, 2.5 * -(-len(letters) // columns)), squeeze=False)
+    figure, grid = plt.subplots(
+        -(-len(letters) // columns), columns, figsize=(2.4 * columns, 2.5 * -(-len(letters) // columns)), squeeze=False
+    )
     for axes, letter in zip(grid.flat, letters, strict=False):
         one = found[letter.name][2]
-        axes.plot(*letter.demonstrations.mean(axis=0).T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations")
+        axes.plot(
+            *letter.demonstrations.mean(axis=0).T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations"
+        )
         axes.plot(*one.promp.T, color=OTHER, lw=1.8, label="ProMP")
         axes.plot(*one.kmp.T, color=ADAPTED, lw=1.3, label="KMP")
         axes.plot(*one.case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8, label="desired points")
@@ -231,10 +277,10 @@ def _draw_letters(report: Report, letters: list[Letter], found: dict[str, list[C
     for axes in grid[-1]:
         axes.set_xlabel("x [cm]")
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    report.figure(figure, "" if name == "model" else name)
+    results.figure(figure, "" if name == "model" else name)
 
 
-def _draw_dimensions(report: Report, rows: list[Grown]) -> None:
+def _draw_dimensions(results: Results, rows: list[Grown]) -> None:
     plt = pyplot()
     figure, (functions, seconds, error) = plt.subplots(1, 3, figsize=(10, 3.4))
     methods = list(dict.fromkeys(one.method for one in rows))
@@ -245,7 +291,12 @@ def _draw_dimensions(report: Report, rows: list[Grown]) -> None:
         functions.plot([one.inputs for one in mine], [one.functions for one in mine], style, color=colour, label=method)
         possible = [one for one in mine if one.seconds is not None]
         seconds.plot([one.inputs for one in possible], [one.seconds for one in possible], style, color=colour)
-        error.plot([one.inputs for one in possible], [100 * one.error for one in possible if one.error is not None], style, color=colour)
+        error.plot(
+            [one.inputs for one in possible],
+            [100 * one.error for one in possible if one.error is not None],
+            style,
+            color=colour,
+        )
     at = (MOST_BYTES / 8) ** 0.5 / OUTPUTS
     functions.axhline(at, color=REFERENCE, lw=0.8)
     functions.text(1, at * 1.4, "above: more than 1 GiB for the weights' covariance", fontsize=7.5, color=REFERENCE)
@@ -255,12 +306,16 @@ def _draw_dimensions(report: Report, rows: list[Grown]) -> None:
     for axes in (functions, seconds, error):
         axes.set(xlabel="input dimensions", xticks=DIMENSIONS)
     figure.legend(*functions.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    report.figure(figure, "dimensions")
+    results.figure(figure, "dimensions")
 
 
 def _record(stream: rr.RecordingStream, letter: Letter, rows: list[Compared], name: str) -> None:
     for number, one in enumerate(rows):
         stream.set_time("case", sequence=number)
         for who, line, colour in (("kmp", one.kmp, ADAPTED), ("promp", one.promp, OTHER)):
-            stream.log(f"/{name}/{letter.name}/{who}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08]))
-        stream.log(f"/{name}/{letter.name}/desired", rr.Points2D(one.case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))
+            stream.log(
+                f"/{name}/{letter.name}/{who}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08])
+            )
+        stream.log(
+            f"/{name}/{letter.name}/desired", rr.Points2D(one.case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3])
+        )

@@ -1,7 +1,9 @@
-"""What the skill is compared with, each as a skill that the service's core can run: GMR, a Gaussian process, a ProMP, the paper's own numbers.
+"""What the skill is compared with, each as a skill that the service's core can run:
 
-All learn from the same demonstrations, are told the same places if they can be, and share the core: only the prediction differs. None is ever held
-back for being far from its data.
+GMR, a Gaussian process, a ProMP, the paper's own numbers.
+
+All learn from the same demonstrations, are told the same places if they can be, and share the core:
+only the prediction differs. None is ever held back for being far from its data.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
-from service.skill import Demonstrated, Prediction, Skill
-from service.wire import ViaPoint
+from service.core.skill import Prediction, Skill
+from service.learning.demonstration import Demonstration
+from service.learning.via_points import adapted, neighbourhoods
 from sim.bench import Bench
 from sim.experiments.rehearsal import TOLERANCE_M
-from sim.experiments.report import Array, ExperimentError
+from sim.experiments.results import Array, ExperimentError
 from sim.scene import Scene
 
 Law: TypeAlias = Callable[[Array], Array]
@@ -31,17 +34,23 @@ COMPONENTS, POINTS, SEED = 10, 200, 0
 PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
 VIA_STD_M, EXACT_STD_M = 0.001, 0.0001
 BASES = 20  # of the ProMP, for each of x, y and z
-RIDGE = 10.0  # times the mean variance of a ProMP's weights: of 0 to 100, about where it leaves the rest of a letter as well alone as KMP does
+# Times the mean variance of a ProMP's weights: of 0 to 100, about where it leaves the rest of a
+# letter as well alone as KMP does.
+RIDGE = 10.0
 STEP_S = 1e-3  # of differences in time
 
 
 @dataclass(frozen=True, eq=False)
 class Rival(Skill):
-    """A skill that predicts by another law; workspace and tool direction are the skill's it was made from."""
+    """A skill that predicts by another law; workspace and tool direction are the skill's it was
+    made from.
+    """
 
     law: Law = field(kw_only=True)
 
-    def predict(self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None) -> Prediction:
+    def predict(
+        self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None
+    ) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
         curve = STEP_S**2 / 2 * a
@@ -50,12 +59,16 @@ class Rival(Skill):
 
 @dataclass(frozen=True, eq=False)
 class TimeDriven(Skill):
-    """A skill that plays a trajectory at its nominal speed whatever the hands do, from the moment they begin."""
+    """A skill that plays a trajectory at its nominal speed whatever the hands do, from the moment
+    they begin.
+    """
 
     trajectory: Law = field(kw_only=True)  # from times (M, 1) [s] to tool (M, 3) [m]
     bench: Bench = field(kw_only=True)
 
-    def predict(self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None) -> Prediction:
+    def predict(
+        self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None
+    ) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s
         rows = self.trajectory(np.array([[t - STEP_S], [t], [t + STEP_S]]))
@@ -63,7 +76,9 @@ class TimeDriven(Skill):
 
 
 def _moving(rows: Array) -> Prediction:
-    """The middle one of three positions (3, 3) that are STEP_S apart, with its velocity and acceleration."""
+    """The middle one of three positions (3, 3) that are STEP_S apart, with its velocity and
+    acceleration.
+    """
     behind, now, ahead = rows
     return Prediction(
         np.round(now, 6),
@@ -82,32 +97,40 @@ def ours(skill: Skill) -> Adapt:
     """The service's own: the shipped skill, taught the three places as the demo teaches them."""
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
-        taught = skill.adapted(scene.places(), tolerance=TOLERANCE_M)
+        taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
         return lambda bench: taught
 
     return adapt
 
 
-def gmr(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
+def gmr(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     """Gaussian mixture regression alone, which cannot be told of places."""
     mixture = GaussianMixture.fit(_samples(demonstrations), components=COMPONENTS, seed=SEED)
     law = _regression(mixture)
     return lambda scene: lambda bench: _rival(skill, law)
 
 
-def paper(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
-    """KMP with the paper's ell = 0.5 and lambda = 2 (in metres), and each place a bare point of variance 1e-6 m²."""
+def paper(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
+    """KMP with the paper's ell = 0.5 and lambda = 2 (in metres), and each place a bare point of
+    variance 1e-6 m².
+    """
     samples = _samples(demonstrations)
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED)
     inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=SEED)
     base = KMP.fit(
-        inputs, mixture.regress(inputs), kernel=GaussianKernel(PAPER_ELL), lambda_mean=PAPER_LAMBDA, prior_mean=samples[:, 6:].mean(axis=0)
+        inputs,
+        mixture.regress(inputs),
+        kernel=GaussianKernel(PAPER_ELL),
+        lambda_mean=PAPER_LAMBDA,
+        prior_mean=samples[:, 6:].mean(axis=0),
     )
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
-        places = scene.places()
-        hands = [[*place.left, *place.right] for place in places]
-        desired = Gaussians(np.array([place.tool for place in places]), np.tile(PAPER_VIA_STD_M**2 * np.eye(3), (len(places), 1, 1)))
+        points = scene.via_points()
+        hands = [[*point.left, *point.right] for point in points]
+        desired = Gaussians(
+            np.array([point.tool for point in points]), np.tile(PAPER_VIA_STD_M**2 * np.eye(3), (len(points), 1, 1))
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # that is what is found out here
             primitive = base.adapt(hands, desired, tolerance=TOLERANCE_M)
@@ -116,10 +139,12 @@ def paper(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
     return adapt
 
 
-def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstrated], *, every: int = 20) -> Adapt:
-    """A Gaussian process of the demonstrations' samples, its lengths and noise by maximum likelihood.
+def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstration], *, every: int = 20) -> Adapt:
+    """A Gaussian process of the demonstrations' samples, its lengths and noise by maximum
+    likelihood.
 
-    It is told the same neighbourhoods of places as our skill, as data with 1 mm of noise that replace the samples near them.
+    It is told the same neighbourhoods of places as our skill, as data with 1 mm of noise that
+    replace the samples near them.
     """
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -128,13 +153,17 @@ def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstrated], *, ev
     inputs, outputs, centre = samples[:, :6], samples[:, 6:], samples[:, 6:].mean(axis=0)
     kernel = ConstantKernel(0.05, (1e-4, 1e2)) * RBF(np.full(6, 0.3), (0.03, 10.0)) + WhiteKernel(1e-4, (1e-6, 1e-2))
     found = GaussianProcessRegressor(kernel, random_state=SEED).fit(inputs, outputs - centre).kernel_
-    size, lengths, noise = float(found.k1.k1.constant_value), np.asarray(found.k1.k2.length_scale), float(found.k2.noise_level)
+    size, lengths, noise = (
+        float(found.k1.k1.constant_value),
+        np.asarray(found.k1.k2.length_scale),
+        float(found.k2.noise_level),
+    )
 
     def covariance(a: Array, b: Array) -> Array:
         return np.asarray(size * np.exp(-0.5 * cdist(a / lengths, b / lengths, "sqeuclidean")))
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
-        at, wanted = neighbourhoods(scene.places())
+        at, wanted, _ = neighbourhoods(scene.via_points())
         kept = cdist(inputs, at).min(axis=1) >= TOLERANCE_M
         s = np.concatenate([inputs[kept], at])
         y = np.concatenate([outputs[kept], wanted]) - centre
@@ -145,8 +174,10 @@ def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstrated], *, ev
     return adapt
 
 
-def promp(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
-    """A ProMP over time (movement_primitives), conditioned on the places at their nominal times and replayed at nominal speed."""
+def promp(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
+    """A ProMP over time (movement_primitives), conditioned on the places at their nominal times and
+    replayed at nominal speed.
+    """
     length = min(len(d.tool) for d in demonstrations)
     lasts_s = (length - 1) * demonstrations[0].period_s
     times = np.linspace(0.0, lasts_s, length)[::4]
@@ -155,46 +186,49 @@ def promp(skill: Skill, demonstrations: Sequence[Demonstrated]) -> Adapt:
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
         conditioned = learned
         for (begin, end), place in zip(scene.dwells, (scene.handover, scene.glass, scene.carry), strict=True):
-            conditioned = conditioned.condition_position(np.array(place), EXACT_STD_M**2 * np.eye(3), t=(begin + end) / 2, t_max=lasts_s)
+            conditioned = conditioned.condition_position(
+                np.array(place), EXACT_STD_M**2 * np.eye(3), t=(begin + end) / 2, t_max=lasts_s
+            )
 
         grid = np.linspace(0.0, lasts_s, 1001)
         spline = CubicSpline(grid, conditioned.mean_trajectory(grid.copy()))
         return lambda bench: TimeDriven(
-            **_fields(skill, b"promp"), trajectory=lambda t: np.asarray(spline(np.clip(t[:, 0], 0.0, lasts_s))), bench=bench
+            **_fields(skill, b"promp"),
+            trajectory=lambda t: np.asarray(spline(np.clip(t[:, 0], 0.0, lasts_s))),
+            bench=bench,
         )
 
     return adapt
 
 
 def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, bases: int, ridge: float = RIDGE) -> Any:
-    """The ProMP (of movement_primitives) of trajectories (T, O) at times (T,) [s], from 0. Raises ExperimentError.
+    """The ProMP (of movement_primitives) of trajectories (T, O) at times (T,) [s], from 0.
 
-    H demonstrations leave its weights' covariance with a rank of H - 1, which can meet that many numbers and no more, and not where wanted: three
-    places in space are nine. So `ridge` times the mean variance is added to its diagonal, with which ProMP meets via-points as it does in the paper.
+    Raises ExperimentError.
+
+    H demonstrations leave its weights' covariance with a rank of H - 1, which can meet that many
+    numbers and no more, and not where wanted: three places in space are nine. So `ridge` times the
+    mean variance is added to its diagonal, with which ProMP meets via-points as it does in the
+    paper.
     """
     try:
         from movement_primitives.promp import ProMP
     except ImportError:
-        raise ExperimentError("ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'") from None
+        raise ExperimentError(
+            "ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'"
+        ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
     primitive.imitate([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
-    return primitive.from_weight_distribution(primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov)))
-
-
-def neighbourhoods(places: Sequence[ViaPoint]) -> tuple[Array, Array]:
-    """Hands (V, 6) and tool (V, 3) of places with their neighbourhoods [m], as the service teaches them."""
-    inputs, outputs = [], []
-    follow = {"none": np.zeros((3, 6)), "left": np.eye(3, 6), "right": np.eye(3, 6, 3)}
-    for place in places:
-        for step in place.radius * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)]):
-            inputs.append(np.array([*place.left, *place.right]) + step)
-            outputs.append(np.array(place.tool) + follow[place.follow] @ step)
-    return np.array(inputs), np.array(outputs)
+    return primitive.from_weight_distribution(
+        primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))
+    )
 
 
 def _regression(mixture: GaussianMixture) -> Law:
-    """The mean of the mixture's regression, as `regress` gives it, with all that does not depend on the query made once."""
+    """The mean of the mixture's regression, as `regress` gives it, with all that does not depend on
+    the query made once.
+    """
     covariances = mixture.covariances
     precisions = np.linalg.inv(covariances[:, :6, :6])
     gains = precisions @ covariances[:, :6, 6:]  # (K, 6, 3)
@@ -210,7 +244,7 @@ def _regression(mixture: GaussianMixture) -> Law:
     return law
 
 
-def _samples(demonstrations: Sequence[Demonstrated]) -> Array:
+def _samples(demonstrations: Sequence[Demonstration]) -> Array:
     return np.concatenate([np.hstack([d.hands, d.tool[:, :3]]) for d in demonstrations])
 
 
@@ -223,8 +257,8 @@ def _fields(skill: Skill, known: bytes) -> dict[str, Any]:
         "name": known.decode(),
         "primitive": skill.primitive,
         "orientation": skill.orientation,
-        "box": skill.box,
+        "workspace": skill.workspace,
         "threshold": skill.threshold,
         "learned_from": skill.learned_from,
-        "known": known,  # its digest: nothing is recorded that would need the rest
+        "file": known,  # its digest: nothing is recorded that would need the rest
     }

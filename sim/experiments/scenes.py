@@ -1,4 +1,6 @@
-"""Random soldering scenes: places, tempo, pauses and second thoughts of the hands, each from its number alone."""
+"""Random soldering scenes: places, tempo, pauses and second thoughts of the hands, each from its
+number alone.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M
-from sim.experiments.report import Array
-from sim.hands import Clock, HandScript, Pause
+from sim.experiments.results import Array
 from sim.scene import MOST_MOVED, Scene
+from sim.script import Clock, HandScript, Pause
 
 LOWEST_M = 0.05  # above the table
 OFFSET_M = 0.008  # of where the hands really come to, each axis
@@ -26,7 +28,13 @@ class Drawn(NamedTuple):
     def script(self) -> HandScript:
         """The hands: a new script each time, as its noise is drawn in order."""
         return HandScript(
-            self.scene, seed=self.seed, speed=self.speed, pauses=self.pauses, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M
+            self.scene,
+            seed=self.seed,
+            speed=self.speed,
+            pauses=self.pauses,
+            offset_std=OFFSET_M,
+            tremor_rms=TREMOR_M,
+            noise_std=NOISE_M,
         )
 
     @property
@@ -38,8 +46,9 @@ class Drawn(NamedTuple):
 def draw(number: int, *, seed: int = 2019) -> Drawn:
     """One random scene.
 
-    Handover, glass and soldering place each anywhere within 15 cm of the nominal one, 5 cm above the table or higher; hands 0.5 to 2 times as
-    fast; one pause in two scenes of three; in every other scene the hands go back once for a while and come again.
+    Handover, glass and soldering place each anywhere within 15 cm of the nominal one, 5 cm above
+    the table or higher; hands 0.5 to 2 times as fast; one pause in two scenes of three; in every
+    other scene the hands go back once for a while and come again.
     """
     random = np.random.default_rng([seed, number])
     nominal = Scene()
@@ -55,7 +64,8 @@ def draw(number: int, *, seed: int = 2019) -> Drawn:
     halves = [0, 1] if random.random() < 1 / 2 else [1, 0]
     for half, wanted, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
         if wanted:
-            # Both in their own half of the script; what lies before the second half is moved by what the first one lost.
+            # Both in their own half of the script; what lies before the second half is moved by
+            # what the first one lost.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
             pauses.append(Pause(at_s, float(random.uniform(0.6, longest_s)), depth))
     ordered = sorted(pauses)
@@ -66,7 +76,7 @@ def draw(number: int, *, seed: int = 2019) -> Drawn:
 
 
 def _never_before_the_start(pauses: list[Pause], speed: float) -> list[Pause]:
-    """The pauses, those in which the hands go back ended where they would be back at their start."""
+    """The pauses; those in which the hands go back end where they would be at their start."""
     shorter = list(pauses)
     for i in range(len(shorter)):
         while shorter[i].depth > 1 and shorter[i].lasts_s > 0.6 and _script_s_after(shorter[i], shorter, speed) < 0:

@@ -1,4 +1,8 @@
-"""How often the task succeeds: 100 random scenes in closed loop, our skill beside its rivals, and a few scenes in real time over Zenoh."""
+"""How often the task succeeds:
+
+100 random scenes in closed loop, our skill beside its rivals, and a few scenes in real time over
+Zenoh.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import rerun as rr
 
-from sim.bench import Events
+from sim.bench import TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse, shipped
-from sim.experiments.report import SERIES, Array, Options, Report, pyplot, rgb
+from sim.experiments.results import SERIES, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
 from sim.scene import GRASP_DISTANCE
 
 SCENES, LIVE_SCENES = 100, 3
 DEMONSTRATIONS = 5
-OURS_HZ, RIVALS_HZ = 500, 125  # rivals at a lower rate, to save time: it changes errors by 2 mm at most, ours and theirs
+OURS_HZ, RIVALS_HZ = (
+    500,
+    125,
+)  # rivals at a lower rate, to save time: it changes errors by 2 mm at most, ours and theirs
 METHODS = {
     "ours": "KMP, taught places\n(the service)",
     "gaussian_process": "Gaussian process,\nsame places",
@@ -29,11 +36,13 @@ METHODS = {
     "promp": "ProMP over time,\nnominal speed",
     "gmr": "GMR alone",
 }
-NAMES = Events.__struct_fields__
+NAMES = TaskEvents.__struct_fields__
 
 
 class Outcome(NamedTuple):
-    """One scene with one method: errors [mm] of the three events, success, and how long the service held [s]."""
+    """One scene with one method: errors [mm] of the three events, success, and how long the service
+    held [s].
+    """
 
     method: str
     number: int
@@ -75,7 +84,7 @@ def outcomes(tasks: list[tuple[str, int]], workers: int) -> Iterator[Outcome]:
         yield from pool.map(outcome, tasks)
 
 
-def run(report: Report, options: Options) -> dict[str, Any]:
+def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     count = max(1, round(SCENES * options.share))
     live_count = LIVE_SCENES if options.share == 1 else 0
@@ -85,12 +94,12 @@ def run(report: Report, options: Options) -> dict[str, Any]:
         found[one.method].append(one)
         done = found[one.method]
         if not one.success and one.method == "ours":
-            report.say(f"scene {one.number} missed: {one.errors_mm} mm")
+            results.say(f"scene {one.number} missed: {one.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
-            report.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
+            results.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
     in_real_time = []
     for number in range(live_count):
-        live, inside = live_run(draw(number), report.folder), found["ours"][number]
+        live, inside = live_run(draw(number), results.folder), found["ours"][number]
         in_real_time.append(
             {
                 "scene": number,
@@ -100,9 +109,9 @@ def run(report: Report, options: Options) -> dict[str, Any]:
                 "agrees": live.success == inside.success,
             }
         )
-        report.say(f"scene {number} over Zenoh in real time: {in_real_time[-1]}")
-    _draw(report, found)
-    _record(report, found)
+        results.say(f"scene {number} over Zenoh in real time: {in_real_time[-1]}")
+    _draw(results, found)
+    _record(results, found)
     return {
         "scenes": count,
         "rate_hz": {"ours": OURS_HZ, "rivals": RIVALS_HZ},
@@ -142,7 +151,7 @@ def wilson(successes: int, of: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / (1 + z * z / of)), min(1.0, (middle + half) / (1 + z * z / of))
 
 
-def _draw(report: Report, found: dict[str, list[Outcome]]) -> None:
+def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.2), width_ratios=(1, 1.7))
     for i, rows in enumerate(found.values()):
@@ -159,20 +168,37 @@ def _draw(report: Report, found: dict[str, list[Outcome]]) -> None:
         errors = np.array([one.errors_mm for one in rows])
         for event in range(3):
             at = event + (i - 2) * 0.16
-            right.scatter(at + random.uniform(-0.05, 0.05, len(rows)), errors[:, event], s=5, color=SERIES[i], alpha=0.5, lw=0)
+            right.scatter(
+                at + random.uniform(-0.05, 0.05, len(rows)), errors[:, event], s=5, color=SERIES[i], alpha=0.5, lw=0
+            )
             right.plot((at - 0.06, at + 0.06), [np.median(errors[:, event])] * 2, color="black", lw=1.5)
         right.scatter([], [], s=18, color=SERIES[i], label=METHODS[method].replace("\n", " "))
     right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
     right.text(2.46, 1000 * GRASP_DISTANCE * 1.06, "30 mm", ha="right", va="bottom", fontsize=8)
-    right.set(yscale="log", ylabel="smallest distance at the event [mm]", xlim=(-0.5, 2.5), xlabel="dots: scenes; bars: medians")
-    right.set_xticks(range(3), ["board handed over:\ntool to left hand", "glass grasped:\ntool to handle", "glass carried:\ntool to its place"])
+    right.set(
+        yscale="log",
+        ylabel="smallest distance at the event [mm]",
+        xlim=(-0.5, 2.5),
+        xlabel="dots: scenes; bars: medians",
+    )
+    right.set_xticks(
+        range(3),
+        [
+            "board handed over:\ntool to left hand",
+            "glass grasped:\ntool to handle",
+            "glass carried:\ntool to its place",
+        ],
+    )
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
-    figure.suptitle(f"{len(next(iter(found.values())))} random scenes: places up to 15 cm away, hands 0.5 to 2 times as fast, pauses, going back")
-    report.figure(figure)
+    figure.suptitle(
+        f"{len(next(iter(found.values())))} random scenes: places up to 15 cm away, "
+        "hands 0.5 to 2 times as fast, pauses, going back"
+    )
+    results.figure(figure)
 
 
-def _record(report: Report, found: dict[str, list[Outcome]]) -> None:
-    stream = report.recording()
+def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
+    stream = results.recording()
     for i, (method, rows) in enumerate(found.items()):
         for event, name in enumerate(NAMES):
             values: Array = np.array([one.errors_mm[event] for one in rows])

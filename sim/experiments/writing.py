@@ -1,7 +1,9 @@
-"""Handwritten letters as demonstrations: a kinematic model of handwriting with human variability, and letters recorded by others.
+"""Handwritten letters as demonstrations: a kinematic model of handwriting with human variability,
+and letters recorded by others.
 
-The model: a pen passes through the targets of a letter on a smooth curve, at a speed that falls with the curvature's cube root (the two-thirds
-power law: Lacquaniti, Terzuolo, Viviani 1983) and rises from and falls to rest at the ends. What varies between repetitions: each target, the whole
+The model: a pen passes through the targets of a letter on a smooth curve, at a speed that falls
+with the curvature's cube root (the two-thirds power law: Lacquaniti, Terzuolo, Viviani 1983) and
+rises from and falls to rest at the ends. What varies between repetitions: each target, the whole
 letter's size, slant and place, and the tempo along it.
 """
 
@@ -12,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from sim.experiments.report import Array, ExperimentError
+from sim.experiments.results import Array, ExperimentError
 
 DURATION_S = 2.0
 SAMPLES = 200
@@ -21,7 +23,19 @@ DEMONSTRATIONS = 5
 
 # Targets of the pen [cm], in the order of writing.
 TARGETS: dict[str, list[tuple[float, float]]] = {
-    "B": [(-4, -8), (-4, 0), (-4, 8), (1, 7.5), (3, 4.5), (1, 1.2), (-3, 0.3), (1.5, -0.6), (4, -4), (1.5, -7.4), (-4, -8)],
+    "B": [
+        (-4, -8),
+        (-4, 0),
+        (-4, 8),
+        (1, 7.5),
+        (3, 4.5),
+        (1, 1.2),
+        (-3, 0.3),
+        (1.5, -0.6),
+        (4, -4),
+        (1.5, -7.4),
+        (-4, -8),
+    ],
     "C": [(5, 5.5), (2, 8), (-2.5, 6.5), (-5, 0), (-2.5, -6.5), (2, -8), (5.2, -5.5)],
     "D": [(-4, -8), (-4, 0), (-4, 8), (1.5, 7), (5, 0), (1.5, -7), (-4, -8)],
     "G": [(5, 5.5), (1.5, 8), (-3, 6), (-5, 0), (-3, -6), (1.5, -8), (5, -5), (5, -0.5), (1, -0.5)],
@@ -36,7 +50,7 @@ STARTING_SHARE = 0.12  # of the way, in which the pen comes to speed
 
 
 def write(letter: str, *, count: int = DEMONSTRATIONS, seed: int = 0) -> Array:
-    """Demonstrations (count, 200, 2) [cm] of a letter at even times from 0 to 2 s, from the model."""
+    """Demonstrations (count, 200, 2) [cm] of a letter at even times, 0 to 2 s, from the model."""
     random = np.random.default_rng([seed, ord(letter)])
     return np.stack([_written(np.array(TARGETS[letter], dtype=np.float64), random) for _ in range(count)])
 
@@ -63,10 +77,15 @@ def _written(targets: Array, random: np.random.Generator) -> Array:
 
 
 def recorded(folder: Path, *, count: int = DEMONSTRATIONS) -> dict[str, Array]:
-    """The letters in a folder, each (count, 200, 2) [cm], even in time from 0 to 2 s: X.npz with demo00, demo01, ... Raises ExperimentError."""
+    """The letters in a folder, each (count, 200, 2) [cm], even in time from 0 to 2 s:
+
+    X.npz with demo00, demo01, ... Raises ExperimentError.
+    """
     files = sorted(folder.glob("?.npz"))
     if not files:
-        raise ExperimentError(f"No letters in {folder}: files X.npz with arrays demo00, demo01, ... (T, 2) [cm] are needed.")
+        raise ExperimentError(
+            f"No letters in {folder}: files X.npz with arrays demo00, demo01, ... (T, 2) [cm] are needed."
+        )
     letters = {}
     for file in files:
         with np.load(file, allow_pickle=False) as arrays:

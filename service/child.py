@@ -1,0 +1,90 @@
+"""A child process with a socket to it, and bytes handed over as memory that both map: no copy
+through the socket.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+_LENGTH = struct.Struct("<Q")
+_ALIGNED = 64  # bytes: so that arrays can stay where they arrive
+
+
+class Child(NamedTuple):
+    """A running child and our end of the socket; the descriptor of its end is its only argument."""
+
+    process: subprocess.Popen[bytes]
+    socket: socket.socket
+
+
+def start(module: str, kind: socket.SocketKind) -> Child:
+    """Starts `python -m module DESCRIPTOR`.
+
+    A terminal's Ctrl-C is not for it: it ends when its socket closes.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, kind)
+    root = str(Path(__file__).parents[1])
+    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": path},
+            start_new_session=True,
+        )
+    return Child(process, ours)
+
+
+def in_memory(*parts: Any) -> int:
+    """The descriptor of a file in memory that holds the parts (anything with a buffer), one after
+    the other.
+    """
+    fd = os.memfd_create("thirdhand")
+    with open(fd, "wb", closefd=False) as file:
+        for view in (memoryview(part).cast("B") for part in parts):
+            file.write(_LENGTH.pack(len(view)))
+            file.write(bytes(-file.tell() % _ALIGNED))
+            file.write(view)
+            file.write(bytes(-file.tell() % _ALIGNED))
+    return fd
+
+
+def from_memory(fd: int) -> list[memoryview]:
+    """The parts that `in_memory` wrote, where they lie; the descriptor is closed.
+
+    Raises EOFError where it is damaged.
+    """
+    try:
+        size = os.fstat(fd).st_size
+        populate = getattr(mmap, "MAP_POPULATE", 0)  # now, not at a first touch in the loop
+        view = memoryview(mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ))
+    finally:
+        os.close(fd)
+    parts, at = [], 0
+    while at < size:
+        (length,) = _LENGTH.unpack_from(view, at)
+        at += _ALIGNED
+        if at + length > size:
+            raise EOFError("a part ends behind the memory")
+        parts.append(view[at : at + length])
+        at += length + -length % _ALIGNED
+    return parts
+
+
+def descriptors(ancillary: Iterable[tuple[int, int, bytes]]) -> list[int]:
+    """The descriptors among what came with a message of `recvmsg`."""
+    found: list[int] = []
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            found += [fd for (fd,) in struct.iter_unpack("=i", data)]
+    return found

@@ -1,0 +1,1 @@
+"""The commands of `thirdhand`, one file a group."""

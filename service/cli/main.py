@@ -1,0 +1,237 @@
+"""The command line: what each command takes, and which module carries it out.
+
+Errors go to standard error.
+
+Exit 1 is a failure, 2 bad usage. A command's module is imported only when that command runs: they
+are heavy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from pathlib import Path
+
+from service.cli.usage import UsageError
+from service.contract import channels
+from service.contract.explain import ExplainedError
+from service.contract.requests import ViaPoint
+
+RUN_BY = {
+    "demo": "demo",
+    "serve": "serve",
+    "play": "recordings",
+    "replay": "recordings",
+    "learn": "recordings",
+    "via-points": "clients",
+    "status": "clients",
+    "hold": "clients",
+    "resume": "clients",
+    "reset": "clients",
+    "view": "view",
+}
+FORMATTER = argparse.RawDescriptionHelpFormatter
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(
+        prog="thirdhand",
+        description="A robot arm as a third hand at the soldering bench.",
+        epilog="example: thirdhand demo",
+    )
+    commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
+        sub = commands_of.add_parser(
+            name, help=about, description=about, epilog=f"example:\n  {example}", formatter_class=FORMATTER
+        )
+        sub.set_defaults(run=f"{RUN_BY[name]}.{name.replace('-', '_')}")
+        return sub
+
+    def client(name: str, about: str, example: str) -> argparse.ArgumentParser:
+        sub = command(name, about, example)
+        _reach(sub)
+        return sub
+
+    c = command(
+        "demo",
+        "The soldering scenario, closed loop and headless: bench, service and scribe.",
+        "thirdhand demo --scene my-scene.toml",
+    )
+    c.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("thirdhand-demo"),
+        help="where recording and viewer file go (default: %(default)s)",
+    )
+    c.add_argument(
+        "--scene", metavar="FILE", type=Path, help="TOML file with handover, glass and soldering as [x, y, z] in metres"
+    )
+    c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+
+    c = command(
+        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
+    )
+    c.add_argument(
+        "--config", metavar="FILE", type=Path, help="settings of the cell as TOML; options below go before it"
+    )
+    c.add_argument("--cell", metavar="NAME", help="prefix of all keys (default: thirdhand)")
+    c.add_argument(
+        "--listen",
+        metavar="EP",
+        action="append",
+        help=f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})",
+    )
+    c.add_argument("--connect", metavar="EP", action="append", help="Zenoh endpoint to connect to; may be repeated")
+    c.add_argument("--rate", metavar="HZ", type=int, help="of the loop (default: 500)")
+    c.add_argument(
+        "--skill",
+        metavar="FILE",
+        type=Path,
+        help="a skill made by `thirdhand learn` (default: the shipped soldering skill)",
+    )
+    c.add_argument(
+        "--arm",
+        choices=("state", "assumed"),
+        help="wait for the arm's joint states, or assume its posture (default: state)",
+    )
+    c.add_argument("--record", metavar="DIR", type=Path, help="write .mcap and .rrd files there")
+    c.add_argument("--live", metavar="PORT", type=int, help="serve Rerun viewers on this loopback port")
+
+    c = command(
+        "play",
+        "Publishes the hands of a recording or demonstration, as a tracker would.",
+        "thirdhand play recordings/demonstration-6.mcap --loop",
+    )
+    c.add_argument("file", metavar="FILE", type=Path, help="an MCAP file with hands/left and hands/right")
+    c.add_argument(
+        "--speed", metavar="X", type=float, default=1.0, help="times as fast as recorded (default: %(default)s)"
+    )
+    c.add_argument("--loop", action="store_true", help="over and over")
+    _reach(c)
+
+    c = command(
+        "replay",
+        "Runs the core on a recording and compares every frame.",
+        "thirdhand replay recordings/golden.mcap --exact",
+    )
+    c.add_argument("file", metavar="FILE", type=Path, help="a recording")
+    c.add_argument("--exact", action="store_true", help="forbid even differences below 10 µm and 10 µrad")
+    c.add_argument(
+        "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
+    )
+
+    c = command(
+        "learn",
+        "Learns a skill from demonstrations.",
+        "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz",
+    )
+    c.add_argument(
+        "demonstrations",
+        metavar="DEMO",
+        nargs="+",
+        type=Path,
+        help="MCAP files with hands/left, hands/right and tool/pose",
+    )
+    c.add_argument("--output", metavar="FILE", type=Path, required=True, help="the skill, .npz")
+    c.add_argument("--name", help="of the skill (default: the file's)")
+    c.add_argument(
+        "--seed", type=int, default=0, help="of the mixture's start and the sampled inputs (default: %(default)s)"
+    )
+
+    c = command("via-points", "Via-points taught to a running daemon.", "thirdhand via-points list")
+    actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")
+    nothing = "example:\n  thirdhand via-points "
+    a = actions.add_parser(
+        "add", help="teach via-points, all or nothing", formatter_class=FORMATTER,
+        epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .62 -.28 .30 "
+        "--radius .03 --follow left --std .001",
+    )  # fmt: skip
+    a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
+    for hand in ("left", "right", "tool"):
+        a.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+    defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
+    a.add_argument(
+        "--std",
+        type=float,
+        default=defaults.std,
+        metavar="M",
+        help="how exactly the tool is to go there (default: %(default)s m)",
+    )
+    a.add_argument(
+        "--radius",
+        type=float,
+        default=defaults.radius,
+        metavar="M",
+        help="also for hands this far from there (default: %(default)s m)",
+    )
+    a.add_argument(
+        "--follow",
+        choices=("none", "left", "right"),
+        default="none",
+        help="within the radius the tool moves with this hand",
+    )
+    a.add_argument(
+        "--tolerance", type=float, metavar="M", help="points learned nearer than this give way (default: 0.05 m)"
+    )
+    a.add_argument("--file", metavar="FILE", help="a request as JSON instead; - is standard input")
+    _reach(a)
+    a = actions.add_parser(
+        "remove", help="forget via-points by name", epilog=f"{nothing}remove handover", formatter_class=FORMATTER
+    )
+    a.add_argument("names", metavar="NAME", nargs="+")
+    _reach(a)
+    _reach(
+        actions.add_parser("list", help="the via-points in force", epilog=f"{nothing}list", formatter_class=FORMATTER)
+    )
+    _reach(
+        actions.add_parser("clear", help="forget all via-points", epilog=f"{nothing}clear", formatter_class=FORMATTER)
+    )
+
+    c = client("status", "What a running daemon does.", "thirdhand status --json")
+    c.add_argument("--json", action="store_true", help="print what <cell>/status carries")
+    client("hold", "Stops the arm, which then stays.", "thirdhand hold")
+    client("resume", "Ends an operator's hold.", "thirdhand resume")
+    client("reset", "Ends a fault.", "thirdhand reset")
+
+    c = client(
+        "view",
+        "Shows a recording, or a running daemon, in Rerun.",
+        "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
+    )
+    c.add_argument("file", metavar="FILE|live", help="an .rrd or .mcap file, or `live`")
+    c.add_argument("--screenshot", metavar="PNG", type=Path, help="write a picture instead of opening a window")
+    c.add_argument(
+        "--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)"
+    )
+    return top
+
+
+def _reach(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint of the daemon (default: {channels.ENDPOINT})"
+    )
+    sub.add_argument("--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code of a command."""
+    args = parser().parse_args(arguments)
+    module, function = args.run.split(".")
+    try:
+        return int(getattr(importlib.import_module(f"service.cli.{module}"), function)(args))
+    except UsageError as error:
+        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        return 2
+    except (ExplainedError, OSError) as error:
+        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 1

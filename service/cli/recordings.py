@@ -1,0 +1,87 @@
+"""`thirdhand play`, `replay` and `learn`: what is done with recordings and demonstrations."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
+from service.client import UnreachableError, open_session
+from service.contract import cdr, channels
+from service.contract.explain import ExplainedError
+from service.contract.messages import WireError
+from service.learning.learn import learn as learned
+from service.recorder.demonstrations import iter_hands, read_demonstration
+from service.recorder.replay import replay as replayed
+
+
+def play(args: argparse.Namespace) -> int:
+    """0 once all hands are published."""
+    if not 0.01 <= args.speed <= 100:
+        raise UsageError(f"--speed {args.speed}: 0.01 to 100 accepted")
+    try:
+        hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in iter_hands(args.file)]
+    except WireError as error:
+        raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
+    start_ns, last_ns = hands[0][0], hands[-1][0]
+    with open_session(connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S) as session:
+        publishers = {
+            side: session.declare_publisher(channels.key(args.cell, f"hands/{side}")) for side in ("left", "right")
+        }
+        until = time.monotonic() + 5.0
+        while not all(publisher.matching_status for publisher in publishers.values()):
+            if time.monotonic() > until:
+                raise UnreachableError(
+                    f"nobody listens to {channels.key(args.cell, 'hands/left')}: is a daemon running in this cell?"
+                )
+            time.sleep(0.02)
+        print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
+        while True:
+            begin = time.monotonic()
+            for time_ns, side, pose in hands:
+                early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()
+                if early > 0:
+                    time.sleep(early)
+                # a tracker stamps what it sees now
+                publishers[side].put(cdr.encode_pose(pose._replace(stamp_ns=time.time_ns())))
+            if not all(publisher.matching_status for publisher in publishers.values()):
+                raise UnreachableError("the daemon stopped listening")
+            if not args.loop:
+                return 0
+
+
+def replay(args: argparse.Namespace) -> int:
+    """0 if every frame is identical, or close enough where that is allowed."""
+
+    def progress(ticks: int) -> None:
+        print(f"\r{ticks} ticks", end="", file=sys.stderr, flush=True)
+
+    result = replayed(args.file, after=args.after, progress=progress if sys.stderr.isatty() else None)
+    if sys.stderr.isatty():
+        print("\r", end="", file=sys.stderr)
+    print(result.text())
+    return 0 if result.exact or (result.close and not args.exact) else 1
+
+
+def learn(args: argparse.Namespace) -> int:
+    """0 once the skill is written."""
+    demonstrations = []
+    for i, path in enumerate(args.demonstrations, start=1):
+        demonstration = read_demonstration(path)
+        count = len(demonstration.stamps_ns)
+        lasts_s = demonstration.period_s * count
+        print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
+        demonstrations.append(demonstration)
+    skill = learned(
+        demonstrations,
+        name=args.name or args.output.stem,
+        seed=args.seed,
+        progress=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    args.output.write_bytes(skill.file)
+    print(
+        f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where the "
+        f"prediction's standard deviation exceeds {1000 * skill.threshold:.0f} mm"
+    )
+    return 0

@@ -1,0 +1,54 @@
+"""`thirdhand serve`: the daemon, with what the command line says over the configuration."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from service.cli.usage import SHIPPED_SKILL, UsageError, recordings
+from service.config import Settings, SettingsError, converted, load
+from service.recorder.client import Scribe
+from service.shell import daemon
+
+
+def serve(args: argparse.Namespace) -> int:
+    """0 once it was asked to stop and has closed everything."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    settings = _overridden(load(args.config) if args.config else Settings(), args)
+    skills = Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
+    folder = Path(settings.files.record).expanduser() if settings.files.record else None
+    scribe = Scribe(settings, folder=folder, live_port=args.live)
+
+    def announce(running: daemon.Daemon) -> None:
+        where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
+        print(f"listening on {where} as cell {settings.cell}", flush=True)
+
+    daemon.serve(settings, args.skill or skills / SHIPPED_SKILL, skills=skills, scribe=scribe, announce=announce)
+    sys.stdout.flush()
+    logging.shutdown()
+    os._exit(0)  # all is closed; libraries that complain of what their own threads still hold are not waited for
+
+
+def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
+    """The settings with what the command line says in their place."""
+    given: dict[str, Any] = msgspec.to_builtins(settings)
+    for section, field, value in (
+        (given, "cell", args.cell),
+        (given, "rate_hz", args.rate),
+        (given["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
+        (given["network"], "connect", args.connect),
+        (given["arm"], "source", args.arm),
+        (given["files"], "record", str(args.record) if args.record else None),
+    ):
+        if value is not None:
+            section[field] = value
+    try:
+        return converted(given, origin="command line")
+    except SettingsError as error:
+        raise UsageError(str(error)) from None

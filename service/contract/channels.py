@@ -1,0 +1,113 @@
+"""The one table of channels: everything that passes between the service and others, enters its
+loop, or is recorded.
+
+Subscribers, publishers, queryables, the kinds of events, the topics of a recording, staleness and
+the README's table are all derived from it: a new channel is one more line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+from service.contract import cdr, requests
+
+ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
+
+
+class Codec(NamedTuple):
+    """A type of message, and how it becomes bytes and is read from them."""
+
+    type: str  # of ROS 2, or JSON
+    encoding: Literal["cdr", "json"]
+    encode: Callable[..., bytes]
+    decode: Callable[..., Any]
+
+
+def _request(kind: Any) -> Codec:
+    return Codec("JSON", "json", requests.encode_json, partial(requests.decode_request, kind=kind))
+
+
+POSE = Codec("geometry_msgs/msg/PoseStamped", "cdr", cdr.encode_pose, cdr.decode_pose)
+POSE_WITH_COVARIANCE = Codec(
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "cdr",
+    cdr.encode_pose_with_covariance,
+    cdr.decode_pose_with_covariance,
+)
+JOINTS = Codec("sensor_msgs/msg/JointState", "cdr", cdr.encode_joints, cdr.decode_joints)
+STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_string)
+TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
+TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
+SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
+FRAME, TIMING, STATE = (
+    Codec(f"thirdhand/msg/{name}", "cdr", cdr.encode_record, cdr.decode_record) for name in ("Frame", "Timing", "State")
+)
+
+
+class Channel(NamedTuple):
+    """One line of the table."""
+
+    key: str  # below the cell, unless it begins with a slash; also the topic in a recording, and the kind of an event
+    codec: Codec
+    direction: Literal["in", "out", "request", "recording"]
+    about: str
+    rate: str = "on demand"  # in words
+    every: int = 0  # ticks from one message to the next; 0: not sent by the loop
+    event: Codec | None = None  # how a recording keeps what enters the loop here; None: nothing does
+    stale_after: tuple[str, str] | None = None  # section and name of the setting after which the source is silent
+    queryable: bool = False
+    recorded: bool = True
+
+
+_HAND: Any = {"rate": "30 - 500 Hz", "event": POSE, "stale_after": ("hands", "stale_ms")}
+
+CHANNELS = (
+    Channel("hands/left", POSE, "in", "the user's left hand in the tracker's frame (`base` unless configured)",
+            **_HAND),
+    Channel("hands/right", POSE, "in", "the user's right hand", **_HAND),
+    Channel("joints/state", JOINTS, "in", "the arm's joints as measured",
+            rate="100 - 1000 Hz", event=JOINTS, stale_after=("arm", "silent_ms")),
+    Channel("joints/command", JOINTS, "out", "position [rad] and velocity [rad/s]; silent until the arm is ready",
+            rate="every tick", every=1),
+    Channel("tool/target", POSE_WITH_COVARIANCE, "out", "what the skill predicts from both hands, and how sure it is",
+            rate="every 5th tick", every=5),
+    Channel("tool/setpoint", POSE, "out", "the target after smoothing", rate="every 5th tick", every=5),
+    Channel("tool/pose", POSE, "in", "the tool as measured, in demonstrations", rate="teaching", recorded=False),
+    Channel("status", _request(requests.Nothing), "out", "mode, reason, flags, rates, latency percentiles, counters",
+            rate="10 Hz, and on request", queryable=True),
+    Channel("via_points", _request(requests.ViaPointsRequest), "request", "add, remove, clear and list via-points",
+            queryable=True, recorded=False),
+    Channel("skill", _request(requests.SkillRequest), "request",
+            "load a skill from the skill folder; via-points stay with the skill they were taught to",
+            event=SKILL, queryable=True),
+    Channel("hold", _request(requests.Nothing), "request", "stop and stay", event=STRING, queryable=True),
+    Channel("resume", _request(requests.Nothing), "request", "end an operator's hold", event=STRING, queryable=True),
+    Channel("reset", _request(requests.Nothing), "request", "end a fault", event=STRING, queryable=True),
+    Channel("tick", TICK, "recording", "index and event kinds", rate="every tick", every=1),
+    Channel("frame", FRAME, "recording", "all that the tick decided", rate="every tick", every=1),
+    Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="every tick", every=1),
+    Channel("state", STATE, "recording", "all that the next frame depends on", rate="every second"),
+    Channel("skill_in_force", SKILL, "recording", "the skill, where it may have changed", rate="after a gap"),
+    Channel("requests", STRING, "recording", "each request and how it was answered"),
+    Channel("log", STRING, "recording", "what went wrong with the recording"),
+    Channel("/tf", TRANSFORMS, "recording", "the arm's links, tool, setpoint, target and hands, for viewers",
+            rate="every 5th tick", every=5),
+    Channel("/robot_description", STRING, "recording", "the arm's URDF", rate="once"),
+)  # fmt: skip
+BY_KEY = {channel.key: channel for channel in CHANNELS}
+EVENT_KINDS = tuple(channel.key for channel in CHANNELS if channel.event is not None)  # a recording numbers them so
+
+
+def key(cell: str, suffix: str) -> str:
+    """The key expression of one channel of a cell; also its topic in a recording."""
+    return suffix if suffix.startswith("/") else f"{cell}/{suffix}"
+
+
+def sent_by_the_loop(tick: int) -> tuple[Channel, ...]:
+    """The channels on which a tick's output goes out."""
+    return tuple(channel for channel in _STREAMS if tick % channel.every == 0)
+
+
+_STREAMS = tuple(channel for channel in CHANNELS if channel.direction == "out" and channel.every)

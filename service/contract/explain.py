@@ -1,0 +1,123 @@
+"""Validation errors in words: where in the input, what was given there, what would have been
+accepted.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+
+class ExplainedError(Exception):
+    """An error whose message tells people what failed, what was given and what is accepted:
+    commands print it and exit 1.
+    """
+
+
+def explained(error: Exception, given: Any, kind: Any) -> str:
+    """The message of a validation error of `given` against the type `kind`:
+
+    `$.points[0].left: 2 numbers, 3 needed`.
+    """
+    message, found, path = str(error).rpartition(" - at `")
+    message, path = (message, path.rstrip("`")) if found else (str(error), "$")
+    if message.startswith("$"):
+        return message  # said by a check of our own, which knows better
+    value, node, accepted = _at(path, given, inspect.type_info(kind))
+    unknown = re.match(r"Object contains unknown field `(.*)`", message)
+    if unknown and isinstance(node, inspect.StructType):
+        return f"{path}: unknown field {unknown[1]!r}; known are {', '.join(_known(node)) or 'none'}"
+    if message.startswith("Object missing required field"):
+        return f"{path}: {message.removeprefix('Object missing required ')} is missing"
+    if (
+        isinstance(error, msgspec.ValidationError)
+        and (needed := _needed(node, value, accepted))
+        and message.startswith(("Expected", "Invalid"))
+    ):
+        if isinstance(node, inspect.TupleType | inspect.VarTupleType) and isinstance(value, list):
+            counted = "numbers" if isinstance(node, inspect.TupleType) else "given"
+            return f"{path}: {len(value) or 'none'} {counted}, {needed}"
+        return f"{path}: {_short(value)} given; {needed}"
+    return f"{path}: {message}"
+
+
+def _known(node: inspect.StructType) -> list[str]:
+    return [*([node.tag_field] if node.tag_field else []), *(field.encode_name for field in node.fields)]
+
+
+def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
+    """What stands at a path, the type needed there, and what the type's author says is accepted."""
+    accepted = ""
+    for field, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
+        node = _chosen(node, value)
+        if isinstance(node, inspect.StructType) and field:
+            if field == node.tag_field:
+                return value.get(field), inspect.LiteralType((node.tag,)), ""
+            inner = next(f.type for f in node.fields if f.encode_name == field)
+        elif isinstance(node, inspect.UnionType) and field:
+            tags = tuple(t.tag for t in node.types if isinstance(t, inspect.StructType))
+            return value.get(field), inspect.LiteralType(tags), ""
+        elif isinstance(node, inspect.TupleType):
+            inner = node.item_types[int(index)]
+        elif isinstance(node, inspect.VarTupleType | inspect.ListType):
+            inner = node.item_type
+        else:
+            return None, None, ""
+        value = value[field] if field else value[int(index)]
+        accepted, node = "", inner
+        if isinstance(node, inspect.Metadata):
+            accepted, node = (node.extra or {}).get("accepted", ""), node.type
+    return value, _chosen(node, value), accepted
+
+
+def _chosen(node: Any, value: Any) -> Any:
+    """The one of several tagged structs that a value says it is."""
+    if isinstance(node, inspect.UnionType) and isinstance(value, dict):
+        return next(
+            (
+                t
+                for t in node.types
+                if isinstance(t, inspect.StructType) and t.tag_field and value.get(t.tag_field) == t.tag
+            ),
+            node,
+        )
+    return node
+
+
+def _needed(node: Any, value: Any, accepted: str) -> str:
+    """What a type accepts, in words."""
+    if accepted:
+        return f"{accepted} accepted"
+    match node:
+        case inspect.LiteralType(values):
+            return f"{', '.join(map(str, values))} accepted"
+        case inspect.IntType() | inspect.FloatType():
+            return f"{_range(node)} accepted"
+        case inspect.TupleType(item_types):
+            return f"{len(item_types)} needed" if isinstance(value, list) else f"{len(item_types)} numbers needed"
+        case inspect.VarTupleType() if node.min_length or node.max_length:
+            return (
+                f"{node.min_length or 0} to {node.max_length} needed"
+                if node.max_length
+                else f"at least {node.min_length} needed"
+            )
+        case inspect.StrType():
+            return "a text needed"
+        case inspect.StructType() | inspect.UnionType():
+            return "an object with its fields needed"
+    return ""
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _range(node: inspect.IntType | inspect.FloatType) -> str:
+    whole = "a whole number" if isinstance(node, inspect.IntType) else "a number"
+    low = f"above {node.gt}" if node.gt is not None else f"from {node.ge}" if node.ge is not None else ""
+    high = f"below {node.lt}" if node.lt is not None else f"to {node.le}" if node.le is not None else ""
+    return " ".join(part for part in (whole, low, high) if part)

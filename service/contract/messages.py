@@ -1,0 +1,91 @@
+"""The messages of the streams, as values: the ROS 2 messages that we send and take in, and what
+rides with every output.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeAlias
+
+BASE = "base"
+Vector3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]  # x y z w
+
+
+class WireError(ValueError):
+    """Bytes that are not the message they should be."""
+
+
+class PoseStamped(NamedTuple):
+    """`geometry_msgs/msg/PoseStamped`: position [m], quaternion x y z w."""
+
+    stamp_ns: int
+    frame: str
+    position: Vector3
+    orientation: Quaternion
+
+
+class PoseWithCovarianceStamped(NamedTuple):
+    """`geometry_msgs/msg/PoseWithCovarianceStamped`; covariance is 6 x 6 row-major [m², rad²]."""
+
+    stamp_ns: int
+    frame: str
+    position: Vector3
+    orientation: Quaternion
+    covariance: tuple[float, ...]
+
+
+class JointState(NamedTuple):
+    """`sensor_msgs/msg/JointState`: position [rad], velocity [rad/s], effort [N m]; each as long as
+    names, or empty.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    effort: tuple[float, ...] = ()
+    frame: str = ""
+
+
+class Transform(NamedTuple):
+    """`geometry_msgs/msg/TransformStamped` without its stamp: where a frame is in its parent,
+    translation [m], rotation x y z w.
+    """
+
+    parent: str
+    child: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+class Attachment(NamedTuple):
+    """What rides with every output: tick index, publish time [ns], stamp of the newest hand sample
+    it answers [ns] (0: none).
+    """
+
+    tick: int
+    published_ns: int
+    hand_stamp_ns: int
+
+
+def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Position [rad] and velocity [rad/s] of the joints named, in that order, whatever order they
+    came in. Raises WireError.
+    """
+    found = {name: i for i, name in enumerate(message.names)}
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise WireError(f"joints {missing} missing among {list(message.names)}")
+    if len(message.position) != len(message.names) or len(message.velocity) not in (0, len(message.names)):
+        raise WireError(
+            f"{len(message.names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
+        )
+    order = [found[name] for name in names]
+    velocity = message.velocity or (0.0,) * len(message.names)
+    return tuple(message.position[i] for i in order), tuple(velocity[i] for i in order)
+
+
+def finite(values: tuple[float, ...]) -> bool:
+    """Whether no value is NaN or infinite."""
+    return all(map(math.isfinite, values))

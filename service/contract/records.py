@@ -1,0 +1,140 @@
+"""Records of fixed layout: what a tick decided (Frame), what the core remembers (State), how long
+it took (Timing).
+
+Their bytes are, behind the four-byte header, the CDR encoding of a ROS 2 message of the same
+fields: these are ordered by size, so that no padding is needed. The enumerations say what the
+numbers in them mean.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import NamedTuple, TypeAlias
+
+SIDES = ("left", "right")
+STAGES = ("intake", "skill", "smoother", "arm", "limiter")
+
+
+class Mode(enum.IntEnum):
+    """What the controller does."""
+
+    HOLD = 0
+    FOLLOW = 1
+    FAULT = 2
+
+
+class Reason(enum.IntEnum):
+    """Why it holds or is at fault."""
+
+    NONE = 0
+    NO_HANDS = 1
+    STALE_HAND = 2
+    FAR_FROM_DEMONSTRATIONS = 3
+    OPERATOR = 4
+    ARM_NOT_READY = 5
+    ARM_ERROR = 6
+    ARM_SILENT = 7
+    TOOL_SPEED = 8  # measured
+
+
+class Flag(enum.IntFlag):
+    """What limits it while it follows."""
+
+    TARGET_CLAMPED = 1
+    SPEED_LIMITED = 2
+    NEAR_JOINT_LIMIT = 4
+
+
+class Cause(enum.IntEnum):
+    """Why a sample was rejected."""
+
+    NOT_FINITE = 0
+    NOT_A_ROTATION = 1
+    OUT_OF_RANGE = 2
+    REPEATED = 3
+    OLDER = 4
+    INCOMPLETE = 5
+
+
+JOINTS = 0  # in a shape: one for each joint of the arm
+
+
+class Field(NamedTuple):
+    """One field: name, ROS 2 type of its numbers, shape."""
+
+    name: str
+    type: str
+    shape: tuple[int, ...] = ()
+
+    def shape_for(self, joints: int) -> tuple[int, ...]:
+        """The shape for an arm with so many joints."""
+        return tuple(size or joints for size in self.shape)
+
+
+Layout: TypeAlias = tuple[Field, ...]
+
+FRAME = (
+    Field("tick", "int64"),
+    Field("hand_stamp_ns", "int64"),  # of the newest sample in it; 0: none yet
+    Field("hands", "float64", (2, 3)),  # left and right, filtered, at this tick [m]
+    Field("hand_velocities", "float64", (2, 3)),
+    Field("target", "float64", (3,)),  # what the skill predicts, clamped [m]
+    Field("target_velocity", "float64", (3,)),
+    Field("target_acceleration", "float64", (3,)),
+    Field("covariance", "float64", (3, 3)),  # of the prediction [m²]
+    Field("deviation", "float64"),  # its standard deviation, root mean square over the axes [m]
+    Field("setpoint", "float64", (3,)),  # after smoothing [m]
+    Field("setpoint_velocity", "float64", (3,)),
+    Field("setpoint_acceleration", "float64", (3,)),
+    Field("tool", "float64", (3,)),  # where the commanded joints put the tool [m]
+    Field("orientation", "float64", (4,)),  # of the target, quaternion x y z w
+    Field("joints", "float64", (JOINTS,)),  # the command [rad]
+    Field("joint_velocities", "float64", (JOINTS,)),
+    Field("joint_accelerations", "float64", (JOINTS,)),
+    Field("hand_ages", "int32", (2,)),  # ticks since the newest sample; -1: none yet
+    Field("rejected", "uint32", (len(Cause),)),
+    Field("mode", "uint8"),
+    Field("reason", "uint8"),
+    Field("flags", "uint8"),
+    Field("commanded", "uint8"),  # 0: the joints are not to be sent
+)
+STATE = (
+    Field("tick", "int64"),
+    Field("hand_stamps_ns", "int64", (2,)),
+    Field("hand_ticks", "int64", (2,)),  # tick of the newest sample; -1: none yet
+    Field("arm_stamp_ns", "int64"),
+    Field("arm_tick", "int64"),
+    Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
+    Field("filters", "float64", (2, 3, 3)),  # position, velocity, acceleration; by axis
+    Field("filter_covariances", "float64", (2, 3, 3)),
+    Field("measured", "float64", (JOINTS,)),
+    Field("measured_velocities", "float64", (JOINTS,)),
+    Field("setpoint", "float64", (3, 3)),  # position, velocity, acceleration; by axis
+    Field("joints", "float64", (3, JOINTS)),  # position, velocity, acceleration; by joint
+    Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
+    Field("rejected", "uint32", (len(Cause),)),
+    Field("mode", "uint8"),
+    Field("reason", "uint8"),
+    Field("operator_hold", "uint8"),
+    Field("arm_ready", "uint8"),
+    Field("skill", "uint8", (16,)),  # digest of the skill in force, which is recorded apart
+)
+TIMING = (
+    Field("tick", "int64"),
+    Field("time_ns", "int64"),  # the tick's deadline on the wall clock
+    Field("missed", "int64"),  # deadlines skipped since start
+    Field("lateness_us", "float32"),
+    Field("work_us", "float32"),
+    Field("latency_us", "float32"),  # newest hand's stamp to command published; 0: no new sample
+    Field("stages_us", "float32", (len(STAGES),)),
+)
+
+
+def definition(layout: Layout, joints: int) -> str:
+    """The ROS 2 message definition of a layout for an arm with so many joints."""
+    lines = []
+    for field in layout:
+        size = f"[{math.prod(field.shape_for(joints))}]" if field.shape else ""
+        lines.append(f"{field.type}{size} {field.name}\n")
+    return "".join(lines)

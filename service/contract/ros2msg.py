@@ -1,0 +1,56 @@
+"""ROS 2 message definitions as `ros2msg` schemas, with which any MCAP reader decodes what we
+record.
+
+The public ones are reduced to their fields; those of Frame, Timing and State follow the layouts in
+`records`.
+"""
+
+from __future__ import annotations
+
+from service.contract import records
+
+_DEFINITIONS = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "std_msgs/String": "string data\n",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+    "geometry_msgs/PoseWithCovarianceStamped": "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
+    ),
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    ),
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "thirdhand/Tick": "int64 index\nuint32 lost\nuint8[] events\n",
+    "thirdhand/Skill": "uint8[] data\n",
+}
+
+
+_LAYOUTS = {"thirdhand/Frame": records.FRAME, "thirdhand/Timing": records.TIMING, "thirdhand/State": records.STATE}
+
+
+def schema(message_type: str, *, joints: int) -> str:
+    """The `ros2msg` schema of a message type like `geometry_msgs/msg/PoseStamped`, with all that it
+    depends on.
+
+    `joints` is how many the arm has: the layouts of Frame and State depend on it.
+    """
+    name = message_type.replace("/msg/", "/")
+    if name in _LAYOUTS:
+        return records.definition(_LAYOUTS[name], joints)
+    text, defined, waiting = _DEFINITIONS[name], {name}, [name]
+    while waiting:
+        for line in _DEFINITIONS[waiting.pop(0)].splitlines():
+            needed = line.split()[0].removesuffix("[]")
+            if needed in _DEFINITIONS and needed not in defined:
+                defined.add(needed)
+                waiting.append(needed)
+                text += f"{'=' * 80}\nMSG: {needed}\n{_DEFINITIONS[needed]}"
+    return text

@@ -1,0 +1,220 @@
+"""The arm's kinematics: where the tool is, which targets it can reach, and the joint velocities
+that bring it there.
+
+One step of differential inverse kinematics is a strictly convex least-squares problem with a bound
+on each joint's speed toward its limits, so that its solution is unique and continuous: unreachable
+targets and singular postures slow the arm, without chatter.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg.lapack import dposv
+
+from service.config import Settings
+from service.core.frame import Vector
+from service.core.limiter import MARGIN, approach_gain
+
+NEAR_LIMIT = 0.1  # [rad]
+
+POSITION_GAIN = 50.0  # [1/s] of a small error's decay
+CLOSING_SPEED = 0.3  # [m/s] at most, of a large one's
+CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
+DIRECTION_GAIN = 10.0  # [1/s]
+DIRECTION_SPEED = 0.5  # [rad/s] at most
+DIRECTION_LEVER = 0.01  # [m] 1 rad/s of direction counts as this many m/s of the tool: position goes first
+POSTURE_GAIN = 1.0  # [1/s]
+POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
+DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
+SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
+SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the table
+FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
+FAR_SPEED = 0.15  # [m/s]
+BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
+DECIMALS = 9  # [rad/s] of the result: replay's seam
+
+
+class Solution(NamedTuple):
+    """Joint velocities (J,) [rad/s].
+
+    Whether they were scaled down to the speed limits; whether a joint is within 0.1 rad of a
+    position limit.
+    """
+
+    velocity: Vector
+    speed_limited: bool
+    near_limit: bool
+
+
+class Arm:
+    """The arm that a URDF describes, with a tool on its plate.
+
+    Stateless: every answer follows from the arguments.
+
+    J joints, in the order of the settings; all others of the description stay at 0.
+    """
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        self._model = _chain(pin.buildModelFromXML(urdf), settings.joints.names)
+        plate = self._model.frames[self._model.getFrameId(settings.arm.plate)]
+        x, y, z, *quaternion = settings.tool.plate_from_tool
+        unit = np.array(quaternion) / math.hypot(*quaternion)
+        plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
+        tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
+        self._tool = self._model.addFrame(tool)
+        self._data = self._model.createData()
+        self._braking = CLOSING_BRAKES * settings.tool.max_acceleration
+        self._closing_speed = min(settings.tool.max_speed, CLOSING_SPEED)
+        self._period = settings.period_s
+        self._ahead = 1.0 / (1.0 + POSITION_GAIN * settings.period_s)  # the error decays as it will be, not as it is
+        limits = settings.joints
+        self._lower, self._upper = np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN
+        self._velocity = np.array(limits.velocity)
+        self._gain = approach_gain(limits)
+        self._posture = np.array(settings.arm.posture)
+
+    def pose(self, q: Vector) -> tuple[Vector, Vector]:
+        """Position (3,) [m] and rotation (3, 3) of the tool in frame base, at joints q (J,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        placement = pin.updateFramePlacement(self._model, self._data, self._tool)
+        return placement.translation.copy(), placement.rotation.copy()
+
+    def velocity(self, q: Vector, dq: Vector) -> Vector:
+        """Velocity of the tool (3,) [m/s] in frame base, at joints q (J,) [rad] and dq (J,)
+        [rad/s].
+        """
+        linear: Vector = self._jacobian(q)[:3] @ dq
+        return linear
+
+    def step(self, q: Vector, position: Vector, velocity: Vector, direction: Vector) -> Solution:
+        """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
+        `velocity` (3,) [m/s].
+
+        The tool's +z turns to `direction` (3,), at any angle about it. Position goes before
+        direction, both before the posture. Never raises nor returns NaN for finite arguments.
+        """
+        q = np.minimum(np.maximum(q, -1e3), 1e3)
+        jacobian = self._jacobian(q)
+        placement = pin.updateFramePlacement(self._model, self._data, self._tool)
+        rotation = placement.rotation
+        linear = np.minimum(np.maximum(velocity, -10.0), 10.0)
+        error = np.minimum(np.maximum(position - placement.translation, -10.0), 10.0) - self._period * linear
+        closing = self._approach(error)
+        linear += self._ahead * closing
+        across = DIRECTION_LEVER * rotation[:, :2].T  # turning about the tool's x and y moves its direction
+        tasks = np.concatenate((jacobian[:3], across @ jacobian[3:]))
+        wanted = np.concatenate((linear, across @ _turn(rotation[:, 2], direction)))
+        posture = np.minimum(np.maximum(POSTURE_GAIN * (self._posture - q), -POSTURE_SPEED), POSTURE_SPEED)
+        fastest = self._gain * np.maximum(self._upper - q, 0.0)
+        slowest = self._gain * np.minimum(self._lower - q, 0.0)
+        damping = _damping(jacobian[:3]) + FAR_DAMPING * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
+        result = _least_squares(tasks, wanted, posture, damping, (slowest, fastest))
+        excess = float((np.abs(result) / self._velocity).max())
+        if excess > 1.0:
+            result /= excess
+        if not math.isfinite(excess):
+            result = np.zeros(len(q))
+        near = bool((np.minimum(self._upper - q, q - self._lower) < NEAR_LIMIT).any())
+        result = result.round(DECIMALS)
+        result.setflags(write=False)
+        return Solution(result, excess > 1.0, near)
+
+    def _jacobian(self, q: Vector) -> Vector:
+        """The tool's Jacobian (6, J) in frame base, linear rows first; leaves the placements in
+        `_data`.
+        """
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian: Vector = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
+        return jacobian
+
+    def _approach(self, error: Vector) -> Vector:
+        """Velocity (3,) [m/s] that closes an error (3,) [m]: in proportion when near, braking
+        evenly from afar.
+        """
+        distance = math.hypot(*error)
+        near = self._braking / POSITION_GAIN**2
+        if distance <= near:
+            return POSITION_GAIN * error
+        speed = min(math.sqrt(2.0 * self._braking * (distance - 0.5 * near)), self._closing_speed)
+        return error * (speed / distance)
+
+
+def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
+    """The model with the named joints only, the others locked at 0."""
+    locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
+    return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+
+
+def _turn(axis: Vector, direction: Vector) -> Vector:
+    """Angular velocity (3,) [rad/s] that turns the tool's axis toward a direction; 0 if that has no
+    length.
+    """
+    ax, ay, az = axis.tolist()
+    dx, dy, dz = direction.tolist()
+    largest = max(abs(dx), abs(dy), abs(dz))
+    if not 0.0 < largest < math.inf:
+        return np.zeros(3)
+    dx, dy, dz = dx / largest, dy / largest, dz / largest
+    turn = (ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx)
+    sine, cosine = math.hypot(*turn), ax * dx + ay * dy + az * dz
+    if sine < 1e-9 * math.hypot(dx, dy, dz):
+        return np.zeros(3)  # there already, or exactly opposite, where no way is nearer
+    speed = min(DIRECTION_GAIN * math.atan2(sine, cosine), DIRECTION_SPEED)
+    return np.array(turn) * (speed / sine)
+
+
+def _damping(linear: Vector) -> float:
+    """Damping [m²]: small, and growing smoothly where the tool's position becomes singular."""
+    (a, b, c), (_, d, e), (_, _, f) = (linear @ linear.T).tolist()
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / SINGULAR_VOLUME, 0.0)
+    return DAMPING + SINGULAR_DAMPING * shortage * shortage
+
+
+def _least_squares(
+    tasks: Vector, wanted: Vector, posture: Vector, damping: float, bounds: tuple[Vector, Vector]
+) -> Vector:
+    """The x (J,) in the bounds with least |tasks x - wanted|² + damping |x - posture|², by an
+    active-set method.
+    """
+    slowest, fastest = bounds
+    result = _solve(tasks, wanted, posture, damping)
+    inside = (result >= slowest) & (result <= fastest)
+    if inside.all():
+        return result
+    result = np.minimum(np.maximum(result, slowest), fastest)
+    free = inside
+    for _ in range(BOUND_ROUNDS):
+        held = np.where(free, 0.0, result)
+        best = np.where(free, _solve(tasks * free, wanted - tasks @ held, posture, damping), result)
+        step = best - result
+        room = np.where(step > 0.0, fastest, slowest) - result
+        fraction = np.divide(room, step, out=np.full(len(step), np.inf), where=step != 0.0)
+        blocked = int(fraction.argmin())
+        if fraction[blocked] < 1.0:
+            result = np.minimum(np.maximum(result + fraction[blocked] * step, slowest), fastest)
+            free[blocked] = False
+            continue
+        result = best
+        slope = tasks.T @ (tasks @ result - wanted) + damping * (result - posture)
+        gain = np.where(free | (fastest <= slowest), 0.0, np.where(result >= fastest, slope, -slope))
+        leaving = int(gain.argmax())  # the bound whose inside is better by most
+        if gain[leaving] <= 1e-12:
+            break
+        free[leaving] = True
+    return result
+
+
+def _solve(tasks: Vector, wanted: Vector, posture: Vector, damping: float) -> Vector:
+    """The x (J,) with least |tasks x - wanted|² + damping |x - posture|², by its dual of five
+    equations.
+    """
+    square = tasks @ tasks.T
+    square.flat[::6] += damping
+    _, weights, _ = dposv(square, wanted - tasks @ posture)
+    x: Vector = posture + tasks.T @ weights
+    return x

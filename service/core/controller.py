@@ -1,0 +1,243 @@
+"""The core: each tick's inbox in, a frame out.
+
+Deterministic: no clock, no input or output, and all it remembers is one flat state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
+
+import numpy as np
+
+from service.config import Settings, robot_description
+from service.contract.records import SIDES, Flag, Mode, Reason
+from service.core.arm import Arm
+from service.core.frame import Frame, Lap, Record, Tick, Vector, blank, frame_layout, frozen, no_lap, state_layout
+from service.core.intake import Intake, rotation
+from service.core.limiter import Limiter
+from service.core.skill import Prediction, Skill
+from service.core.smoother import Smoother
+from service.core.workspace import Target, clamp
+
+TOO_FAST_S = (
+    0.03  # for so long the tool must be too fast to be a fault: an arm that catches up after a late command is not
+)
+
+Tap: TypeAlias = Callable[[Tick, Frame], None]
+
+
+def start_state(settings: Settings, skill: Skill) -> Record:
+    """The state before the first tick."""
+    state = blank(state_layout(len(settings.joints.names)))
+    state["tick"] = -1
+    state["hand_ticks"] = -1
+    state["arm_tick"] = -1
+    state["reason"] = Reason.ARM_NOT_READY
+    state["joints"][0] = settings.arm.posture
+    state["skill"] = np.frombuffer(skill.digest, np.uint8)
+    return state
+
+
+class Controller:
+    """Five stages in a row: intake, skill, smoother, arm, limiter.
+
+    `Controller(settings, skill, state)` goes on bit for bit from where another controller's `state`
+    was taken. `urdf` is the text of the arm's description where it is not to be read from where the
+    settings say.
+    """
+
+    def __init__(
+        self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str | None = None
+    ) -> None:
+        self._settings = settings
+        self._skill = skill
+        self._state = (start_state(settings, skill) if state is None else state).copy()
+        self._layout = frame_layout(len(settings.joints.names))
+        self._intake = Intake(settings)
+        self._smoother = Smoother(settings.tool, settings.period_s)
+        self._arm = Arm(settings, robot_description(settings) if urdf is None else urdf)
+        self._limiter = Limiter(settings.joints, settings.period_s)
+        self._direction = rotation(tuple(skill.orientation))[:, 2]
+
+    @property
+    def state(self) -> Record:
+        """A copy of all that the next frame depends on, but for settings and skill."""
+        return self._state.copy()
+
+    @property
+    def skill(self) -> Skill:
+        """The skill in force."""
+        return self._skill
+
+    def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
+        """The frame of one tick.
+
+        Ticks have growing indices; where some are missing, hands have moved on and the arm by one
+        period.
+        """
+        state = self._state
+        self._take_in(tick)
+        lap("intake")
+        prediction = self._predict()
+        target = None if prediction is None else self._clamp(prediction)
+        lap("skill")
+        self._decide(prediction)
+        flags = Flag(0)
+        joints, velocities, accelerations = state["joints"]
+        if state["mode"] == Mode.FOLLOW and target is not None:
+            state["setpoint"], slowed = self._smoother.step(
+                state["setpoint"], target.position, target.velocity, target.acceleration
+            )
+            lap("smoother")
+            wanted = self._arm.step(joints, state["setpoint"][0], state["setpoint"][1], self._direction)
+            lap("arm")
+            limited = self._limiter.step(joints, velocities, accelerations, wanted.velocity)
+            flags |= Flag.TARGET_CLAMPED * target.clamped
+            flags |= Flag.SPEED_LIMITED * (slowed or wanted.speed_limited or limited.limited)
+            flags |= Flag.NEAR_JOINT_LIMIT * wanted.near_limit
+            state["joints"] = limited[:3]
+        else:
+            state["joints"] = self._limiter.stop(joints, velocities, accelerations)[:3]
+            state["setpoint"] = self._at_rest()
+        lap("limiter")
+        return self._frame(prediction, target, flags)
+
+    def _take_in(self, tick: Tick) -> None:
+        state = self._state
+        if tick.index <= state["tick"]:
+            raise ValueError(f"tick {tick.index} after tick {state['tick']}: indices must grow")
+        self._intake.advance(state, tick.index - int(state["tick"]))
+        for event in tick.inbox:
+            match event.kind:
+                case "hands/left" | "hands/right":
+                    self._intake.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+                case "joints/state":
+                    self._intake.take_arm(state, event.value)
+                case "skill":
+                    self._adopt(event.value)
+                case "hold" | "resume":
+                    state["operator_hold"] = event.kind == "hold"
+                case "reset":
+                    if state["mode"] == Mode.FAULT:
+                        state["mode"], state["arm_ready"] = Mode.HOLD, 0
+
+    def _adopt(self, skill: Skill) -> None:
+        self._skill = skill
+        self._direction = rotation(tuple(skill.orientation))[:, 2]
+        self._state["skill"] = np.frombuffer(skill.digest, np.uint8)
+        self._state["covariance"] = 0.0
+
+    def _predict(self) -> Prediction | None:
+        """The prediction, if both hands are known; how sure it is, is asked anew with each sample
+        of a hand.
+        """
+        state = self._state
+        if not (self._intake.is_fresh(state, 0) and self._intake.is_fresh(state, 1)):
+            return None
+        hands, known = state["filters"], state["covariance"]
+        is_new = bool((state["hand_ticks"] == state["tick"]).any()) or not known.any()
+        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], covariance=None if is_new else known)
+        state["covariance"] = prediction.covariance
+        return prediction
+
+    def _decide(self, prediction: Prediction | None) -> None:
+        """Mode and reason of this tick."""
+        state = self._state
+        if state["mode"] == Mode.FAULT:
+            return
+        fault = self._watch_arm()
+        if fault is not None:
+            state["mode"], state["reason"] = Mode.FAULT, fault
+            return
+        reason = self._why_hold(prediction)
+        state["mode"] = Mode.FOLLOW if reason is Reason.NONE else Mode.HOLD
+        state["reason"] = reason
+
+    def _watch_arm(self) -> Reason | None:
+        """What is wrong with the arm, if anything; where it appears anew, joints start from it."""
+        state, arm = self._state, self._settings.arm
+        if arm.source == "assumed":
+            if not state["arm_ready"]:
+                state["arm_ready"] = 1
+                state["setpoint"] = self._at_rest()
+            return None
+        heard = self._intake.is_arm_heard(state)
+        if not state["arm_ready"]:
+            if heard and not self._is_moving():  # what still moves comes to rest first
+                state["arm_ready"], state["slow_tick"] = 1, state["tick"]
+                state["joints"] = 0.0
+                state["joints"][0] = state["measured"]
+                state["setpoint"] = self._at_rest()
+            return None
+        if not heard:
+            if state["mode"] == Mode.FOLLOW or self._is_moving():
+                return Reason.ARM_SILENT
+            state["arm_ready"] = 0
+            return None
+        if np.abs(state["joints"][0] - state["measured"]).max() > arm.fault_error_rad:
+            return Reason.ARM_ERROR
+        speed = self._arm.velocity(state["measured"], state["measured_velocities"])
+        if math.hypot(*speed) <= self._settings.tool.fault_speed:
+            state["slow_tick"] = state["tick"]
+        return (
+            Reason.TOOL_SPEED if (state["tick"] - state["slow_tick"]) * self._settings.period_s > TOO_FAST_S else None
+        )
+
+    def _why_hold(self, prediction: Prediction | None) -> Reason:
+        state = self._state
+        if not state["arm_ready"]:
+            return Reason.ARM_NOT_READY
+        if state["operator_hold"]:
+            return Reason.OPERATOR
+        if prediction is None:
+            return Reason.NO_HANDS if (state["hand_ticks"] < 0).any() else Reason.STALE_HAND
+        # what has been found far must come clearly nearer again
+        ease = 0.9 if state["reason"] == Reason.FAR_FROM_DEMONSTRATIONS else 1.0
+        return Reason.FAR_FROM_DEMONSTRATIONS if prediction.deviation > ease * self._skill.threshold else Reason.NONE
+
+    def _clamp(self, prediction: Prediction) -> Target:
+        """The target where it may be, with the motion that stays there."""
+        return clamp(*prediction[:3], box=self._skill.workspace, reach=self._settings.reach)
+
+    def _is_moving(self) -> bool:
+        """Whether the commanded joints have not come to rest."""
+        return bool(self._state["joints"][1:].any())
+
+    def _at_rest(self) -> Vector:
+        """The setpoint (3, 3) that goes with the commanded joints."""
+        joints, velocities = self._state["joints"][:2]
+        return np.stack([self._arm.pose(joints)[0], self._arm.velocity(joints, velocities), np.zeros(3)])
+
+    def _frame(self, prediction: Prediction | None, target: Target | None, flags: Flag) -> Frame:
+        state, frame = self._state, blank(self._layout)
+        seen = state["hand_ticks"]
+        frame["tick"] = state["tick"]
+        frame["hand_stamp_ns"] = state["hand_stamps_ns"][seen == seen.max()].max()
+        frame["hands"], frame["hand_velocities"] = state["filters"][:, 0], state["filters"][:, 1]
+        frame["hand_ages"] = np.where(seen < 0, -1, state["tick"] - seen)
+        frame["setpoint"], frame["setpoint_velocity"], frame["setpoint_acceleration"] = state["setpoint"]
+        if prediction is None or target is None:
+            frame["target"] = frame["setpoint"]
+        else:
+            frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
+            frame["covariance"], frame["deviation"] = prediction.covariance, prediction.deviation
+        frame["orientation"] = self._skill.orientation
+        frame["joints"], frame["joint_velocities"], frame["joint_accelerations"] = state["joints"]
+        frame["tool"] = self._arm.pose(state["joints"][0])[0]
+        frame["mode"], frame["reason"], frame["flags"] = state["mode"], state["reason"], flags
+        frame["commanded"] = self._is_moving() or (state["arm_ready"] and state["mode"] != Mode.FAULT)
+        frame["rejected"] = state["rejected"]
+        return frozen(frame)
+
+
+def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:
+    """Steps through all ticks and shows each frame to the taps: the only loop, live, in replay and
+    in tests.
+    """
+    taps = tuple(taps)
+    for tick in ticks:
+        frame = controller.step(tick, lap)
+        for tap in taps:
+            tap(tick, frame)

@@ -1,0 +1,160 @@
+"""Hand and arm samples as they come in: checked, mapped to frame `base`, and filtered to a state at
+the tick.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+
+from service.config import Settings
+from service.contract.channels import BY_KEY
+from service.contract.messages import JointState, PoseStamped, WireError, finite, in_order
+from service.contract.records import SIDES, Cause
+from service.core.frame import Record, Vector
+
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
+JUMP_M = 0.1  # from where a hand was expected: the filter starts anew there, and does not take it for a motion
+START_DEVIATIONS = (0.3, 1.0)  # [m/s], [m/s²] of a hand of which one sample is known
+
+
+def _stale_ticks(key: str, settings: Settings) -> int:
+    """The ticks, at least one, after which a channel's source is silent; rounding of the period
+    does not make it one more.
+    """
+    section, name = BY_KEY[key].stale_after or ("", "")
+    duration_ms: float = getattr(getattr(settings, section), name)
+    return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
+
+
+def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
+    """The rotation matrix (3, 3) of a quaternion x y z w, normalised first."""
+    x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class Intake:
+    """Hand and arm samples into the state: a constant-acceleration Kalman filter for each hand, the
+    newest sample of the arm.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        hands = settings.hands
+        self._period_s = settings.period_s
+        self._stale_ticks = tuple(_stale_ticks(f"hands/{side}", settings) for side in SIDES)
+        self._silent_ticks = _stale_ticks("joints/state", settings)
+        self._names = settings.joints.names
+        self._scale = UNIT_M[hands.unit]
+        self._origin = np.array(hands.base_from_tracker[:3])
+        self._axes = rotation(hands.base_from_tracker[3:])
+        self._noise = hands.noise_std_m**2
+        self._jerk_density = hands.jerk_density
+        self._motion = functools.lru_cache(maxsize=64)(self._motion_over)
+
+    def _motion_over(self, ticks: int) -> tuple[Vector, Vector]:
+        """Transition and process noise (3, 3) of position, velocity and acceleration over some
+        ticks (white jerk).
+        """
+        t = ticks * self._period_s
+        transition = np.array([[1, t, t * t / 2], [0, 1, t], [0, 0, 1]])
+        noise = self._jerk_density * np.array(
+            [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
+        )
+        return transition, noise
+
+    def is_fresh(self, state: Record, side: int) -> bool:
+        """Whether a hand has been seen, and lately enough."""
+        seen = int(state["hand_ticks"][side])
+        return seen >= 0 and int(state["tick"]) - seen < self._stale_ticks[side]
+
+    def is_arm_heard(self, state: Record) -> bool:
+        """Whether the arm has told its joints lately enough."""
+        seen = int(state["arm_tick"])
+        return seen >= 0 and int(state["tick"]) - seen < self._silent_ticks
+
+    def advance(self, state: Record, ticks: int) -> None:
+        """The state moved on by some ticks: fresh hands by their motion, others stand still."""
+        transition, noise = self._motion(ticks)
+        state["tick"] += ticks
+        means, covariances = state["filters"], state["filter_covariances"]
+        fresh = (self.is_fresh(state, 0), self.is_fresh(state, 1))
+        if all(fresh):
+            means[:] = transition @ means
+            covariances[:] = transition @ covariances @ transition.T + noise
+            return
+        for side in (0, 1):
+            if fresh[side]:
+                means[side] = transition @ means[side]
+                covariances[side] = transition @ covariances[side] @ transition.T + noise
+            else:
+                means[side, 1:] = 0.0
+
+    def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
+        """One hand's sample filtered in, or counted as rejected."""
+        cause: Cause | None = None
+        if not (finite(sample.position) and finite(sample.orientation)):
+            cause = Cause.NOT_FINITE
+        elif abs(math.hypot(*sample.orientation) - 1.0) > 0.01:
+            cause = Cause.NOT_A_ROTATION
+        elif math.hypot(*(position := self._in_base(sample.position)).tolist()) > FARTHEST_M:
+            cause = Cause.OUT_OF_RANGE
+        else:
+            cause = self._why_not_newer(
+                sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=self.is_fresh(state, side)
+            )
+        if cause is not None:
+            state["rejected"][cause] += 1
+            return
+        mean, covariance = state["filters"][side], state["filter_covariances"][side]
+        if self.is_fresh(state, side) and math.dist(position, mean[0]) < JUMP_M:
+            gain = covariance[:, 0] / (covariance[0, 0] + self._noise)
+            mean += gain[:, None] * (position - mean[0])
+            covariance -= gain[:, None] * covariance[0]
+        else:
+            mean[:] = (position, np.zeros(3), np.zeros(3))
+            covariance[:] = np.diag((self._noise, START_DEVIATIONS[0] ** 2, START_DEVIATIONS[1] ** 2))
+        state["hand_stamps_ns"][side] = sample.stamp_ns
+        state["hand_ticks"][side] = state["tick"]
+
+    def _in_base(self, position: tuple[float, float, float]) -> Vector:
+        """A tracker's position (3,) in frame `base` [m]."""
+        return np.asarray(self._axes @ (self._scale * np.array(position)) + self._origin)
+
+    @staticmethod
+    def _why_not_newer(stamp_ns: int, newest_ns: int, *, fresh: bool) -> Cause | None:
+        """A repeated stamp is never news; an older one is, once the source has been silent: its
+        clock was set back.
+        """
+        if stamp_ns == newest_ns:
+            return Cause.REPEATED
+        return Cause.OLDER if fresh and stamp_ns < newest_ns else None
+
+    def take_arm(self, state: Record, sample: JointState) -> None:
+        """The arm's sample into the state, or counted as rejected."""
+        try:
+            position, velocity = in_order(sample, self._names)
+        except WireError:
+            state["rejected"][Cause.INCOMPLETE] += 1
+            return
+        if not (finite(position) and finite(velocity)):
+            cause: Cause | None = Cause.NOT_FINITE
+        elif max(map(abs, position)) > 2 * math.pi or max(map(abs, velocity)) > 100:
+            cause = Cause.OUT_OF_RANGE
+        else:
+            cause = self._why_not_newer(sample.stamp_ns, int(state["arm_stamp_ns"]), fresh=self.is_arm_heard(state))
+        if cause is not None:
+            state["rejected"][cause] += 1
+            return
+        state["measured"] = position
+        state["measured_velocities"] = velocity
+        state["arm_stamp_ns"] = sample.stamp_ns
+        state["arm_tick"] = state["tick"]

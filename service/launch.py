@@ -1,0 +1,86 @@
+"""A daemon as a process of its own, on a free port and with its files in one folder: for the demo,
+experiments and tests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.contract.explain import ExplainedError
+
+START_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 60.0
+
+
+class LaunchError(ExplainedError, RuntimeError):
+    """A daemon that did not start or did not end; the message says what it said."""
+
+
+@dataclass(frozen=True)
+class Launched:
+    """A running daemon: its process, where it listens, and its log."""
+
+    process: subprocess.Popen[str]
+    endpoint: str
+    log: Path
+
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> int:
+        """The exit code, after being asked to stop. Raises LaunchError where that takes longer."""
+        self.process.terminate()
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise LaunchError(f"the service did not end within {timeout_s:g} s of being asked to") from None
+
+
+@contextlib.contextmanager
+def launched(folder: Path, *arguments: str, record: Path | None = None) -> Iterator[Launched]:
+    """A daemon (`thirdhand serve` with the arguments) that ends with the context.
+
+    Raises LaunchError.
+
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record` where
+    that is given.
+    """
+    config, log = folder / "cell.toml", folder / "service.log"
+    files = {"state": folder / "state"} | ({} if record is None else {"record": record})
+    config.write_text(
+        "# A cell with a free port and its own files.\n"
+        '[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\n'
+        + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items())
+    )
+    command = [sys.executable, "-m", "service", "serve", "--config", str(config), *arguments]
+    with log.open("a") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+    try:
+        yield Launched(process, _endpoint(process, log), log)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _endpoint(process: subprocess.Popen[str], log: Path) -> str:
+    """Where a daemon says that it listens."""
+    assert process.stdout is not None
+    until = time.monotonic() + START_TIMEOUT_S
+    while (left_s := until - time.monotonic()) > 0 and select.select([process.stdout], [], [], left_s)[0]:
+        line = process.stdout.readline()
+        if line.startswith("listening on "):
+            return line.split()[2].rstrip(",")
+        if not line:
+            break
+    raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")

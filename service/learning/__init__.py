@@ -1,0 +1,3 @@
+"""From demonstrations to a skill, from a skill to one that goes through taught via-points, and the
+skill's file.
+"""

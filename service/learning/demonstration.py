@@ -1,0 +1,75 @@
+"""A demonstration: how the tool went with the two hands, checked, and with a tool that lags brought
+into phase.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.frame import Vector
+from service.learning.skill_file import SkillError
+
+FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
+
+
+class Demonstration(NamedTuple):
+    """Stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, each x y z [m] and
+    quaternion x y z w, in one frame.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    left: Vector
+    right: Vector
+    tool: Vector
+
+    @property
+    def hands(self) -> Vector:
+        """Both hands' positions (T, 6) [m]: what a skill predicts from."""
+        return np.hstack([self.left[:, :3], self.right[:, :3]])
+
+    @property
+    def period_s(self) -> float:
+        """Mean time from one sample to the next [s]."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) / 1e9 / max(1, len(self.stamps_ns) - 1)
+
+    def every(self, step: int) -> Demonstration:
+        """The demonstration with one sample of so many."""
+        return Demonstration(self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step])
+
+
+def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:
+    """Hands and tool, shifted against each other where that makes their speeds agree better: a tool
+    that lags makes the map no function.
+    """
+    if len({len(part) for part in demonstration}) > 1:
+        counts = ", ".join(
+            f"{len(part)} {name}" for name, part in zip(Demonstration._fields, demonstration, strict=True)
+        )
+        raise SkillError(f"a demonstration of {counts}: as many of each needed")
+    hands, tool, period_s = demonstration.hands, demonstration.tool, demonstration.period_s
+    if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
+        raise SkillError("a demonstration holds numbers that are not finite")
+    if len(hands) < 4 or period_s <= 0 or int(longest_s / period_s) < 1:
+        raise SkillError(f"a demonstration of {len(hands)} samples is too short to learn from")
+    reach = min(int(longest_s / period_s), len(hands) // 4)
+    if max(np.abs(hands).max(), np.abs(tool[:, :3]).max()) > FARTHEST_M:
+        raise SkillError(
+            f"a demonstration goes {max(np.abs(hands).max(), np.abs(tool[:, :3]).max()):.0f} m away: is it in metres?"
+        )
+    if min(np.ptp(hands, axis=0).max(), np.ptp(tool[:, :3], axis=0).max()) < LEAST_M:
+        raise SkillError(
+            f"a demonstration in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teaches nothing"
+        )
+    if (np.abs(np.linalg.norm(tool[:, 3:], axis=1) - 1) > 0.01).any():
+        raise SkillError("a demonstration's tool orientations are not quaternions of norm 1")
+    speeds = [np.linalg.norm(np.gradient(x, axis=0), axis=1) for x in (hands, tool[:, :3])]
+    a, b = (s - s.mean() for s in speeds)
+    inner = a[reach : len(a) - reach]
+    score = [float(inner @ b[reach + shift : len(b) - reach + shift]) for shift in range(-reach, reach + 1)]
+    best = int(np.argmax(score)) - reach
+    if best == 0 or score[best + reach] < 1.02 * score[reach]:
+        return hands, tool
+    return (hands[: len(hands) - best], tool[best:]) if best > 0 else (hands[-best:], tool[: len(tool) + best])

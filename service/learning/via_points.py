@@ -1,0 +1,70 @@
+"""Via-points: a skill made to go through the poses that were taught to it, and how far it then
+misses each.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from kmp import Gaussians, ViaPointMissed
+from service.contract.requests import AdoptedViaPoint, ViaPoint
+from service.core.frame import Vector
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError, with_file
+
+NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
+
+
+def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
+    """A new skill that goes through these via-points and no others. Raises SkillError.
+
+    Algorithm 1 of Huang et al. 2019, from the skill as it was learned.
+    """
+    try:
+        inputs, outputs, deviations = neighbourhoods(via_points)
+        desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ViaPointMissed)  # `adopted` tells by how much
+            primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
+    except ValueError as error:
+        raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
+    return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
+
+
+def adopted(skill: Skill) -> tuple[AdoptedViaPoint, ...]:
+    """The via-points in force, each with the distance by which the skill misses it [m]."""
+    return tuple(
+        AdoptedViaPoint(
+            **msgspec.structs.asdict(point),
+            missed_by_m=math.dist(point.tool, skill.primitive.mean([[*point.left, *point.right]])[0]),
+        )
+        for point in skill.via_points
+    )
+
+
+def count(via_points: Sequence[ViaPoint]) -> int:
+    """How many points `neighbourhoods` makes of via-points."""
+    return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)
+
+
+def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vector]:
+    """Inputs (V, 6), outputs (V, 3) and standard deviations (V,) of via-points: each alone, or with
+    its neighbours.
+    """
+    inputs: list[Vector] = []
+    outputs: list[Vector] = []
+    deviations: list[float] = []
+    follow = {"none": np.zeros((3, 6)), "left": np.eye(3, 6), "right": np.eye(3, 6, 3)}
+    here, around = np.zeros((1, 6)), np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
+    for point in via_points:
+        steps = point.radius * around if point.radius else here
+        inputs.extend(np.array([*point.left, *point.right]) + steps)
+        outputs.extend(np.array(point.tool) + steps @ follow[point.follow].T)
+        deviations.extend([point.std] * len(steps))
+    return np.array(inputs).reshape(-1, 6), np.array(outputs).reshape(-1, 3), np.array(deviations)

@@ -1,0 +1,270 @@
+"""The daemon's end of the scribe, the process that writes the recording and feeds the viewer.
+
+The loop makes one non-blocking send a tick over a socket pair that keeps message boundaries. Slow,
+stuck or dead, the loop does not notice: what does not fit is counted as lost, the next message that
+does carries state and skill, so that a replay goes on behind the gap, and a dead scribe is started
+anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import socket
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from service import child
+from service.config import Settings
+from service.core.frame import Record, Tick
+from service.recorder.protocol import HAS_STATE, HEAD, LARGEST_MESSAGE, LONGEST_NOTE, NOTE, Task, pack
+
+BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
+_SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
+READY_TIMEOUT_S = 15.0
+RESTART_S = 1.0
+
+
+class Scribe:
+    """A scribe process and the way to tell it.
+
+    `send` is for the loop, `start`, `supervise`, `status` and `close` for one other thread, `note`
+    and `keep` for any.
+
+    In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`; `recording` and `rrd` are explicit
+    paths. With none of these and no `live_port` there is nothing to do and no process.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        folder: Path | None = None,
+        recording: Path | None = None,
+        rrd: Path | None = None,
+        live_port: int | None = None,
+        restart_s: float = RESTART_S,
+    ) -> None:
+        self._settings = settings
+        self._restart_s = restart_s
+        self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
+        self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
+        self._socket: socket.socket | None = None  # of the child that is told; the loop reads it, the others set it
+        self._child: child.Child | None = None
+        self._say_all = True
+        self._gap = self._lost = self._sent = self._restarts = 0
+        self._since_state = self._pause = 0
+        self._started = 0.0
+        self._memory: dict[int, tuple[bytes, int]] = {}
+        self._report: dict[str, Any] = {"recording": None, "rrd": None, "live": None}
+        self._errors: deque[str] = deque(maxlen=5)
+
+    def start(self, *, skill: bytes, state: Record | None) -> None:
+        """Starts the process and waits until it listens. Problems are told by `status`."""
+        if not self._wanted:
+            return
+        self._say_all = state is None
+        self._child = self._spawn(skill, state)
+        if not self.ready(READY_TIMEOUT_S):
+            ended = self._child.process.poll()
+            self._errors.append(
+                "the scribe does not listen yet"
+                if ended is None
+                else f"the scribe ended with code {ended} before it listened"
+            )
+
+    def ready(self, timeout_s: float) -> bool:
+        """Whether the process listens; waits for it for `timeout_s` at most."""
+        deadline = time.monotonic() + timeout_s
+        while self._socket is None and self._child is not None and time.monotonic() < deadline:
+            self._listen(timeout_s=min(0.1, timeout_s))
+            if self._child.process.poll() is not None:
+                break
+        return self._socket is not None
+
+    def keep(self, skill: bytes) -> int:
+        """The descriptor of a skill prepared to be sent.
+
+        That takes a millisecond a megabyte: call it off the loop before the loop adopts one.
+        """
+        known = self._memory.get(id(skill))
+        if known is None:
+            fd = child.in_memory(skill)
+            known = self._memory.setdefault(id(skill), (skill, fd))
+            if known[1] != fd:
+                os.close(fd)
+            elif len(self._memory) > 4:
+                os.close(self._memory.pop(next(iter(self._memory)))[1])
+        return known[1]
+
+    def send(self, tick: Tick, frame: Record, timing: Record, *, state: Callable[[], Record], skill: bytes) -> None:
+        """Tells of a tick.
+
+        Never waits; what cannot be told is counted. `state` is asked for now and then, and after a
+        loss.
+        """
+        target = self._socket
+        if target is None or self._pause:
+            self._pause = max(0, self._pause - 1)
+            if self._wanted:
+                self._gap += 1
+                self._lost += 1
+                self._say_all = True
+            return
+        say_all = self._say_all
+        self._since_state += 1
+        message = pack(
+            tick,
+            frame,
+            timing,
+            state=state() if say_all or self._since_state >= self._settings.rate_hz else None,
+            lost=self._gap,
+            with_skill=say_all,
+        )
+        try:
+            skills = [event.payload for event in tick.inbox if event.kind == "skill"]
+            if say_all:
+                skills.append(skill)
+            if skills:
+                socket.send_fds(target, [message], [self.keep(data) for data in skills])
+            else:
+                target.send(message)
+        except OSError:
+            self._gap += 1
+            self._lost += 1
+            self._say_all = True
+            self._pause = self._settings.rate_hz // 10  # one gap rather than many
+            return
+        self._sent += 1
+        self._gap = 0
+        if say_all:
+            self._say_all = False
+        if message[1] & HAS_STATE:
+            self._since_state = 0
+
+    def note(self, key: str, text: str, time_ns: int) -> None:
+        """A text for the recording, under `<cell>/<key>`; those under `requests` and `log` are
+        shown in the viewer. Never waits.
+        """
+        target = self._socket
+        if target is not None:
+            with contextlib.suppress(OSError):
+                target.send(HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode())
+
+    def supervise(self) -> None:
+        """Hears what the process has to say, and starts it anew if it died, with new files.
+
+        Ten times a second.
+        """
+        if not self._wanted or self._child is None:
+            return
+        self._listen(timeout_s=0.0)
+        process = self._child.process
+        if process.poll() is None:
+            return
+        if self._socket is not None:
+            self._errors.append(f"the scribe ended with code {process.returncode}")
+            self._socket = None
+        if time.monotonic() - self._started >= self._restart_s:
+            self._child.socket.close()
+            self._restarts += 1
+            self._child = self._spawn(None, None)
+
+    def status(self) -> dict[str, Any]:
+        """What is known of the process: alive, ticks sent and lost, restarts, where it writes, the
+        latest errors.
+        """
+        alive = self._socket is not None and self._child is not None and self._child.process.poll() is None
+        counts = {
+            "alive": alive,
+            "pid": None if self._child is None else self._child.process.pid,
+            "sent": self._sent,
+            "lost": self._lost,
+            "restarts": self._restarts,
+        }
+        return counts | self._report | {"errors": list(self._errors)}
+
+    def close(self, timeout_s: float = 20.0) -> None:
+        """Lets the process write what it was told and close its files; ends it if that takes longer
+        than `timeout_s`.
+        """
+        running, self._socket = self._child, None
+        if running is None:
+            return
+        with contextlib.suppress(OSError):
+            running.socket.shutdown(socket.SHUT_WR)  # also where a forked process still holds this end
+        try:
+            running.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._errors.append(f"the scribe was not done after {timeout_s:g} s: its last data are lost")
+            running.process.kill()
+            running.process.wait()
+        self._listen(timeout_s=0.0)
+        self._socket, self._child = None, None
+        running.socket.close()
+        for _, fd in self._memory.values():
+            os.close(fd)
+        self._memory = {}
+
+    def _paths(self) -> tuple[Path | None, Path | None]:
+        recording, rrd = self._recording, self._rrd
+        if self._restarts:
+            recording, rrd = (path and path.with_stem(f"{path.stem}-{self._restarts + 1}") for path in (recording, rrd))
+        if self._folder is not None:
+            stem = f"{self._settings.cell.replace('/', '-')}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+            while any((self._folder / (stem + suffix)).exists() for suffix in (".mcap", ".rrd")):
+                stem += "-2"
+            recording = recording or self._folder / f"{stem}.mcap"
+            if self._settings.files.rerun:
+                rrd = rrd or self._folder / f"{stem}.rrd"
+        return recording, rrd
+
+    def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
+        """A process that was given its task and is not told anything yet."""
+        recording, rrd = self._paths()
+        task = Task(
+            self._settings,
+            None if state is None else state.tobytes(),
+            None if recording is None else str(recording.absolute()),
+            None if rrd is None else str(rrd.absolute()),
+            self._live_port,
+        )
+        running = child.start("service.recorder.process", socket.SOCK_SEQPACKET)
+        self._started = time.monotonic()
+        ours = running.socket
+        ours.setblocking(False)
+        try:
+            ours.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, BUFFER_BYTES)
+        except PermissionError:  # then it is cut to what the system allows
+            ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        with contextlib.suppress(OSError):
+            if skill is None:
+                ours.send(msgspec.json.encode(task))
+            else:
+                socket.send_fds(ours, [msgspec.json.encode(task)], [self.keep(skill)])
+        return running
+
+    def _listen(self, *, timeout_s: float) -> None:
+        """Takes in the reports that have come; the first makes the process the one that is told."""
+        assert self._child is not None
+        source = self._child.socket
+        select.select([source], [], [], timeout_s)
+        with contextlib.suppress(OSError):
+            while data := source.recv(LARGEST_MESSAGE):
+                report = json.loads(data)
+                if "error" in report:
+                    self._errors.append(report["error"])
+                else:
+                    self._report = report
+                    if self._socket is None:
+                        self._say_all = self._say_all or self._restarts > 0
+                        self._socket = source

@@ -1,0 +1,88 @@
+"""The messages by which the control loop tells the scribe process of each tick, and the task it is
+started with.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from service.config import Settings
+from service.contract.channels import EVENT_KINDS
+from service.core.frame import TIMING, Event, Record, Tick, frame_layout, state_layout
+
+LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
+LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
+
+_TICK, NOTE = 1, 2
+HEAD = struct.Struct("<BBHIq")  # type, what follows, number of events, ticks lost before, index
+_EVENT = struct.Struct("<BI")  # kind, bytes
+HAS_STATE, _HAS_SKILL = 1, 2
+_ELSEWHERE = 0xFFFFFFFF  # the bytes are in a file in memory that comes along
+_KINDS = {kind: number for number, kind in enumerate(EVENT_KINDS)}
+_SKILL = _KINDS["skill"]
+
+
+class Told(NamedTuple):
+    """What one message tells of a tick."""
+
+    tick: Tick
+    frame: Record
+    timing: Record
+    state: Record | None
+    skill: bytes | None
+    lost: int
+
+
+def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, lost: int, with_skill: bool) -> bytes:
+    """One message about a tick; the bytes of skills are not in it."""
+    head, bodies = [b""], []
+    for event in tick.inbox:
+        kind = _KINDS[event.kind]
+        if kind == _SKILL:
+            head.append(_EVENT.pack(kind, _ELSEWHERE))
+        else:
+            head.append(_EVENT.pack(kind, len(event.payload)))
+            bodies.append(event.payload)
+    follows = (HAS_STATE if state is not None else 0) | (_HAS_SKILL if with_skill else 0)
+    head[0] = HEAD.pack(_TICK, follows, len(tick.inbox), lost, tick.index)
+    bodies += (frame.tobytes(), timing.tobytes())
+    if state is not None:
+        bodies.append(state.tobytes())
+    return b"".join(head + bodies)
+
+
+def unpack(message: bytes, skills: list[bytes], *, joints: int) -> Told:
+    """What a message about a tick of an arm with `joints` joints tells; `skills` are the files that
+    came along, in order.
+    """
+    of_frame, of_state = frame_layout(joints), state_layout(joints)
+    _, follows, count, lost, index = HEAD.unpack_from(message)
+    kinds = [_EVENT.unpack_from(message, HEAD.size + i * _EVENT.size) for i in range(count)]
+    at, files, inbox = HEAD.size + count * _EVENT.size, iter(skills), []
+    for kind, size in kinds:
+        payload = next(files) if size == _ELSEWHERE else message[at : at + size]
+        at += 0 if size == _ELSEWHERE else size
+        inbox.append(Event(EVENT_KINDS[kind], payload, None))
+    frame: Record = np.frombuffer(message, of_frame, 1, at)[0]
+    timing: Record = np.frombuffer(message, TIMING, 1, at + of_frame.itemsize)[0]
+    at += of_frame.itemsize + TIMING.itemsize
+    state: Record | None = np.frombuffer(message, of_state, 1, at)[0] if follows & HAS_STATE else None
+    skill = next(files) if follows & _HAS_SKILL else None
+    return Told(Tick(index, tuple(inbox)), frame, timing, state, skill, lost)
+
+
+class Task(msgspec.Struct, frozen=True):
+    """What a scribe is started with; the skill comes as a file in memory.
+
+    Without state it begins with the first message that has one.
+    """
+
+    settings: Settings
+    state: bytes | None
+    recording: str | None
+    rrd: str | None
+    live_port: int | None

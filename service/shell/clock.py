@@ -1,0 +1,109 @@
+"""The shell's clock: phase-locked deadlines, real-time scheduling where it is granted, and the
+figures that tell how well they are kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from service.contract.requests import Percentiles
+from service.core.frame import Vector
+
+SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
+FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
+
+
+class Deadlines:
+    """Deadlines at a fixed rate since start.
+
+    Those that have passed are skipped and counted, never made up for in a burst.
+    """
+
+    def __init__(
+        self,
+        rate_hz: int,
+        *,
+        spin_ns: int = 0,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.period_ns = 1_000_000_000 // rate_hz
+        self.missed = 0
+        self._spin_ns = spin_ns
+        self._now_ns = now_ns
+        self._sleep = sleep
+        self._start_ns = now_ns()
+        self._wall_ns = time.time_ns()
+        self._index = -1
+
+    def wait(self) -> tuple[int, int]:
+        """The number of the next deadline, once it has come, and how late it is [ns]."""
+        index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
+        self.missed += index - self._index - 1
+        self._index = index
+        deadline = self._start_ns + index * self.period_ns
+        early = deadline - self._now_ns() - self._spin_ns
+        if early > 0:
+            self._sleep(early / 1e9)
+        while (late := self._now_ns() - deadline) < 0:
+            pass
+        return index, late
+
+    def rate_hz(self) -> float:
+        """Ticks a second since start, as achieved."""
+        elapsed = self._now_ns() - self._start_ns
+        return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
+
+    def time_ns(self, index: int) -> int:
+        """A deadline on the wall clock as it was at start [ns]."""
+        return self._wall_ns + index * self.period_ns
+
+
+def ask_for_real_time() -> bool:
+    """Whether this thread was granted real-time scheduling; the garbage collector leaves what is
+    there alone in any case.
+    """
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(0.0005)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except (PermissionError, AttributeError, OSError):
+        return False
+    return True
+
+
+def run_beside_real_time() -> None:
+    """Lets this thread run before other processes, if that is granted: put aside while it holds the
+    interpreter, it would hold up the loop.
+    """
+    with contextlib.suppress(PermissionError, AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
+
+
+class Window:
+    """The last values of a figure, written by one thread and read by another."""
+
+    def __init__(self, length: int) -> None:
+        self._values: Vector = np.zeros(length)
+        self._count = 0
+
+    def add(self, value: float) -> None:
+        """One more value."""
+        self._values[self._count % len(self._values)] = value
+        self._count += 1
+
+    def percentiles(self) -> Percentiles:
+        """Median, 99th percentile and maximum over the window; zeros while it is empty."""
+        values = self._values[: self._count] if self._count < len(self._values) else self._values
+        if not len(values):
+            return Percentiles()
+        p50, p99, top = np.percentile(values, (50, 99, 100))
+        return Percentiles(round(float(p50), 3), round(float(p99), 3), round(float(top), 3))

@@ -1,0 +1,287 @@
+"""The daemon: a thin shell that fills the controller's inbox from Zenoh and hands each frame to
+whoever cares.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import signal
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from service.client import endpoints, open_session
+from service.config import Settings
+from service.contract import cdr, channels
+from service.contract.messages import Attachment, WireError
+from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
+from service.contract.requests import Status, encode_json
+from service.core.controller import Controller, run
+from service.core.frame import TIMING, Event, Frame, Tick, blank, frame_layout, outgoing
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError
+from service.recorder.client import Scribe
+from service.shell.clock import SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
+from service.shell.requests import Requests
+from service.shell.saved_via_points import SavedViaPoints
+from service.shell.workshop import Workshop
+
+log = logging.getLogger("thirdhand")
+LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+STOP_TIMEOUT_S = 3.0
+LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
+
+
+class Daemon:
+    """One cell's loop and all around it.
+
+    `serve` runs until it is asked to stop, then stops the arm and closes everything.
+    """
+
+    def __init__(self, settings: Settings, skill: Skill, *, workshop: Workshop, skills: Path, scribe: Scribe) -> None:
+        self._settings = settings
+        self._scribe = scribe
+        self._stop = threading.Event()
+        self._ended = threading.Event()
+        self._controller = Controller(settings, skill)
+        self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
+        self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
+        self._malformed: Counter[str] = Counter()
+        self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
+        self._realtime = False
+        self._status: Status | None = None
+        self._late_ns = self._began_ns = 0
+        self._laps: list[tuple[str, int]] = []
+        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen)
+        self.endpoints = endpoints(self._session) if settings.network.listen else ()
+        self._subscribers = [
+            (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
+            for channel in channels.CHANNELS
+            if channel.direction == "in" and channel.event
+            if channel.key != "joints/state" or settings.arm.source == "state"
+        ]
+        self._publishers = {
+            channel.key: self._session.declare_publisher(
+                channels.key(settings.cell, channel.key),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+            for channel in channels.CHANNELS
+            if channel.direction == "out"
+        }
+        self._requests = Requests(
+            self._session,
+            settings,
+            skill,
+            workshop=workshop,
+            skills=skills,
+            status=self.status,
+            note=self.note,
+            keep=scribe.keep,
+        )
+        self._clock = Deadlines(settings.rate_hz)
+
+    def stop(self, *_: Any) -> None:
+        """Asks the loop to stop the arm and end. Safe in a signal handler."""
+        self._stop.set()
+
+    def note(self, text: str) -> None:
+        """A line for the log and for the recording."""
+        log.info(text)
+        self._scribe.note("requests", text, time.time_ns())
+
+    def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> None:
+        """Runs the loop until `stop`, `announce`d once requests are answered; then everything is
+        flushed and closed.
+        """
+        reporter = threading.Thread(target=self._report, name="status", daemon=True)
+        try:
+            self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
+            reporter.start()
+            announce(self)
+            self._realtime = ask_for_real_time()
+            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._realtime else 0)
+            run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
+        finally:
+            self._ended.set()
+            gc.unfreeze()  # what was kept from the collector may go
+            if reporter.is_alive():
+                reporter.join(2)
+            self._requests.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+            self._scribe.close(timeout_s=20)
+
+    # --- the loop: every line below costs each tick ---
+
+    def _ticks(self) -> Iterator[Tick]:
+        inbox: list[Event] = []
+        stop_by: float | None = None
+        while True:
+            index, self._late_ns = self._clock.wait()
+            self._began_ns = time.perf_counter_ns()
+            self._laps = []
+            inbox = [
+                event for channel, subscriber in self._subscribers if (event := self._receive(channel, subscriber))
+            ]
+            while self._requests.inbox:
+                if (event := self._requests.inbox.popleft().taken(index)) is not None:
+                    inbox.append(event)
+            if self._stop.is_set():
+                if stop_by is None:
+                    stop_by = time.monotonic() + STOP_TIMEOUT_S
+                    inbox.append(Event("hold", cdr.encode_string("{}"), None))
+                elif not self._frame["joint_velocities"].any() or time.monotonic() > stop_by:
+                    return
+            yield Tick(index, tuple(inbox))
+
+    def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
+        """The newest message on one channel, if it is one."""
+        sample = subscriber.try_recv()
+        if sample is None:
+            return None
+        payload = sample.payload.to_bytes()
+        try:
+            if len(payload) > LARGEST_MESSAGE:
+                raise WireError(f"{len(payload)} bytes")
+            return Event(channel.key, payload, channel.codec.decode(payload))
+        except WireError:
+            self._malformed[channel.key] += 1
+            return None
+
+    def _lap(self, stage: str) -> None:
+        self._laps.append((stage, time.perf_counter_ns()))
+
+    def _publish(self, tick: Tick, frame: Frame) -> None:
+        now_ns = time.time_ns()
+        attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
+        for channel, payload in outgoing(frame, self._clock.time_ns(tick.index), self._settings.joints.names):
+            self._publishers[channel.key].put(payload, attachment=attachment)
+
+    def _record(self, tick: Tick, frame: Frame) -> None:
+        self._frame = frame
+        timing = blank(TIMING)
+        timing["tick"], timing["time_ns"], timing["missed"] = (
+            tick.index,
+            self._clock.time_ns(tick.index),
+            self._clock.missed,
+        )
+        timing["lateness_us"] = self._late_ns / 1e3
+        before = self._began_ns
+        for stage, at in self._laps:
+            timing["stages_us"][STAGES.index(stage)] = (at - before) / 1e3
+            before = at
+        if (frame["hand_ages"] == 0).any():
+            latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
+            if 0 <= latency_ms < LONGEST_LATENCY_MS:
+                timing["latency_us"] = latency_ms * 1e3
+                self._latency.add(latency_ms)
+        timing["work_us"] = (time.perf_counter_ns() - self._began_ns) / 1e3
+        self._lateness.add(self._late_ns / 1e3)
+        self._work.add(float(timing["work_us"]))
+        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._controller.skill.file)
+
+    # --- beside the loop ---
+
+    def status(self) -> Status:
+        """What is, at most a tenth of a second ago."""
+        return self._status or self._survey()
+
+    def _report(self) -> None:
+        """Publishes the status, logs what changed, keeps the scribe alive: ten times a second."""
+        run_beside_real_time()
+        said: tuple[str, str] | None = None
+        told: deque[str] = deque(maxlen=50)
+        while not self._ended.wait(0.1):
+            status = self._status = self._survey()
+            payload = encode_json(status)
+            self._publishers["status"].put(payload)
+            self._scribe.note("status", payload.decode(), time.time_ns())
+            self._scribe.supervise()
+            for error in status.scribe["errors"]:
+                if error not in told:
+                    told.append(error)
+                    log.warning("%s", error)
+            if status.tick >= 0 and (status.mode, status.reason) != said:
+                said = (status.mode, status.reason)
+                log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
+
+    def _survey(self) -> Status:
+        """What is, now."""
+        frame, clock = self._frame, self._clock
+        reason = Reason(int(frame["reason"]))
+        skill = self._controller.skill
+        rejected = {
+            cause.name.lower(): int(count) for cause, count in zip(Cause, frame["rejected"], strict=True) if count
+        }
+        return Status(
+            cell=self._settings.cell,
+            mode=Mode(int(frame["mode"])).name.lower(),
+            reason="" if reason is Reason.NONE else reason.name.lower(),
+            flags=tuple(str(flag.name).lower() for flag in Flag(int(frame["flags"]))),
+            tick=int(frame["tick"]),
+            rate_hz=clock.rate_hz(),
+            missed=clock.missed,
+            realtime=self._realtime,
+            skill=skill.name,
+            places=tuple(point.name for point in skill.via_points),
+            rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},
+            hand_age_ms={
+                side: round(float(age) * self._settings.period_s * 1e3, 1)
+                for side, age in zip(SIDES, frame["hand_ages"], strict=True)
+                if age >= 0
+            },
+            lateness_us=self._lateness.percentiles(),
+            work_us=self._work.percentiles(),
+            latency_ms=self._latency.percentiles(),
+            scribe=self._scribe.status(),
+            endpoints=self.endpoints,
+            version=version("thirdhand"),
+        )
+
+
+def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
+    """The skill in a file, with the via-points that were taught to it before. Raises SkillError."""
+    skill, saved = workshop.load(path), SavedViaPoints(settings)
+    try:
+        found = saved.read(skill)
+    except SkillError as error:
+        aside = saved.path.with_suffix(".damaged")
+        with contextlib.suppress(OSError):
+            saved.path.replace(aside)
+        log.warning("%s; it is kept as %s, and no via-points are in force", error, aside)
+        return skill
+    if found is None or found[0] == skill.via_points:
+        return skill
+    return workshop.adapt(skill, found[0], tolerance=found[1])
+
+
+def serve(
+    settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]
+) -> None:
+    """The daemon from start to end:
+
+    SIGINT and SIGTERM ask it to stop. Raises SkillError and UnreachableError before it starts.
+    """
+    workshop = Workshop()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        daemon = Daemon(
+            settings, load_skill(workshop, skill_path, settings), workshop=workshop, skills=skills, scribe=scribe
+        )
+        for number in before:
+            signal.signal(number, daemon.stop)
+        daemon.serve(announce)
+    finally:
+        workshop.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,73 @@
+"""Via-points that survive a restart: a small file in the configured folder, for the skill that they
+were taught to.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import msgspec
+
+from service.config import Settings
+from service.contract.requests import Add, ViaPoint, decode_request
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError
+
+
+class SavedViaPoints:
+    """The via-points in force on disk, so that they survive a restart; written atomically."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.path = Path(settings.files.state).expanduser() / settings.cell / "places.json"
+
+    def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
+        """Via-points and tolerance taught to this skill, or None.
+
+        Raises SkillError where the file is damaged.
+        """
+        try:
+            content = self.path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise SkillError(f"cannot read via-points {self.path}: {error.strerror}") from None
+        try:
+            saved = json.loads(content)
+            request = (
+                decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
+                if saved["request"]
+                else None
+            )
+            if saved["learned_from"] != skill.learned_from:
+                return None
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise SkillError(f"{self.path} does not hold via-points ({error})") from None
+        return (request.points, request.tolerance) if request else ((), skill.tolerance)
+
+    def write(self, skill: Skill) -> None:
+        """Puts the via-points of this skill into the file. Raises SkillError."""
+        self.draft(skill).replace(self.path)
+
+    def draft(self, skill: Skill) -> Path:
+        """A new file beside, whole and on disk, that is to replace the old one.
+
+        Raises SkillError.
+        """
+        request = (
+            {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
+            if skill.via_points
+            else None
+        )
+        content = json.dumps({"skill": skill.name, "learned_from": skill.learned_from, "request": request}, indent=1)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self.path.parent, suffix=".new", delete=False) as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise SkillError(f"cannot save via-points in {self.path.parent}: {error.strerror}") from None
+        return Path(file.name)

@@ -1,0 +1,140 @@
+"""What a URDF says of an arm: its joints along the chain to the tool, their limits, and where its
+links are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from service.contract.explain import ExplainedError
+from service.contract.messages import Quaternion, Transform, Vector3
+
+
+class UrdfError(ExplainedError, ValueError):
+    """A robot description that cannot be used: says what is wrong with it and what would do."""
+
+
+class Joint(NamedTuple):
+    """A joint: the links it connects, where it sits in the parent, and for a movable one its axis
+    and limits [rad, rad/s].
+    """
+
+    name: str
+    kind: str  # as in the URDF: fixed, revolute, ...
+    parent: str
+    child: str
+    translation: Vector3
+    rotation: Quaternion
+    axis: Vector3
+    lower: float
+    upper: float
+    velocity: float
+
+
+class Urdf:
+    """A robot description, read. Raises UrdfError."""
+
+    def __init__(self, text: str, *, origin: str = "the URDF") -> None:
+        self.origin = origin
+        try:
+            root = ElementTree.fromstring(text)
+            self.joints = tuple(_joint(element) for element in root.iter("joint") if element.find("parent") is not None)
+        except (ElementTree.ParseError, ValueError) as error:
+            raise UrdfError(f"{origin}: not a robot description: {error}") from None
+        if root.tag != "robot" or not self.joints:
+            raise UrdfError(f"{origin}: not a robot description: a <robot> with joints needed")
+        self._above = {joint.child: joint for joint in self.joints}
+        parents = {joint.parent for joint in self.joints}
+        self.root = next(joint.parent for joint in self.joints if joint.parent not in self._above)
+        self.leaves = tuple(joint.child for joint in self.joints if joint.child not in parents)
+        self.links = (self.root, *(joint.child for joint in self.joints))
+
+    def chain(self, tip: str) -> tuple[Joint, ...]:
+        """The joints from the root to link `tip`, in order. Raises UrdfError."""
+        found: list[Joint] = []
+        link = tip
+        while link != self.root:
+            if link not in self._above:
+                last = ", ".join(self.leaves)
+                raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
+            found.insert(0, self._above[link])
+            link = found[0].parent
+        return tuple(found)
+
+    def movable(self, tip: str) -> tuple[Joint, ...]:
+        """The revolute joints from the root to link `tip`, in order.
+
+        Raises UrdfError where one has no limits or slides.
+        """
+        moving = tuple(joint for joint in self.chain(tip) if joint.kind != "fixed")
+        for joint in moving:
+            if joint.kind != "revolute" or not joint.lower < joint.upper or not joint.velocity > 0:
+                raise UrdfError(
+                    f"{self.origin}: joint {joint.name!r} is {joint.kind}; revolute with limits and a velocity needed"
+                )
+        if not moving:
+            raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
+        return moving
+
+    def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
+        """Each link in its parent link, for joint positions by name [rad]; others are at 0."""
+        return [
+            Transform(
+                joint.parent,
+                joint.child,
+                joint.translation,
+                multiply(joint.rotation, about(joint.axis, positions[joint.name]))
+                if joint.name in positions
+                else joint.rotation,
+            )
+            for joint in self.joints
+        ]
+
+
+def _joint(element: ElementTree.Element) -> Joint:
+    origin, limit = element.find("origin"), element.find("limit")
+    roll, pitch, yaw = _three(origin, "rpy", "0 0 0")
+    x, y, z = _three(element.find("axis"), "xyz", "1 0 0")
+    norm = math.sqrt(x * x + y * y + z * z) or math.nan
+    return Joint(
+        element.get("name", ""),
+        element.get("type", ""),
+        _link(element, "parent"),
+        _link(element, "child"),
+        _three(origin, "xyz", "0 0 0"),
+        multiply(about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll))),
+        (x / norm, y / norm, z / norm),
+        *(float("nan" if limit is None else limit.get(name, "nan")) for name in ("lower", "upper", "velocity")),
+    )
+
+
+def _link(element: ElementTree.Element, which: str) -> str:
+    found = element.find(which)
+    return "" if found is None else found.get("link", "")
+
+
+def _three(element: ElementTree.Element | None, name: str, default: str) -> Vector3:
+    text = default if element is None else element.get(name, default)
+    x, y, z = (float(number) for number in text.split())
+    return x, y, z
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The rotation b followed by the rotation a; x y z w."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def about(axis: Sequence[float], angle: float) -> Quaternion:
+    """The rotation by `angle` [rad] about a unit axis; x y z w."""
+    half = math.sin(angle / 2)
+    return (axis[0] * half, axis[1] * half, axis[2] * half, math.cos(angle / 2))

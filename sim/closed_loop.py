@@ -1,0 +1,89 @@
+"""Bench and core in step, faster than real time: the one source of ticks for the golden session,
+rehearsals and tests.
+
+The core follows what the bench's hands and arm say, the bench follows the core's newest frame, as
+on the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from service.contract import cdr
+from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3
+from service.contract.records import SIDES
+from service.core.frame import Event, Frame, Tick
+from sim.bench import Bench
+from sim.network import SETTLE_S, STILL_S
+
+HANDS_HZ = 100  # also of the joint states
+START_NS = 1_000_000_000_000  # stamps begin there: 0 would mean that there is none
+
+
+def hand_event(side: str, position: Vector3, stamp_ns: int, orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)) -> Event:
+    """A sample of one hand as an event."""
+    pose = PoseStamped(stamp_ns, BASE, position, orientation)
+    return Event(f"hands/{side}", cdr.encode_pose(pose), pose)
+
+
+def joints_event(
+    names: tuple[str, ...], position: tuple[float, ...], velocity: tuple[float, ...], stamp_ns: int
+) -> Event:
+    """A sample of the arm's joints as an event."""
+    state = JointState(stamp_ns, names, position, velocity)
+    return Event("joints/state", cdr.encode_joints(state), state)
+
+
+def begin_when_settled(bench: Bench) -> None:
+    """Lets the script begin once, when the arm has come to rest where the hands want it."""
+    waited_s = bench.tick * bench.period_s
+    if bench.waiting and waited_s >= SETTLE_S[0] and (waited_s >= SETTLE_S[1] or bench.still_s >= STILL_S):
+        bench.begin()
+
+
+class ClosedLoop:
+    """A bench whose ticks follow from the frames that `follow` is shown, one for each tick."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        *,
+        direct: Callable[[Bench], None] = begin_when_settled,
+        spoil: Callable[[Event], tuple[Event, ...]] = lambda event: (event,),
+        more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
+    ) -> None:
+        """`direct` starts and turns the script before each step, `spoil` says what becomes of each
+        hand's sample.
+
+        `more` makes further events of the newest frame, as often as hands are seen.
+        """
+        self._bench, self._direct, self._spoil, self._more = bench, direct, spoil, more
+        self._newest: Frame | None = None
+
+    def follow(self, tick: Tick, frame: Frame) -> None:
+        """Has the arm follow a frame with the next step."""
+        self._newest = frame
+
+    def ticks(self) -> Iterator[Tick]:
+        """A tick for each period, until the script is over."""
+        bench = self._bench
+        every = round(1 / bench.period_s) // HANDS_HZ
+        while True:
+            self._direct(bench)
+            if bench.finished:
+                return
+            newest = self._newest
+            if newest is not None and newest["commanded"]:
+                seen = bench.step(tuple(newest["joints"].tolist()), tuple(newest["joint_velocities"].tolist()))
+            else:
+                seen = bench.step()
+            inbox: list[Event] = []
+            if bench.tick % every == 0:
+                stamp_ns = START_NS + bench.tick * round(bench.period_s * 1e9)
+                for side, pose in zip(SIDES, bench.script.sample(bench.time_s), strict=True):
+                    x, y, z, *orientation = pose.tolist()
+                    inbox += self._spoil(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))
+                if newest is not None:
+                    inbox += self._more(newest)
+                inbox.append(joints_event(bench.joint_names, seen.joints, seen.joint_velocities, stamp_ns))
+            yield Tick(bench.tick, tuple(inbox))

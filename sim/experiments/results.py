@@ -1,0 +1,170 @@
+"""Where an experiment's results go:
+
+PNG figures, one JSON of its numbers, a Rerun recording, and progress on standard error.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from service.contract.explain import ExplainedError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's colours, which people with colour vision deficiencies tell apart.
+LEFT, RIGHT, TOOL = (
+    "#D55E00",
+    "#0072B2",
+    "#009E73",
+)  # as in the paper: the left hand red, the right one blue, the robot green
+ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
+SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DPI, COLOURS = 110, 256
+
+
+class ExperimentError(ExplainedError):
+    """An experiment that cannot be made; the message says what would help."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says for all experiments."""
+
+    letters: Path | None = None  # a folder of recorded letters, for those about letters
+    workers: int = 1  # processes
+    share: float = 1.0  # of the full size, for a quick look
+
+
+@dataclass
+class Results:
+    """One experiment's results in `folder`: files are named after the experiment."""
+
+    folder: Path
+    name: str
+    said: bool = True
+    figures: list[str] = field(default_factory=list)
+    began_s: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def say(self, line: str) -> None:
+        """Shows progress."""
+        if self.said:
+            print(f"[{self.name} {time.monotonic() - self.began_s:5.1f} s] {line}", file=sys.stderr, flush=True)
+
+    def figure(self, figure: Figure, suffix: str = "") -> Path:
+        """The path of a figure, saved as PNG."""
+        path = self.folder / f"{self.name}{suffix and '-' + suffix}.png"
+        from PIL import Image
+
+        whole = io.BytesIO()
+        figure.savefig(whole, dpi=DPI, bbox_inches="tight")
+        Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
+            path, optimize=True
+        )  # a third of the size
+        figure.clear()
+        self.figures.append(path.name)
+        self.say(f"{path}")
+        return path
+
+    def numbers(self, numbers: dict[str, Any]) -> Path:
+        """The path of the JSON file of the numbers, the figures' names and the time it took."""
+        path = self.folder / f"{self.name}.json"
+        whole = {
+            "experiment": self.name,
+            "figures": self.figures,
+            "seconds": round(time.monotonic() - self.began_s, 1),
+            **numbers,
+        }
+        path.write_text(json.dumps(_plain(whole), indent=2) + "\n", encoding="utf-8")
+        self.say(f"{path}")
+        return path
+
+    def recording(self) -> rr.RecordingStream:
+        """A Rerun stream into the experiment's .rrd file; `disconnect` ends it."""
+        stream = rr.RecordingStream(f"thirdhand-{self.name}")
+        stream.save(self.folder / f"{self.name}.rrd")
+        return stream
+
+
+def pyplot() -> Any:
+    """Matplotlib's pyplot that draws into files. Raises ExperimentError."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        raise ExperimentError(
+            "the experiments draw with Matplotlib, which is not installed: pip install 'thirdhand[experiments]'"
+        ) from None
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    plt.rcParams.update(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True}
+    )
+    return plt
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green, blue (0 to 255) of #RRGGBB."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def equal_box(axes: Any, points: Array) -> None:
+    """Gives 3-D axes equal scales around points (N, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.55 * (high - low).clip(min=1e-3)
+    middle = (low + high) / 2
+    axes.set(
+        xlim=middle[0] + half[0] * np.array([-1, 1]),
+        ylim=middle[1] + half[1] * np.array([-1, 1]),
+        zlim=middle[2] + half[2] * np.array([-1, 1]),
+    )
+    axes.set_box_aspect(half, zoom=1.1)
+
+
+def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:
+    """Draws where a 2-D normal (2,), (2, 2) is one standard deviation from its mean."""
+    from matplotlib.patches import Ellipse
+
+    values, vectors = np.linalg.eigh(covariance)
+    size = 2 * np.sqrt(values)
+    axes.add_patch(
+        Ellipse(
+            (mean[0], mean[1]), size[0], size[1], angle=math.degrees(math.atan2(vectors[1, 0], vectors[0, 0])), **style
+        )
+    )
+
+
+def _plain(value: Any) -> Any:
+    """JSON's own types, numbers with five significant digits; what is not a number or infinite as
+    text.
+    """
+    if isinstance(value, dict):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(f"{value:.5g}") if math.isfinite(value) else str(value)
+    return value

@@ -1,0 +1,56 @@
+"""The main job: bench, service and scribe as processes; the robot hands the board over, fetches the
+glass and holds it over the board.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cell import thirdhand
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+SCENES = {
+    "the nominal places": "",
+    "new places, 5 to 15 cm away": "handover = [0.68, -0.20, 0.36]\nglass = [0.44, 0.31, 0.22]\n"
+    "soldering = [0.70, 0.09, 0.09]\nseed = 7\n",
+}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_the_task_succeeds_and_its_recording_replays_identically(scene: str, tmp_path: Path) -> None:
+    arguments = ["demo", "--json", "--out", str(tmp_path / "out")]
+    if scene:
+        (tmp_path / "scene.toml").write_text(scene)
+        arguments += ["--scene", str(tmp_path / "scene.toml")]
+    done = thirdhand(*arguments, timeout=110)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert report["success"]
+    for name in ("handover", "grasp", "carry"):
+        assert report["events"][name]["reached"]
+        assert report["events"][name]["error_mm"] <= 30
+    assert Path(report["rrd"]).stat().st_size > 100_000
+    replayed = thirdhand("replay", "--exact", report["recording"], timeout=110)
+    assert replayed.returncode == 0, replayed.stdout
+    with Path(report["recording"]).open("rb") as file:
+        decoded = {
+            channel.topic
+            for _, channel, _, _ in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        }
+    assert {
+        "thirdhand/joints/command",
+        "thirdhand/tool/target",
+        "thirdhand/frame",
+        "/tf",
+        "/robot_description",
+    } <= decoded
+
+
+def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")
+    done = thirdhand("demo", "--out", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
+    assert done.returncode == 1
+    assert "handover" in done.stderr

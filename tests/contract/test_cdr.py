@@ -1,0 +1,253 @@
+"""The wire: bytes as the ROS 2 ecosystem has them, and every malformed message and request answered
+by an error that says where.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from wam import JOINT_NAMES
+
+from service.contract import cdr, channels, messages, requests
+from service.contract.channels import EVENT_KINDS
+from service.contract.ros2msg import schema
+
+ROS = get_typestore(Stores.ROS2_HUMBLE)
+FRAMES = ("", "b", "ba", "bas", "base", "base_", "base_l", "a/tracker/over there", "tête")
+finite = st.floats(allow_nan=False, width=64)
+stamps = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
+texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=20)
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    time = ROS.types["builtin_interfaces/msg/Time"](sec, nanosec)
+    return ROS.types["std_msgs/msg/Header"](time, frame)
+
+
+def _pose(position: Any, orientation: Any) -> Any:
+    point, quaternion = ROS.types["geometry_msgs/msg/Point"], ROS.types["geometry_msgs/msg/Quaternion"]
+    return ROS.types["geometry_msgs/msg/Pose"](point(*position), quaternion(*orientation))
+
+
+def _bytes(kind: str, *fields: Any) -> bytes:
+    return bytes(ROS.serialize_cdr(ROS.types[kind](*fields), kind))
+
+
+three, four = st.tuples(*[finite] * 3), st.tuples(*[finite] * 4)
+
+
+@given(stamps, st.sampled_from(FRAMES) | texts, three, four)
+def test_poses_are_the_bytes_of_another_implementation(
+    stamp_ns: int, frame: str, position: Any, orientation: Any
+) -> None:
+    message = messages.PoseStamped(stamp_ns, frame, position, orientation)
+    data = cdr.encode_pose(message)
+    assert data == _bytes(channels.POSE.type, _header(stamp_ns, frame), _pose(position, orientation))
+    assert cdr.decode_pose(data) == message
+
+
+@given(stamps, st.sampled_from(FRAMES) | texts, three, four, st.lists(finite, min_size=36, max_size=36))
+def test_poses_with_covariance_are_the_bytes_of_another_implementation(
+    stamp_ns: int, frame: str, position: Any, orientation: Any, covariance: list[float]
+) -> None:
+    message = messages.PoseWithCovarianceStamped(stamp_ns, frame, position, orientation, tuple(covariance))
+    data = cdr.encode_pose_with_covariance(message)
+    pose = ROS.types["geometry_msgs/msg/PoseWithCovariance"](_pose(position, orientation), np.array(covariance))
+    assert data == _bytes(channels.POSE_WITH_COVARIANCE.type, _header(stamp_ns, frame), pose)
+    assert cdr.decode_pose_with_covariance(data) == message
+
+
+@given(stamps, st.sampled_from(FRAMES), st.lists(texts, max_size=9), st.data())
+def test_joint_states_are_the_bytes_of_another_implementation(
+    stamp_ns: int, frame: str, names: list[str], data: st.DataObject
+) -> None:
+    values = [data.draw(st.lists(finite, max_size=9)) for _ in range(3)]
+    message = messages.JointState(stamp_ns, tuple(names), *map(tuple, values), frame=frame)
+    encoded = cdr.encode_joints(message)
+    assert encoded == _bytes(
+        channels.JOINTS.type, _header(stamp_ns, frame), names, *(np.array(value, np.float64) for value in values)
+    )
+    assert cdr.decode_joints(encoded) == message
+
+
+@given(stamps, st.lists(finite, min_size=14, max_size=14))
+def test_the_quick_command_is_the_same_bytes_as_the_general_one(stamp_ns: int, values: list[float]) -> None:
+    message = messages.JointState(stamp_ns, JOINT_NAMES, tuple(values[:7]), tuple(values[7:]))
+    assert cdr.encode_command(stamp_ns, JOINT_NAMES, values[:7], values[7:]) == cdr.encode_joints(message)
+
+
+@given(texts)
+def test_texts_are_the_bytes_of_another_implementation(text: str) -> None:
+    assert cdr.encode_string(text) == _bytes("std_msgs/msg/String", text)
+    assert cdr.decode_string(cdr.encode_string(text)) == text
+
+
+@given(stamps, st.lists(st.tuples(texts, texts, three, four), max_size=4))
+def test_transforms_are_the_bytes_of_another_implementation(stamp_ns: int, items: list[Any]) -> None:
+    transform, stamped = ROS.types["geometry_msgs/msg/Transform"], ROS.types["geometry_msgs/msg/TransformStamped"]
+    vector, quaternion = ROS.types["geometry_msgs/msg/Vector3"], ROS.types["geometry_msgs/msg/Quaternion"]
+    theirs = [
+        stamped(_header(stamp_ns, parent), child, transform(vector(*xyz), quaternion(*turn)))
+        for parent, child, xyz, turn in items
+    ]
+    ours = cdr.encode_transforms(stamp_ns, [messages.Transform(*item) for item in items])
+    assert ours == _bytes("tf2_msgs/msg/TFMessage", theirs)
+
+
+POSE = cdr.encode_pose(messages.PoseStamped(7, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
+JOINTS = cdr.encode_joints(messages.JointState(7, JOINT_NAMES, (0.5,) * 7, ()))
+COVARIANCE = cdr.encode_pose_with_covariance(
+    messages.PoseWithCovarianceStamped(7, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 36)
+)
+MESSAGES = [(POSE, cdr.decode_pose), (JOINTS, cdr.decode_joints), (COVARIANCE, cdr.decode_pose_with_covariance)]
+
+
+@pytest.mark.parametrize(("data", "decode"), MESSAGES)
+def test_a_message_cut_anywhere_is_refused(data: bytes, decode: Any) -> None:
+    for size in range(len(data)):
+        with pytest.raises(messages.WireError):
+            decode(data[:size])
+
+
+@pytest.mark.parametrize(("data", "decode"), MESSAGES)
+def test_a_message_may_be_padded_to_four_bytes_and_no_further(data: bytes, decode: Any) -> None:
+    assert decode(data + bytes(3)) == decode(data)
+    with pytest.raises(messages.WireError, match="4 bytes follow the message"):
+        decode(data + bytes(4))
+
+
+@given(st.sampled_from(MESSAGES), st.data())
+def test_no_bytes_raise_anything_but_a_wire_error(message: Any, data: st.DataObject) -> None:
+    damaged = bytearray(message[0])
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, len(damaged) - 1), st.integers(0, 255)), max_size=6)
+    ):
+        damaged[place] = value
+    with contextlib.suppress(messages.WireError):
+        message[1](bytes(damaged))
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [
+        (b"", "header missing, little-endian CDR 00 01 00 00 needed"),
+        (b"\0\0\0\0" + POSE[4:], "header 00 00 00 00, little-endian CDR 00 01 00 00 needed"),
+        (POSE[:12] + b"\xff\xff\xff\x7f" + POSE[16:], "a length of 2147483647 with "),
+        (POSE[:16] + b"\xff\xfe\0\0\0" + POSE[21:], "a string that is not UTF-8"),
+        (POSE[:-1], "bytes end before byte"),
+    ],
+)
+def test_the_error_of_a_malformed_message_says_what_is_wrong(data: bytes, error: str) -> None:
+    with pytest.raises(messages.WireError, match=re.escape(error)):
+        cdr.decode_pose(data)
+
+
+def test_a_joint_state_that_claims_millions_of_joints_is_refused_without_memory_for_them() -> None:
+    at = 4 + 8 + 4 + 1 + 3
+    with pytest.raises(messages.WireError, match="a length of 4294967295"):
+        cdr.decode_joints(JOINTS[:at] + b"\xff\xff\xff\xff" + JOINTS[at + 4 :])
+
+
+@given(st.permutations(range(7)), st.booleans())
+def test_joints_are_found_in_any_order_among_others(order: list[int], moving: bool) -> None:
+    names = ("gripper", *(JOINT_NAMES[i] for i in order))
+    position = (9.0, *(float(i) for i in order))
+    message = messages.JointState(0, names, position, tuple(-value for value in position) if moving else ())
+    found, velocity = messages.in_order(message, JOINT_NAMES)
+    assert found == tuple(float(i) for i in range(7))
+    assert velocity == (tuple(-float(i) for i in range(7)) if moving else (0.0,) * 7)
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (messages.JointState(0, JOINT_NAMES[1:], (0.0,) * 6, ()), "joints ['wam/base_yaw_joint'] missing"),
+        (messages.JointState(0, JOINT_NAMES, (0.0,) * 6, ()), "7 names, 6 positions, 0 velocities"),
+        (messages.JointState(0, JOINT_NAMES, (0.0,) * 7, (0.0,) * 3), "7 names, 7 positions, 3 velocities"),
+    ],
+)
+def test_a_joint_state_that_does_not_fit_the_arm_is_refused(message: messages.JointState, error: str) -> None:
+    with pytest.raises(messages.WireError, match=re.escape(error)):
+        messages.in_order(message, JOINT_NAMES)
+
+
+@given(st.integers(0, 2**64 - 1), st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1))
+def test_the_attachment_comes_back(tick: int, published_ns: int, hand_stamp_ns: int) -> None:
+    attachment = messages.Attachment(tick, published_ns, hand_stamp_ns)
+    assert cdr.decode_attachment(cdr.encode_attachment(attachment)) == attachment
+
+
+def test_an_attachment_of_another_size_is_refused() -> None:
+    with pytest.raises(messages.WireError, match="an attachment of 23 bytes, 24 needed"):
+        cdr.decode_attachment(bytes(23))
+
+
+PLACE = {"name": "handover", "left": [0.6, -0.3, 0.3], "right": [0.9, 0.3, 0.1], "tool": [0.6, -0.28, 0.3]}
+
+
+def _add(**changed: Any) -> bytes:
+    return json.dumps({"op": "add", "points": [PLACE | changed]}).encode()
+
+
+def test_a_request_is_read_with_its_defaults() -> None:
+    request = requests.decode_request(_add(), requests.ViaPointsRequest)
+    assert request == requests.Add(
+        (requests.ViaPoint("handover", (0.6, -0.3, 0.3), (0.9, 0.3, 0.1), (0.6, -0.28, 0.3), 0.0001),), 0.05
+    )
+    assert requests.decode_request(b"", requests.Nothing) == requests.Nothing()
+    assert requests.decode_request(b'{"op": "list"}', requests.ViaPointsRequest) == requests.List()
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "error"),
+    [
+        (_add(left=[1, 2]), requests.ViaPointsRequest, "$.points[0].left: 2 numbers, 3 needed"),
+        (_add(tool=[1, 2, 3, 4]), requests.ViaPointsRequest, "$.points[0].tool: 4 numbers, 3 needed"),
+        (_add(right=[1, 2, 30]), requests.ViaPointsRequest, "$.points[0].right[2]: 30 given; -10 to 10 m accepted"),
+        (_add(std=0), requests.ViaPointsRequest, "$.points[0].std: 0 given; a number from 1e-06 to 1 accepted"),
+        (_add(name=""), requests.ViaPointsRequest, "$.points[0].name: '' given; 1 to 64 letters"),
+        (_add(colour="red"), requests.ViaPointsRequest, "$.points[0]: unknown field 'colour'; known are"),
+        (_add().replace(b"0.6", b"NaN"), requests.ViaPointsRequest, "malformed"),
+        (b'{"op": "fly"}', requests.ViaPointsRequest, "$.op: 'fly' given; add, remove, clear, list accepted"),
+        (b'{"op": "add", "points": []}', requests.ViaPointsRequest, "$.points: none given, 1 to 100 needed"),
+        (b"{", requests.ViaPointsRequest, "truncated"),
+        (b"[1]", requests.Nothing, "$: [1] given; an object with its fields needed"),
+        (b'{"name": "../x"}', requests.SkillRequest, "$.name: '../x' given; 1 to 64 letters"),
+        (b'{"name": "\xff"}', requests.SkillRequest, "utf-8"),
+    ],
+)
+def test_the_error_of_a_request_names_the_place_in_it(data: bytes, kind: Any, error: str) -> None:
+    with pytest.raises(requests.RequestError, match=re.escape(error)):
+        requests.decode_request(data, kind)
+
+
+def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
+    keys = [channel.key for channel in channels.CHANNELS]
+    assert len(set(keys)) == len(keys)
+    assert all(
+        channel.codec.encoding == "json" or schema(channel.codec.type, joints=7) for channel in channels.CHANNELS
+    )
+    assert {channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded} < set(
+        EVENT_KINDS
+    )
+    assert channels.key("hall/bench", "hands/left") == "hall/bench/hands/left"
+
+
+@given(st.binary(max_size=64), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1))
+def test_what_only_recordings_hold_comes_back_too(data: bytes, index: int, lost: int) -> None:
+    kinds = bytes(value % len(EVENT_KINDS) for value in data)
+    assert cdr.decode_tick(cdr.encode_tick(index, kinds, lost)) == (index, kinds, lost)
+    assert cdr.decode_skill(cdr.encode_skill(data)) == data
+    with pytest.raises(messages.WireError, match="a Tick"):
+        cdr.decode_tick(cdr.encode_tick(index, b"\0", lost)[:-1])
+    with pytest.raises(messages.WireError, match="a Skill"):
+        cdr.decode_skill(cdr.encode_skill(data)[:7])

@@ -1,0 +1,288 @@
+"""The core as a whole: modes and reasons, limits, stops without a jump, smoothness without lag, and
+going on from a state bit for bit.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, order, resting, ticks_of
+from wam import FRAME
+
+from service.config import Settings
+from service.contract import records
+from service.contract.records import Flag, Mode, Reason
+from service.core.controller import Controller
+from service.core.frame import Event, Tick
+from service.core.skill import Skill
+from service.learning.via_points import adapted
+from sim.scene import Scene
+from sim.script import HandScript
+
+PERIOD_S = 0.002
+POSTURE = Settings().arm.posture
+
+
+@pytest.fixture(scope="module")
+def taught(skill: Skill) -> Skill:
+    return adapted(skill, Scene().via_points(), tolerance=0.05)
+
+
+def limits_hold(seen: np.ndarray) -> None:
+    """Every number is finite and every joint within its limits, as commanded and by differences of
+    what was commanded.
+    """
+    limits = Settings().joints
+    for name in FRAME.names or ():
+        if FRAME[name].base.kind == "f":
+            assert np.isfinite(seen[name]).all(), name
+    sent = seen[seen["commanded"] == 1]
+    assert (sent["joints"] >= np.array(limits.lower)).all()
+    assert (sent["joints"] <= np.array(limits.upper)).all()
+    assert (np.abs(sent["joint_velocities"]) <= np.array(limits.velocity)).all()
+    assert (np.abs(sent["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
+    jerk = np.diff(sent["joint_accelerations"], axis=0) / PERIOD_S
+    assert (np.abs(jerk) <= np.array(limits.jerk) * (1 + 1e-6)).all()
+
+
+def no_jump(seen: np.ndarray) -> None:
+    """Consecutive commands are no farther apart than their velocities say."""
+    sent = seen[seen["commanded"] == 1]
+    way = np.diff(sent["joints"], axis=0)
+    mean = (sent["joint_velocities"][1:] + sent["joint_velocities"][:-1]) / 2
+    assert np.abs(way - mean * PERIOD_S).max() < 1e-6
+
+
+def modes(seen: np.ndarray) -> list[tuple[str, str]]:
+    """The modes and reasons that were, in order."""
+    pairs = [(Mode(f["mode"]).name.lower(), Reason(f["reason"]).name.lower()) for f in seen]
+    return [pair for i, pair in enumerate(pairs) if i == 0 or pair != pairs[i - 1]]
+
+
+def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Skill) -> None:
+    script = HandScript(Scene(), seed=5)
+    seen = frames(Controller(ASSUMED, taught), ticks_of(script))
+    limits_hold(seen)
+    no_jump(seen)
+    assert modes(seen[1:]) == [("follow", "none")]
+    time_s = np.arange(len(seen)) * PERIOD_S - 1.5
+    for (begin, end), goal in zip(script.scene.dwells, (None, script.scene.glass, script.scene.carry), strict=True):
+        rest = seen[(time_s >= begin) & (time_s <= end)]
+        at = script.truth(begin).left.position if goal is None else np.array(goal)
+        assert np.linalg.norm(rest["tool"] - at, axis=1).min() < 0.03
+
+
+def test_the_tool_neither_lags_the_demonstrated_relation_nor_chatters(taught: Skill) -> None:
+    script = HandScript(Scene(), seed=6)
+    seen = frames(Controller(ASSUMED, taught), ticks_of(script))
+    time_s = np.arange(len(seen)) * PERIOD_S - 1.5
+    hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
+    ideal = taught.primitive.mean(hands)
+    inner = slice(750, -100)
+    ideal_v, ideal_a = (
+        np.gradient(ideal, PERIOD_S, axis=0),
+        np.gradient(np.gradient(ideal, PERIOD_S, axis=0), PERIOD_S, axis=0),
+    )
+    tool_v = np.gradient(seen["tool"], PERIOD_S, axis=0)
+    tool_a = np.gradient(tool_v, PERIOD_S, axis=0)
+    speed, ideal_speed = np.linalg.norm(tool_v, axis=1), np.linalg.norm(ideal_v, axis=1)
+    score = [float(ideal_speed[inner] @ np.roll(speed, -shift)[inner]) for shift in range(-40, 41)]
+    lag_s = (int(np.argmax(score)) - 40) * PERIOD_S
+    assert lag_s <= 0.010
+    assert np.sqrt(np.mean(tool_a[inner] ** 2)) <= 3 * np.sqrt(np.mean(ideal_a[inner] ** 2))
+
+
+def test_it_goes_on_from_its_state_bit_for_bit(taught: Skill) -> None:
+    ticks = list(ticks_of(HandScript(Scene(), seed=7)))[:2500]
+    whole = frames(Controller(ASSUMED, taught), ticks)
+    first = Controller(ASSUMED, taught)
+    head = frames(first, ticks[:1234])
+    tail = frames(Controller(ASSUMED, taught, first.state), ticks[1234:])
+    assert np.concatenate([head, tail]).tobytes() == whole.tobytes()
+
+
+def test_the_first_setpoint_is_where_the_tool_is(taught: Skill) -> None:
+    seen = frames(Controller(ASSUMED, taught), resting(0, 300, every=1))
+    assert modes(seen) == [("follow", "none")]
+    assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.002
+
+
+def test_a_hand_that_falls_silent_brings_a_hold_within_100_ms_and_comes_back_without_a_jump(taught: Skill) -> None:
+    script = HandScript(Scene(), seed=8)
+    silent = range(1500, 1900)
+    ticks = [
+        Tick(t.index, tuple(e for e in t.inbox if not (e.kind == "hands/left" and t.index in silent)))
+        for t in ticks_of(script)
+    ]
+    seen = frames(Controller(ASSUMED, taught), ticks)
+    limits_hold(seen)
+    no_jump(seen)
+    assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
+    held = np.flatnonzero(seen["mode"] == Mode.HOLD)
+    assert held[1] - (silent.start - 5) <= 50 + 1
+    assert not seen["joint_velocities"][held[-1]].any()
+
+
+def test_without_hands_it_holds_and_says_so(taught: Skill) -> None:
+    seen = frames(Controller(ASSUMED, taught), [Tick(k, (hand("left", LEFT, k + 1),)) for k in range(100)])
+    assert modes(seen) == [("hold", "no_hands")]
+    assert seen["hand_ages"][-1].tolist() == [0, -1]
+
+
+def test_hands_far_from_the_demonstrations_are_not_followed_until_they_are_clearly_nearer(taught: Skill) -> None:
+    def at(k: int) -> tuple[float, float, float]:
+        return (LEFT[0], LEFT[1], LEFT[2] + (0.5 if 400 <= k < 800 else 0.0))
+
+    ticks = [
+        Tick(k, (hand("left", at(k), k + 1), hand("right", RIGHT, k + 1)) if k % 5 == 0 else ()) for k in range(1600)
+    ]
+    seen = frames(Controller(ASSUMED, taught), ticks)
+    limits_hold(seen)
+    no_jump(seen)
+    assert modes(seen[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
+
+
+def test_an_operator_holds_and_resumes(taught: Skill) -> None:
+    orders = {300: "hold", 900: "resume"}
+    seen = frames(Controller(ASSUMED, taught), resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ()))
+    assert modes(seen[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
+    no_jump(seen)
+
+
+def test_nothing_is_commanded_before_the_arm_has_told_where_it_is(taught: Skill) -> None:
+    start = (0.1, 0.5, 0.0, 1.9, 0.0, -0.3, 0.2)
+    controller = Controller(Settings(), taught)
+    before = frames(controller, resting(0, 200))
+    assert modes(before) == [("hold", "arm_not_ready")]
+    assert not before["commanded"].any()
+    after = frames(controller, resting(200, 1, lambda k: (arm(start, k),)))
+    assert after["commanded"].all()
+    assert np.abs(after["joints"][0] - start).max() < 1e-3
+
+
+def follow(controller: Controller, first: int, count: int, *, offset: float = 0.0, speed: float = 0.0) -> np.ndarray:
+    """Frames with an arm that does as it was told the tick before, or is off by an offset, or moves
+    at a speed.
+    """
+    out = []
+    joints = tuple(controller.state["joints"][0].tolist())
+    for tick in resting(first, count):
+        measured = tuple(q + offset for q in joints)
+        event = arm(measured, tick.index + 1, (speed,) * 7)
+        frame = controller.step(Tick(tick.index, (*tick.inbox, event)))
+        joints = tuple(frame["joints"].tolist())
+        out.append(frame)
+    return np.array(out)
+
+
+def test_an_arm_that_does_not_follow_is_a_fault_until_reset(taught: Skill) -> None:
+    controller = Controller(Settings(), taught)
+    assert modes(follow(controller, 0, 300))[-1] == ("follow", "none")
+    seen = follow(controller, 300, 400, offset=0.15)
+    assert modes(seen) == [("fault", "arm_error")]
+    assert not seen["commanded"][-1]
+    limits_hold(seen)
+    controller.step(Tick(700, (order("reset"),)))
+    assert modes(follow(controller, 701, 100))[-1] == ("follow", "none")
+
+
+def test_an_arm_that_falls_silent_while_followed_is_a_fault(taught: Skill) -> None:
+    controller = Controller(Settings(), taught)
+    follow(controller, 0, 300)
+    seen = frames(controller, resting(300, 300))
+    assert modes(seen) == [("follow", "none"), ("fault", "arm_silent")]
+    assert np.argmax(seen["mode"] == Mode.FAULT) <= 50
+
+
+def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
+    controller = Controller(Settings(), taught)
+    follow(controller, 0, 300)
+    assert modes(follow(controller, 300, 10, speed=2.0))[-1] == ("follow", "none")
+    assert modes(follow(controller, 310, 1))[-1] == ("follow", "none")
+    assert modes(follow(controller, 311, 20, speed=2.0))[-1] == ("fault", "tool_speed")
+
+
+def test_a_reset_while_the_arm_still_moves_lets_it_come_to_rest_first(taught: Skill) -> None:
+    controller = Controller(Settings(), taught)
+    out: list[np.ndarray] = []
+    joints, was_fault = POSTURE, False
+    for tick in list(ticks_of(HandScript(Scene(), seed=11), wait_s=0.5))[:3000]:
+        lies = 1400 <= tick.index < 1420
+        inbox = [*tick.inbox, arm(joints, tick.index + 1, (9.0,) * 7 if lies else (0.0,) * 7)]
+        if was_fault and tick.index % 7 == 0:
+            inbox.append(order("reset"))
+        frame = controller.step(Tick(tick.index, tuple(inbox)))
+        was_fault = frame["mode"] == Mode.FAULT
+        joints = tuple(frame["joints"].tolist())
+        out.append(frame)
+    seen = np.array(out)
+    assert [reason for _, reason in modes(seen)][-3:] == ["tool_speed", "arm_not_ready", "none"]
+    limits_hold(seen)
+    no_jump(seen)
+
+
+def test_reset_without_a_fault_changes_nothing(taught: Skill) -> None:
+    plain = frames(Controller(ASSUMED, taught), resting(0, 400))
+    reset = frames(Controller(ASSUMED, taught), resting(0, 400, lambda k: (order("reset"),) if k == 200 else ()))
+    assert plain.tobytes() == reset.tobytes()
+
+
+def test_a_new_skill_is_adopted_at_its_tick_and_approached_within_the_limits(skill: Skill, taught: Skill) -> None:
+    moved = adapted(skill, Scene(handover=(0.66, -0.22, 0.33), glass=(0.45, 0.30, 0.2)).via_points(), tolerance=0.05)
+    controller = Controller(ASSUMED, taught)
+    seen = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
+    assert controller.skill is moved
+    assert controller.state["skill"].tobytes() == moved.digest
+    limits_hold(seen)
+    no_jump(seen)
+
+
+def test_jumping_and_noisy_hands_never_make_a_command_outside_the_limits_nor_a_fault(taught: Skill) -> None:
+    random = np.random.default_rng(3)
+    places = np.array([LEFT, (0.62, -0.28, 0.3), (0.75, 0.0, 0.06)])
+    ticks = []
+    for k in range(3000):
+        inbox = []
+        if k % 3 == 0:
+            left = places[(k // 400) % 3] + random.normal(0, 0.01, 3)
+            inbox = [
+                hand("left", tuple(left.tolist()), k + 1),
+                hand("right", tuple((np.array(RIGHT) + random.normal(0, 0.01, 3)).tolist()), k + 1),
+            ]
+        ticks.append(Tick(k, tuple(inbox)))
+    seen = frames(Controller(ASSUMED, taught), ticks)
+    limits_hold(seen)
+    no_jump(seen)
+    assert (seen["mode"] != Mode.FAULT).all()
+    assert (seen["flags"] & Flag.SPEED_LIMITED).any()
+
+
+def test_missed_ticks_move_the_arm_by_one_period(taught: Skill) -> None:
+    ticks = [
+        Tick(t.index + (40 if t.index > 2000 else 0), t.inbox)
+        for t in list(ticks_of(HandScript(Scene(), seed=9)))[:3000]
+    ]
+    seen = frames(Controller(ASSUMED, taught), ticks)
+    limits_hold(seen)
+    no_jump(seen)
+
+
+def test_ticks_must_grow(taught: Skill) -> None:
+    controller = Controller(ASSUMED, taught)
+    controller.step(Tick(4))
+    with pytest.raises(ValueError, match="tick 4 after tick 4"):
+        controller.step(Tick(4))
+
+
+def test_frames_cannot_be_changed_and_describe_themselves(taught: Skill) -> None:
+    frame = Controller(ASSUMED, taught).step(Tick(0))
+    with pytest.raises(ValueError, match="read-only"):
+        frame["joints"][0] = 1.0
+    assert records.definition(records.FRAME, 7).startswith("int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n")
+
+
+def test_the_assumed_arm_starts_at_the_configured_posture(taught: Skill) -> None:
+    posture = (*POSTURE[:6], 0.5)
+    settings = msgspec.structs.replace(ASSUMED, arm=msgspec.structs.replace(ASSUMED.arm, posture=posture))
+    assert Controller(settings, taught).step(Tick(0))["joints"].tolist() == list(posture)

@@ -1,0 +1,334 @@
+"""Intake: samples checked and mapped to frame `base`, ages in ticks, and a filter that knows a hand
+between its samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from wam import JOINT_NAMES, STATE
+
+from service.config import HandSettings, Settings
+from service.contract.messages import JointState, PoseStamped
+from service.contract.records import Cause
+from service.core.frame import Record, Vector, blank
+from service.core.intake import Intake, rotation
+
+PERIOD_S = 0.002
+LEFT, RIGHT = 0, 1
+STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
+
+
+class Bench:
+    """An intake and its state, moved on tick by tick."""
+
+    def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
+        self.intake = Intake(Settings(hands=hands or HandSettings(), rate_hz=rate_hz))
+        self.state: Record = blank(STATE)
+        self.state["tick"] = self.state["hand_ticks"] = self.state["arm_tick"] = -1
+        self.advance()
+
+    def advance(self, ticks: int = 1) -> None:
+        self.intake.advance(self.state, ticks)
+
+    def hand(
+        self,
+        stamp_ns: int,
+        position: tuple[float, ...] = (0.5, 0.1, 0.2),
+        turn: tuple[float, ...] = STRAIGHT,
+        side: int = LEFT,
+    ) -> Vector:
+        """The filtered position (3,) [m] after one more sample."""
+        self.intake.take_hand(self.state, side, PoseStamped(stamp_ns, "base", position, turn))  # type: ignore[arg-type]
+        return np.array(self.state["filters"][side, 0])
+
+    def arm(
+        self,
+        stamp_ns: int,
+        names: tuple[str, ...] = JOINT_NAMES,
+        position: tuple[float, ...] = (0.1,) * 7,
+        velocity: tuple[float, ...] = (),
+    ) -> None:
+        self.intake.take_arm(self.state, JointState(stamp_ns, names, position, velocity))
+
+    def fresh(self, side: int = LEFT) -> bool:
+        return self.intake.is_fresh(self.state, side)
+
+    def rejected(self) -> dict[Cause, int]:
+        return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}
+
+
+# --- what a tracker says -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
+def test_a_trackers_unit_becomes_metres(unit: str, scale: float) -> None:
+    bench = Bench(HandSettings(unit=unit))  # type: ignore[arg-type]
+    np.testing.assert_allclose(bench.hand(1, (0.5 * scale, -0.1 * scale, 0.2 * scale)), [0.5, -0.1, 0.2])
+
+
+def test_a_turned_tracker_is_scaled_then_turned_then_moved() -> None:
+    bench = Bench(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
+    np.testing.assert_allclose(bench.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
+
+
+def test_a_rotation_turns_as_its_quaternion_does() -> None:
+    np.testing.assert_allclose(rotation(QUARTER_TURN), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    matrix = rotation((0.1, -0.4, 0.3, 0.8))
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+    np.testing.assert_allclose(rotation((-0.1, 0.4, -0.3, -0.8)), matrix)
+
+
+@pytest.mark.parametrize(
+    ("position", "turn", "cause"),
+    [
+        ((math.nan, 0.0, 0.0), STRAIGHT, Cause.NOT_FINITE),
+        ((0.0, math.inf, 0.0), STRAIGHT, Cause.NOT_FINITE),
+        ((0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), Cause.NOT_FINITE),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), Cause.NOT_A_ROTATION),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.02), Cause.NOT_A_ROTATION),
+        ((0.0, 0.0, 0.0), (1e308, 1e308, 1e308, 1e308), Cause.NOT_A_ROTATION),
+        ((500.0, 100.0, 200.0), STRAIGHT, Cause.OUT_OF_RANGE),
+        ((1e308, 1e308, 1e308), STRAIGHT, Cause.OUT_OF_RANGE),
+    ],
+)
+def test_a_useless_hand_sample_is_counted_and_changes_nothing_else(
+    position: tuple[float, ...], turn: tuple[float, ...], cause: Cause
+) -> None:
+    bench = Bench()
+    bench.hand(1)
+    before = bench.state.copy()
+    bench.hand(2, position, turn)
+    assert bench.rejected() == {cause: 1}
+    before["rejected"][cause] += 1
+    assert bench.state.tobytes() == before.tobytes()
+
+
+def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
+    bench = Bench()
+    bench.hand(1, turn=(0.0, 0.0, 0.0, -1.0))
+    assert bench.fresh()
+
+
+# --- stamps and ages -----------------------------------------------------------------------------
+
+
+def test_repeated_and_older_stamps_are_counted_apart() -> None:
+    bench = Bench()
+    for stamp in (1000, 1000, 999):
+        bench.hand(stamp)
+        bench.advance()
+    assert bench.rejected() == {Cause.REPEATED: 1, Cause.OLDER: 1}
+    assert int(bench.state["hand_ticks"][LEFT]) == 0
+
+
+def test_hands_do_not_share_stamps() -> None:
+    bench = Bench()
+    bench.hand(1000, side=LEFT)
+    bench.hand(1000, side=RIGHT)
+    assert bench.fresh(LEFT)
+    assert bench.fresh(RIGHT)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "stale_ms", "ticks"),
+    [
+        (500, 100.0, 50),
+        (1000, 100.0, 100),
+        (140, 100.0, 14),
+        (500, 99.0, 50),
+        (50, 1.0, 1),
+    ],
+)
+def test_a_hand_is_stale_after_exactly_the_configured_time(rate_hz: int, stale_ms: float, ticks: int) -> None:
+    bench = Bench(HandSettings(stale_ms=stale_ms), rate_hz=rate_hz)
+    bench.hand(1)
+    assert bench.fresh()
+    bench.advance(ticks - 1)
+    assert bench.fresh()
+    bench.advance()
+    assert not bench.fresh()
+
+
+def test_a_repeated_sample_does_not_keep_a_hand_fresh() -> None:
+    bench = Bench()
+    for _ in range(51):
+        bench.hand(1000)
+        bench.advance()
+    assert not bench.fresh()
+    bench.hand(1000)
+    assert not bench.fresh()
+
+
+def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
+    bench = Bench()
+    bench.hand(5_000_000_000)
+    for stamp in range(49):
+        bench.advance()
+        bench.hand(stamp + 1)
+    assert bench.rejected() == {Cause.OLDER: 49}
+    bench.advance()
+    np.testing.assert_array_equal(bench.hand(50, (0.6, 0.0, 0.0)), [0.6, 0.0, 0.0])
+    assert bench.fresh()
+    bench.hand(51)
+    assert bench.rejected() == {Cause.OLDER: 49}
+
+
+def test_one_stamp_from_the_future_locks_a_hand_out_until_it_is_stale_only() -> None:
+    bench = Bench()
+    bench.hand(1_000)
+    bench.hand(2**62)
+    for tick in range(1, 60):
+        bench.advance()
+        bench.hand(1_000 + tick)
+    assert bench.rejected() == {Cause.OLDER: 49}
+    assert bench.fresh()
+
+
+def test_a_stale_hand_stands_still_and_starts_anew() -> None:
+    bench = Bench()
+    follow(bench, lambda t: np.array([0.5 * t, 0.0, 0.0]), until_s=0.5)
+    bench.advance(50)
+    where = bench.state["filters"][LEFT].copy()
+    assert not where[1:].any()
+    bench.advance(100)
+    np.testing.assert_array_equal(bench.state["filters"][LEFT], where)
+    np.testing.assert_array_equal(bench.hand(10**10, (0.1, 0.2, 0.3)), [0.1, 0.2, 0.3])
+    assert not bench.state["filters"][LEFT, 1:].any()
+
+
+# --- the arm -------------------------------------------------------------------------------------
+
+
+def test_joints_are_taken_in_any_order_among_others() -> None:
+    bench = Bench()
+    values = {name: 0.1 * i for i, name in enumerate(JOINT_NAMES)} | {"gripper": 3.0}
+    for stamp, names in ((1, tuple(values)), (2, tuple(reversed(values))), (3, tuple(sorted(values)))):
+        bench.arm(stamp, names, tuple(values[name] for name in names), tuple(2 * values[name] for name in names))
+        np.testing.assert_allclose(bench.state["measured"], 0.1 * np.arange(7))
+        np.testing.assert_allclose(bench.state["measured_velocities"], 0.2 * np.arange(7))
+    assert bench.rejected() == {}
+
+
+def test_joints_without_velocities_stand_still() -> None:
+    bench = Bench()
+    bench.arm(1, velocity=(1.0,) * 7)
+    bench.arm(2)
+    assert not bench.state["measured_velocities"].any()
+
+
+@pytest.mark.parametrize(
+    ("names", "position", "velocity", "cause"),
+    [
+        (JOINT_NAMES[:6], (0.1,) * 6, (), Cause.INCOMPLETE),
+        ((), (), (), Cause.INCOMPLETE),
+        (JOINT_NAMES, (0.1,) * 6, (), Cause.INCOMPLETE),
+        (JOINT_NAMES, (0.1,) * 7, (0.0,) * 6, Cause.INCOMPLETE),
+        (JOINT_NAMES, (math.nan,) + (0.1,) * 6, (), Cause.NOT_FINITE),
+        (JOINT_NAMES, (0.1,) * 7, (math.inf,) * 7, Cause.NOT_FINITE),
+        (JOINT_NAMES, (7.0,) * 7, (), Cause.OUT_OF_RANGE),
+        (JOINT_NAMES, (0.1,) * 7, (101.0,) * 7, Cause.OUT_OF_RANGE),
+    ],
+)
+def test_a_useless_arm_sample_is_counted_and_changes_nothing_else(
+    names: tuple[str, ...], position: tuple[float, ...], velocity: tuple[float, ...], cause: Cause
+) -> None:
+    bench = Bench()
+    bench.arm(1)
+    before = bench.state.copy()
+    bench.arm(2, names, position, velocity)
+    assert bench.rejected() == {cause: 1}
+    before["rejected"][cause] += 1
+    assert bench.state.tobytes() == before.tobytes()
+
+
+def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with_any_stamp() -> None:
+    bench = Bench()
+    assert not bench.intake.is_arm_heard(bench.state)
+    bench.arm(1000)
+    bench.advance(49)
+    bench.arm(999)
+    bench.arm(1000)
+    assert bench.rejected() == {Cause.OLDER: 1, Cause.REPEATED: 1}
+    assert bench.intake.is_arm_heard(bench.state)
+    bench.advance()
+    assert not bench.intake.is_arm_heard(bench.state)
+    bench.arm(5)
+    assert bench.intake.is_arm_heard(bench.state)
+
+
+# --- the filter ----------------------------------------------------------------------------------
+
+
+def follow(
+    bench: Bench, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
+) -> Vector:
+    """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
+    states, taken = [], 0
+    for tick in range(round(until_s / PERIOD_S)):
+        if tick:
+            bench.advance()
+        if tick * PERIOD_S * rate_hz >= taken - 1e-9:
+            stamp_s = tick * PERIOD_S
+            position = where(stamp_s) + (0.0 if noise is None else noise[taken])
+            bench.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
+            taken += 1
+        states.append(bench.state["filters"][LEFT].copy())
+    assert bench.rejected() == {}
+    return np.array(states)
+
+
+def test_the_filter_converges_on_a_constant_velocity() -> None:
+    velocity = np.array([0.3, -0.2, 0.1])
+    states = follow(Bench(), lambda t: np.array([0.5, 0.0, 0.2]) + velocity * t, until_s=2.0)
+    np.testing.assert_allclose(states[-1, 1], velocity, atol=1e-4)
+    np.testing.assert_allclose(states[-1, 2], 0.0, atol=1e-3)
+
+
+def test_the_filter_converges_on_a_constant_acceleration() -> None:
+    acceleration = np.array([0.4, -0.3, 0.2])
+    states = follow(Bench(), lambda t: 0.5 * acceleration * t * t, until_s=2.0)
+    last = 1.998
+    np.testing.assert_allclose(states[-1, 0], 0.5 * acceleration * last**2, atol=1e-5)
+    np.testing.assert_allclose(states[-1, 1], acceleration * last, atol=1e-4)
+    np.testing.assert_allclose(states[-1, 2], acceleration, atol=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100])
+def test_a_hand_moves_in_each_tick_between_its_samples(rate_hz: int) -> None:
+    velocity = np.array([0.5, 0.0, 0.0])
+    states = follow(Bench(), lambda t: velocity * t, until_s=2.0, rate_hz=rate_hz)
+    steps = np.diff(states[500:, 0, 0]) / PERIOD_S
+    np.testing.assert_allclose(steps, 0.5, atol=0.01)
+
+
+def test_the_filter_makes_noise_smaller() -> None:
+    noise = np.random.default_rng(1).normal(0.0, 0.0005, (600, 3))
+    still = np.array([0.5, 0.0, 0.2])
+    states = follow(Bench(), lambda t: still, until_s=6.0, noise=noise)
+    assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.6 * 0.0005
+
+
+def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
+    one, many = Bench(), Bench()
+    for bench in (one, many):
+        follow(bench, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
+    for _ in range(20):
+        one.advance()
+    many.advance(20)
+    assert one.state["tick"] == many.state["tick"]
+    np.testing.assert_allclose(many.state["filters"], one.state["filters"], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(many.state["filter_covariances"], one.state["filter_covariances"], rtol=1e-9, atol=1e-15)
+
+
+def test_covariances_stay_symmetric_and_positive() -> None:
+    bench = Bench()
+    follow(bench, lambda t: np.array([0.1 * t, 0.0, 0.0]), until_s=4.0, rate_hz=30)
+    covariance = bench.state["filter_covariances"][LEFT]
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+    assert np.linalg.eigvalsh(covariance).min() > 0

@@ -1,0 +1,237 @@
+"""The limiter: every limit holds by construction, whatever is wanted; what is within them passes
+unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.config import JointSettings
+from service.core.limiter import Limited, Limiter, approach_gain
+
+PERIOD = 0.002  # [s]
+LIMITS = JointSettings()
+LOWERED = JointSettings(velocity=(0.3,) * 7, acceleration=(0.5,) * 7, jerk=(4.0,) * 7)
+LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
+REST = np.zeros(7)
+HOME = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])  # as published: joints 2 and 4 outside their limits
+Vector = npt.NDArray[np.float64]
+
+
+class Run(NamedTuple):
+    """A motion from rest, (N, 7) each; jerk from differences of acceleration."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    jerk: Vector
+    limited: list[bool]
+
+
+def drive(limits: JointSettings, q: Vector, inputs: Vector) -> Run:
+    limiter = Limiter(limits, PERIOD)
+    state: tuple[Vector, Vector, Vector] = (q, REST, REST)
+    steps: list[Limited] = []
+    for velocity in inputs:
+        steps.append(limiter.step(*state, velocity))
+        state = steps[-1][:3]
+    position, speed, acceleration = (np.array([step[i] for step in steps]) for i in range(3))
+    jerk = np.diff(acceleration, axis=0, prepend=0.0) / PERIOD
+    return Run(position, speed, acceleration, jerk, [step.limited for step in steps])
+
+
+def assert_held(limits: JointSettings, q: Vector, run: Run) -> None:
+    furthest = np.vstack((q, run.position))
+    assert (np.maximum.accumulate(furthest)[-1] <= np.maximum(UPPER, q)).all()
+    assert (np.minimum.accumulate(furthest)[-1] >= np.minimum(LOWER, q)).all()
+    outside = np.maximum(np.maximum(furthest - UPPER, LOWER - furthest), 0.0)
+    assert (np.diff(outside, axis=0) <= 0.0).all(), "outside the limits, inwards only"
+    assert (np.abs(run.velocity) <= limits.velocity).all()
+    assert (np.abs(run.acceleration) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
+    assert (np.abs(run.jerk) <= np.array(limits.jerk) * (1 + 1e-9)).all()
+    between = 0.5 * (run.velocity[1:] + run.velocity[:-1])
+    # what jerk makes of one tick between the trapezoid's value and the true one
+    slack = np.array(limits.jerk) * PERIOD**2 + 1e-6
+    assert (np.abs(np.diff(run.position, axis=0) / PERIOD - between) <= slack).all(), "position follows velocity"
+    assert np.array_equal(run.position, run.position.round(9))
+
+
+anything = st.one_of(
+    st.floats(),
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 0.0, 1.5, -1.5]),
+    st.floats(-2.0, 2.0),
+)
+pieces = st.lists(st.tuples(st.tuples(*[anything] * 7), st.integers(1, 60)), min_size=1, max_size=8)
+
+
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(pieces, st.tuples(*[st.floats(0.0, 1.0)] * 7), st.sampled_from([LIMITS, LOWERED]))
+def test_every_limit_holds_for_any_sequence_of_wanted_velocities(
+    wanted: list[tuple[tuple[float, ...], int]], where: tuple[float, ...], limits: JointSettings
+) -> None:
+    q = (LOWER + np.array(where) * (UPPER - LOWER)).round(9).clip(LOWER, UPPER)
+    run = drive(limits, q, np.array([value for value, count in wanted for _ in range(count)]))
+    assert_held(limits, q, run)
+
+
+@pytest.mark.parametrize("limits", [LIMITS, LOWERED])
+@pytest.mark.parametrize("ticks", [1, 7, 150, 900])
+def test_every_limit_holds_when_random_extremes_last(limits: JointSettings, ticks: int) -> None:
+    rng = np.random.default_rng(ticks)
+    extremes = rng.choice([-math.inf, -9.0, -1.0, 0.0, 1.0, 9.0, math.inf], (3600 // ticks, 7))
+    q = rng.uniform(LOWER, UPPER).round(9)
+    assert_held(limits, q, drive(limits, q, np.repeat(extremes, ticks, axis=0)))
+
+
+@settings(derandomize=True, deadline=None, max_examples=30)
+@given(pieces)
+def test_joints_outside_their_limits_only_move_inwards(wanted: list[tuple[tuple[float, ...], int]]) -> None:
+    inputs = np.array([value for value, count in wanted for _ in range(count)])
+    assert_held(LIMITS, HOME, drive(LIMITS, HOME, inputs))
+
+
+def test_joints_outside_their_limits_come_back_in_when_told_to() -> None:
+    inward = np.array([0.0, 0.5, 0.0, -0.5, 0.0, 0.0, 0.0])
+    run = drive(LIMITS, HOME, np.tile(inward, (300, 1)))
+    assert_held(LIMITS, HOME, run)
+    assert (run.position[-1] >= LOWER).all()
+    assert (run.position[-1] <= UPPER).all()
+
+
+def test_what_is_smooth_and_within_the_limits_passes_unchanged() -> None:
+    times = PERIOD * np.arange(1, 4001)[:, None]
+    start = 1.0 - np.exp(-(times**3))
+    wanted = start * 0.4 * np.sin(1.3 * times + np.arange(7))
+    run = drive(LIMITS, np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), wanted)
+    assert np.abs(run.velocity - wanted).max() < 2e-5
+    assert not any(run.limited)
+
+
+def test_a_step_of_wanted_velocity_is_reached_and_held_exactly() -> None:
+    wanted = np.array([0.4, -0.4, 1.0, 0.3, -1.0, 0.2, 0.7])
+    run = drive(LIMITS, np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), np.tile(wanted, (300, 1)))
+    assert np.abs(run.velocity[200:] - wanted).max() < 1e-12
+    assert np.abs(run.acceleration[200:]).max() < 1e-9
+    assert run.limited[0]
+    assert not run.limited[-1]
+
+
+def test_pushing_against_a_limit_for_long_comes_to_rest_there_without_chatter() -> None:
+    run = drive(LIMITS, np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), np.full((5000, 7), 9.0))
+    assert_held(LIMITS, np.zeros(7), run)
+    assert (run.position[-1] > UPPER - 1e-4).all()
+    assert (np.diff(run.position[2000:], axis=0) >= 0.0).all()
+    assert np.abs(run.jerk[2000:]).max() < 1.0
+    assert all(run.limited)
+
+
+def moving() -> tuple[Vector, Vector, Vector]:
+    """A state in the middle of a motion, well within limits."""
+    run = drive(
+        LIMITS, np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), np.tile([1.0, -1.2, 0.9, 0.6, -1, 1, 0.5], (40, 1))
+    )
+    return run.position[-1], run.velocity[-1], run.acceleration[-1]
+
+
+def test_a_stop_takes_the_shortest_time_that_the_limits_allow() -> None:
+    limiter, start = Limiter(LIMITS, PERIOD), (np.zeros(7), np.full(7, 1.2), np.zeros(7))
+    a, j = np.array(LIMITS.acceleration), np.array(LIMITS.jerk)
+    shortest = np.where(a**2 / j > 1.2, 2 * np.sqrt(1.2 / j), 1.2 / a + a / j)
+    q, dq, ddq = start
+    stopped = np.zeros(7)
+    for tick in range(1, 200):
+        q, dq, ddq, _ = limiter.stop(q, dq, ddq)
+        stopped[(stopped == 0) & (np.abs(dq) < 1e-9) & (np.abs(ddq) < 1e-9)] = tick * PERIOD
+    assert (stopped >= shortest - 1e-9).all()
+    assert (stopped <= shortest + 1.001 * PERIOD).all()
+
+
+def test_a_stop_ends_at_rest_and_stays_there() -> None:
+    limiter, state = Limiter(LIMITS, PERIOD), moving()
+    limited = True
+    for _ in range(300):
+        q, dq, ddq, limited = limiter.stop(*state)
+        state = (q, dq, ddq)
+    assert not limited
+    assert not state[1].any()
+    assert np.array_equal(limiter.stop(*state).position, state[0])
+
+
+def test_a_nan_stops_all_joints() -> None:
+    limiter, state = Limiter(LIMITS, PERIOD), moving()
+    wanted = np.array([0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(300):
+        q, dq, ddq, limited = limiter.step(*state, wanted)
+        state = (q, dq, ddq)
+        assert limited
+    assert np.abs(state[1]).max() < 1e-12
+
+
+def test_it_continues_bit_for_bit_from_a_saved_state() -> None:
+    rng = np.random.default_rng(3)
+    wanted = np.repeat(rng.uniform(-2, 2, (30, 7)), 25, axis=0)
+    through = Limiter(LIMITS, PERIOD)
+    state: tuple[Vector, Vector, Vector] = (REST, REST, REST)
+    for velocity in wanted:
+        q, dq, ddq = (np.array(values.tolist()) for values in state)
+        fresh = Limiter(LIMITS, PERIOD).step(q, dq, ddq, velocity)
+        result = through.step(*state, velocity)
+        for one, other in zip(result[:3], fresh[:3], strict=True):
+            assert one.tobytes() == other.tobytes()
+        assert result.limited == fresh.limited
+        state = result[:3]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300, 1e9])
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_state_that_is_no_state_neither_raises_nor_moves_the_others(bad: float, which: int) -> None:
+    state = [REST.copy(), REST.copy(), REST.copy()]
+    state[which][3] = bad
+    q, dq, ddq = state
+    for result in (Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)), Limiter(LIMITS, PERIOD).stop(q, dq, ddq)):
+        assert result.limited
+        assert not result.velocity.any()
+        assert np.array_equal(result.position, state[0], equal_nan=True)
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(st.tuples(*[st.floats(-1e4, 1e4)] * 21))
+def test_no_finite_state_raises_or_gives_nan(values: tuple[float, ...]) -> None:
+    q, dq, ddq = np.array(values).reshape(3, 7)
+    for result in (Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)), Limiter(LIMITS, PERIOD).stop(q, dq, ddq)):
+        for array in result[:3]:
+            assert np.isfinite(array).all()
+
+
+def test_a_joint_that_comes_too_fast_is_brought_back_into_its_limits() -> None:
+    limiter = Limiter(LIMITS, PERIOD)
+    q, dq, ddq = REST, np.full(7, 2.5), np.full(7, 30.0)
+    for _ in range(600):
+        q, dq, ddq, _ = limiter.step(q, dq, ddq, np.full(7, 0.1))
+    assert np.abs(dq - 0.1).max() < 1e-9
+    assert np.abs(ddq).max() < 1e-6
+
+
+def test_results_are_read_only_and_arguments_are_left_alone() -> None:
+    q = REST.copy()
+    result = Limiter(LIMITS, PERIOD).step(q, REST, REST, np.ones(7))
+    q[0] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        result.velocity[0] = 1.0
+
+
+def test_approaching_a_limit_takes_half_of_the_acceleration() -> None:
+    gain = approach_gain(LIMITS)
+    velocity = np.array(LIMITS.velocity)
+    assert (gain * velocity <= 0.5 * np.array(LIMITS.acceleration) + 1e-12).all()
+    assert (gain**2 * velocity <= 0.25 * np.array(LIMITS.jerk) + 1e-12).all()
+    slow = msgspec.structs.replace(LIMITS, jerk=(1.0,) * 7)
+    assert (approach_gain(slow) ** 2 * velocity <= 0.25 + 1e-12).all()

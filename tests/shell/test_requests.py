@@ -1,0 +1,385 @@
+"""Requests: checked, answered and carried out through the inbox."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from service.client import Client, RefusedError, endpoints, open_session
+from service.config import Files, Settings
+from service.contract import channels, requests
+from service.core.frame import Event
+from service.core.skill import Skill
+from service.learning.skill_file import with_file
+from service.learning.via_points import adapted
+from service.shell.requests import Pending, Requests, SavedViaPoints
+from service.shell.workshop import Workshop
+from sim.scene import Scene
+
+PLACES = Scene().via_points()
+HANDOVER = PLACES[0]
+CELLS = (f"tests/cell{n}" for n in itertools.count())
+
+
+class Bench:
+    """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
+
+    def __init__(self, near: zenoh.Session, far: zenoh.Session, skill: Skill, workshop: Workshop, folder: Path) -> None:
+        (folder / "soldering.npz").write_bytes(skill.file)
+        self.folder = folder
+        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")))
+        self.taken: list[Event] = []
+        self.notes: list[str] = []
+        self.kept: list[bytes] = []
+        self.running = True
+        self._tick = 0
+        self._end = threading.Event()
+        tell = {"status": self.status, "note": self.notes.append, "keep": self.kept.append}
+        self.requests = Requests(near, self.settings, skill, workshop=workshop, skills=folder, **tell)  # type: ignore[arg-type]
+        self._loop = threading.Thread(target=self._drain)
+        self._loop.start()
+        self.session = far
+        self.client = Client(far, self.settings.cell)
+        self.client.wait_until_ready()
+
+    def status(self) -> requests.Status:
+        none = requests.Percentiles()
+        numbers = {
+            "tick": self._tick,
+            "rate_hz": 500.0,
+            "missed": 0,
+            "realtime": False,
+            "rejected": {},
+            "hand_age_ms": {},
+            "scribe": {},
+        }
+        words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}
+        lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
+        return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
+
+    def _drain(self) -> None:
+        while not self._end.wait(0.0005):
+            self._tick += 1
+            while self.running and self.requests.inbox:
+                event = self.requests.inbox.popleft().taken(self._tick)
+                self.taken += [event] if event else []
+
+    def refusal(self, suffix: str, request: Any) -> str:
+        """The words in which a request is refused; bytes are sent as they are."""
+        before = len(self.taken), self.names(), self.place_bytes()
+        payload = request if isinstance(request, bytes) else requests.encode_json(request)
+        replies = list(self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0))
+        assert len(replies) == 1
+        assert replies[0].err is not None
+        assert (len(self.taken), self.names(), self.place_bytes()) == before
+        return replies[0].err.payload.to_string()
+
+    def names(self) -> list[str]:
+        """The places in force."""
+        return [point["name"] for point in self.client.ask("via_points", {"op": "list"})["points"]]
+
+    def place_bytes(self) -> bytes:
+        file = SavedViaPoints(self.settings).path
+        return file.read_bytes() if file.exists() else b""
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.taken]
+
+    def close(self) -> None:
+        if not self._end.is_set():
+            self.requests.close()
+            self._end.set()
+            self._loop.join()
+
+
+@pytest.fixture(scope="module")
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """A listening session and one connected to it."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as near, open_session(connect=endpoints(near)) as far:
+        yield near, far
+
+
+@pytest.fixture(scope="module")
+def workshop() -> Iterator[Workshop]:
+    running = Workshop()
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def opened(
+    sessions: tuple[zenoh.Session, zenoh.Session], skill: Skill, tmp_path: Path
+) -> Iterator[Callable[[Workshop], Bench]]:
+    """Opens a bench; closes it."""
+    with contextlib.ExitStack() as closing:
+        yield lambda workshop: closing.enter_context(contextlib.closing(Bench(*sessions, skill, workshop, tmp_path)))
+
+
+@pytest.fixture
+def bench(opened: Callable[[Workshop], Bench], workshop: Workshop) -> Bench:
+    return opened(workshop)
+
+
+@pytest.fixture(scope="module")
+def taught_bench(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+    workshop: Workshop,
+    skill: Skill,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Bench]:
+    """A bench with three places taught, for requests that change nothing."""
+    with contextlib.closing(Bench(*sessions, skill, workshop, tmp_path_factory.mktemp("cell"))) as bench:
+        bench.client.add(PLACES)
+        yield bench
+
+
+def point(**change: Any) -> dict[str, Any]:
+    """A place as a client writes it; None leaves a field out."""
+    whole = {"name": "a", "left": HANDOVER.left, "right": HANDOVER.right, "tool": HANDOVER.tool} | change
+    return {name: value for name, value in whole.items() if value is not None}
+
+
+def add(*points: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"op": "add", "points": points, **more}
+
+
+@pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
+def test_a_plain_request_is_answered_with_the_tick_that_took_it(bench: Bench, suffix: str) -> None:
+    first, second = bench.client.ask(suffix), bench.client.ask(suffix, {})
+    assert 0 < first["tick"] < second["tick"]
+    assert bench.kinds() == [suffix, suffix]
+
+
+def test_an_empty_payload_is_an_empty_request(bench: Bench) -> None:
+    (reply,) = bench.session.get(channels.key(bench.settings.cell, "hold"), timeout=10.0)
+    assert reply.ok is not None
+    assert bench.kinds() == ["hold"]
+
+
+def test_places_are_added_listed_replaced_removed_and_cleared(bench: Bench) -> None:
+    assert bench.client.ask("via_points", {"op": "list"})["points"] == []
+    reply = bench.client.add(PLACES)
+    assert [taught["name"] for taught in reply["points"]] == ["handover", "glass", "soldering"]
+    assert all(taught["missed_by_m"] < 0.003 for taught in reply["points"])
+    assert bench.client.ask("via_points", {"op": "list"})["points"] == reply["points"]
+
+    moved = bench.client.ask("via_points", add(point(name="glass", tool=[0.5, 0.1, 0.3])))
+    assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
+    assert len(moved["points"]) == 3
+
+    assert [
+        taught["name"] for taught in bench.client.ask("via_points", {"op": "remove", "names": ["glass"]})["points"]
+    ] == ["handover", "soldering"]
+    assert bench.client.ask("via_points", {"op": "clear"})["points"] == []
+    assert bench.kinds() == ["skill"] * 4
+    assert bench.taken[0].value.via_points == PLACES
+
+
+def test_what_the_loop_adopts_is_what_a_recording_keeps(bench: Bench, skill: Skill) -> None:
+    bench.client.add(PLACES, tolerance=0.04)
+    (event,) = bench.taken
+    assert event.payload == bench.kept[0] == adapted(skill, PLACES, tolerance=0.04).file
+
+
+@pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
+def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
+    bench: Bench, skill: Skill, name: str
+) -> None:
+    bench.client.add(PLACES)
+    assert len(bench.client.ask("skill", {"name": name})["points"]) == len(PLACES)
+    other = with_file(replace(skill, learned_from="other demonstrations"))
+    (bench.folder / "other.npz").write_bytes(other.file)
+    assert bench.client.ask("skill", {"name": "other"})["points"] == []
+    assert bench.taken[-1].value.digest == other.digest
+    assert bench.names() == []
+
+
+def test_what_is_taught_is_in_force_again_after_a_restart(bench: Bench, skill: Skill) -> None:
+    bench.client.add(PLACES[:2], tolerance=0.04)
+    assert SavedViaPoints(bench.settings).read(skill) == (PLACES[:2], 0.04)
+    bench.client.ask("via_points", {"op": "clear"})
+    restored = SavedViaPoints(bench.settings).read(skill)
+    assert restored is not None
+    assert restored[0] == ()
+
+
+class SlowWorkshop(Workshop):
+    """A workshop in this process that adapts when it is let."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.let = threading.Event(), threading.Event()
+
+    def adapt(self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float) -> Skill:
+        self.begun.set()
+        assert self.let.wait(20)
+        return adapted(skill, places, tolerance=tolerance)
+
+
+def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[Workshop], Bench]) -> None:
+    slow = SlowWorkshop()
+    bench = opened(slow)
+    with ThreadPoolExecutor(1) as pool:
+        teaching = pool.submit(bench.client.add, PLACES)
+        assert slow.begun.wait(10)
+        held = bench.client.ask("hold")
+        assert bench.kinds() == ["hold"]
+        assert bench.client.ask("status")["cell"] == bench.settings.cell
+        slow.let.set()
+        taught = teaching.result(20)
+    assert bench.kinds() == ["hold", "skill"]
+    assert held["tick"] < taught["tick"]
+
+
+def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Workshop], Bench]) -> None:
+    slow = SlowWorkshop()
+    bench = opened(slow)
+    with ThreadPoolExecutor(2) as pool:
+        teaching = pool.submit(bench.client.add, PLACES)
+        assert slow.begun.wait(10)
+        closing = pool.submit(bench.close)
+        slow.let.set()
+        assert teaching.result(20)["points"]
+        closing.result(20)
+
+
+def test_a_loop_that_does_not_take_a_request_is_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
+    bench.running = False
+    with pytest.raises(RefusedError, match="the control loop did not take the request: it is ending or stalled"):
+        bench.client.ask("hold")
+
+
+def test_a_skill_that_was_given_up_is_not_adopted_later(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
+    bench.running = False
+    with pytest.raises(RefusedError):
+        bench.client.add(PLACES)
+    monkeypatch.undo()
+    bench.running = True
+    bench.client.ask("hold")  # taken after whatever else waits
+    assert bench.kinds() == ["hold"]
+    assert bench.names() == []
+
+
+def test_places_that_cannot_be_saved_are_not_taught(bench: Bench) -> None:
+    (bench.folder / "state").write_text("a file where a folder is needed")
+    with pytest.raises(RefusedError, match="via-points"):
+        bench.client.add(PLACES)
+    assert bench.kinds() == []
+    assert bench.names() == []
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (add(point(left=[1.0, 2.0])), "$.points[0].left: 2 numbers, 3 needed"),
+        (add(point(), point(name="b", tool=[0.1] * 4)), "$.points[1].tool: 4 numbers, 3 needed"),
+        (add(point(left=[0.1, "x", 0.3])), "$.points[0].left[1]: 'x' given; -10 to 10 m accepted"),
+        (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
+        (add(point(left="here")), "$.points[0].left: 'here' given; 3 numbers needed"),
+        (add(point(right=None)), "$.points[0]: field `right` is missing"),
+        (
+            add(point(nam="b")),
+            "$.points[0]: unknown field 'nam'; known are name, left, right, tool, std, radius, follow",
+        ),
+        (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
+        (add(point(name="a/b")), "$.points[0].name: "),
+        (add(point(name="x" * 65)), "$.points[0].name: '"),
+        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-06 to 1 accepted"),
+        (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
+        (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
+        (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
+        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's box, ("),
+        (
+            add(point(tool=[0.2, 0.0, 0.3])),
+            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach, 0.35 to 0.88 m from the shoulder",
+        ),
+        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach"),
+        (add(), "$.points: none given, 1 to 100 needed"),
+        (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
+        (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
+        ({"op": "add"}, "$: field `points` is missing"),
+        (
+            {"op": "remove", "names": ["nothing"]},
+            "$.names[0]: no via-point 'nothing'. There are: handover, glass, soldering",
+        ),
+        (
+            {"op": "remove", "names": ["glass", "nothing"]},
+            "$.names[1]: no via-point 'nothing'. There are: handover, glass, soldering",
+        ),
+        ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
+        ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),
+        ({"op": "lst"}, "$.op: 'lst' given; add, remove, clear, list accepted"),
+        ({}, "$: field `op` is missing"),
+        ([], "$: [] given; an object with its fields needed"),
+        (b'{"op":', "not JSON: Input data was truncated"),
+        (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
+        (b"\xff\xfe", "not JSON: JSON is malformed"),
+        (b"[" * 100_000, "not JSON: maximum recursion depth"),
+        (b" " * 20_000_000, "a request of 20000000 bytes, at most 262144 accepted"),
+    ],
+    ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
+)
+def test_a_request_for_places_is_refused_whole_and_with_a_reason(
+    taught_bench: Bench, request_: Any, message: str
+) -> None:
+    assert taught_bench.refusal("via_points", request_).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder. There are: soldering"),
+        ({"name": "../soldering"}, "$.name: "),
+        ({"name": "/etc/passwd"}, "$.name: "),
+        ({"name": ".."}, "$.name: "),
+        ({"name": ".npz"}, "$.name: "),
+        ({"name": "a/b"}, "$.name: "),
+        ({"name": ""}, "$.name: "),
+        ({"name": "x" * 129}, "$.name: "),
+        ({"name": 3}, "$.name: 3 given; 1 to 64 letters"),
+        ({}, "$: field `name` is missing"),
+    ],
+)
+def test_a_request_for_a_skill_is_refused_whole_and_with_a_reason(
+    taught_bench: Bench, request_: Any, message: str
+) -> None:
+    assert taught_bench.refusal("skill", request_).startswith(message)
+
+
+@pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"now": True}, "$: unknown field 'now'; known are none"),
+        (None, "$: None given; an object with its fields needed"),
+        (b"hold!", "not JSON: JSON is malformed"),
+    ],
+)
+def test_a_plain_request_with_something_in_it_is_refused(
+    taught_bench: Bench, suffix: str, request_: Any, message: str
+) -> None:
+    assert taught_bench.refusal(suffix, request_).startswith(message)
+
+
+def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_bench: Bench) -> None:
+    (taught_bench.folder / "broken.npz").write_bytes(b"nothing")
+    assert "broken.npz: not a skill" in taught_bench.refusal("skill", {"name": "broken"})
+    (taught_bench.folder / "broken.npz").unlink()
+
+
+def test_a_pending_event_tells_the_tick_that_took_it() -> None:
+    event = Event("hold", b"", None)
+    pending = Pending(event)
+    assert pending.taken(42) is event
+    assert pending.wait() == 42

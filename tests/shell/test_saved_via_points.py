@@ -1,0 +1,80 @@
+"""Saved via-points: what was taught survives a restart, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from service.config import Files, Settings
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError
+from service.learning.via_points import adapted
+from service.shell.saved_via_points import SavedViaPoints
+from sim.scene import Scene
+
+POINTS = Scene().via_points()
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> SavedViaPoints:
+    return SavedViaPoints(Settings(cell="lab/bench2", files=Files(state=str(tmp_path))))
+
+
+def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
+    assert saved.read(skill) is None
+    saved.write(adapted(skill, POINTS, tolerance=0.03))
+    assert saved.read(skill) == (POINTS, 0.03)
+    saved.write(skill)
+    assert saved.read(skill) == ((), skill.tolerance)
+
+
+def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.write(adapted(skill, POINTS, tolerance=0.03))
+    assert saved.read(replace(skill, learned_from="other demonstrations")) is None
+
+
+def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
+    for count in (1, 2, 3):
+        saved.write(adapted(skill, POINTS[:count], tolerance=0.03))
+        assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
+        assert len(json.loads(saved.path.read_text())["request"]["points"]) == count
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.write(adapted(skill, POINTS[:1], tolerance=0.03))
+    before = saved.path.read_bytes()
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        saved.write(replace(skill, name=3j))  # type: ignore[arg-type]
+    assert saved.path.read_bytes() == before
+    assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"3",
+        b"\xff\xff",
+        b"{}",
+        b'{"learned_from": "x"}',
+        b'{"learned_from": "x", "request": 3}',
+        b'{"request": {"points": 1}}',
+    ],
+)
+def test_a_damaged_file_is_told_with_what_to_do(saved: SavedViaPoints, skill: Skill, content: bytes) -> None:
+    saved.path.parent.mkdir(parents=True)
+    saved.path.write_bytes(content)
+    with pytest.raises(SkillError, match=r"does not hold via-points") as caught:
+        saved.read(skill)
+    assert str(saved.path) in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.path.mkdir(parents=True)
+    with pytest.raises(SkillError, match=r"cannot read via-points .*: Is a directory"):
+        saved.read(skill)

@@ -1,0 +1,140 @@
+"""The workshop: skills made by another process, the same to the bit as if made here, and errors
+that come back with their words.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests_paths import RECORDINGS
+
+from service.contract.requests import ViaPoint
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError
+from service.learning.via_points import adapted, adopted
+from service.shell.workshop import Workshop
+from sim.scene import Scene
+
+PLACES = Scene().via_points()
+SOLDERING = RECORDINGS / "soldering.npz"
+
+
+@pytest.fixture(scope="module")
+def workshop() -> Iterator[Workshop]:
+    """A workshop whose process is closed in the end."""
+    running = Workshop()
+    yield running
+    running.close()
+
+
+def child_of(workshop: Workshop) -> int:
+    """The process id of its child."""
+    assert workshop._child is not None
+    return workshop._child.process.pid
+
+
+def is_there(pid: int) -> bool:
+    """Whether a process exists, be it as a zombie."""
+    return Path(f"/proc/{pid}").exists()
+
+
+def assert_same_bits(one: Skill, other: Skill) -> None:
+    random = np.random.default_rng(0)
+    hands, velocities, accelerations = (random.normal((0.8, 0.0, 0.2), 0.1, (2, 3)) for _ in range(3))
+    assert one.digest == other.digest
+    assert one.file == other.file
+    for a, b in zip(
+        one.predict(hands, velocities, accelerations), other.predict(hands, velocities, accelerations), strict=True
+    ):
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+def test_a_skill_is_loaded_as_it_stands_in_its_file(workshop: Workshop, skill: Skill) -> None:
+    assert_same_bits(workshop.load(SOLDERING), skill)
+
+
+def test_a_skill_is_loaded_with_the_places_taught_to_it(workshop: Workshop, skill: Skill) -> None:
+    assert_same_bits(workshop.load(SOLDERING, PLACES, tolerance=0.04), adapted(skill, PLACES, tolerance=0.04))
+
+
+@pytest.mark.parametrize("count", [3, 1, 0])
+def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
+    workshop: Workshop, skill: Skill, count: int
+) -> None:
+    there = workshop.adapt(skill, PLACES[:count], tolerance=0.05)
+    assert_same_bits(there, adapted(skill, PLACES[:count], tolerance=0.05))
+    assert there.via_points == PLACES[:count]
+    assert adopted(there) == adopted(adapted(skill, PLACES[:count], tolerance=0.05))
+
+
+def test_a_skill_that_came_back_is_adapted_again(workshop: Workshop, skill: Skill) -> None:
+    once = workshop.adapt(skill, PLACES, tolerance=0.05)
+    assert_same_bits(workshop.adapt(once, PLACES[1:], tolerance=0.05), adapted(skill, PLACES[1:], tolerance=0.05))
+
+
+def test_arrays_that_came_back_cannot_be_changed(workshop: Workshop, skill: Skill) -> None:
+    there = workshop.adapt(skill, PLACES, tolerance=0.05)
+    with pytest.raises(ValueError, match="read-only"):
+        there.primitive.inputs[0, 0] = 1.0
+
+
+def test_errors_come_back_with_their_words(workshop: Workshop, skill: Skill, tmp_path: Path) -> None:
+    with pytest.raises(SkillError, match=r"cannot adapt to \['handover'\]: tolerance is -1"):
+        workshop.adapt(skill, PLACES[:1], tolerance=-1.0)
+    with pytest.raises(SkillError, match=r"cannot read skill .*nowhere\.npz: No such file"):
+        workshop.load(tmp_path / "nowhere.npz")
+    with pytest.raises(SkillError, match=r"cannot read skill .*: Is a directory"):
+        workshop.load(tmp_path)
+    (tmp_path / "broken.npz").write_bytes(SOLDERING.read_bytes()[:5000])
+    with pytest.raises(SkillError, match=r"broken\.npz: not a skill"):
+        workshop.load(tmp_path / "broken.npz")
+
+
+def test_an_error_does_not_end_the_process(workshop: Workshop, skill: Skill, tmp_path: Path) -> None:
+    workshop.load(SOLDERING)
+    child = child_of(workshop)
+    with pytest.raises(SkillError):
+        workshop.load(tmp_path / "nowhere.npz")
+    assert_same_bits(workshop.load(SOLDERING), skill)
+    assert child_of(workshop) == child
+
+
+def test_a_killed_process_is_replaced_at_the_next_request(workshop: Workshop, skill: Skill) -> None:
+    workshop.load(SOLDERING)
+    child = child_of(workshop)
+    os.kill(child, signal.SIGKILL)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)  # until it is dead; the workshop finds that out itself
+    assert_same_bits(workshop.load(SOLDERING), skill)
+    assert child_of(workshop) != child
+    assert not is_there(child)
+
+
+def test_askers_in_several_threads_get_their_own_answers(workshop: Workshop, skill: Skill) -> None:
+    def taught(place: ViaPoint) -> tuple[ViaPoint, ...]:
+        return workshop.adapt(skill, [place], tolerance=0.05).via_points
+
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(taught, PLACES)) == [(place,) for place in PLACES]
+
+
+def test_closing_leaves_no_process_and_may_be_repeated(skill: Skill) -> None:
+    workshop = Workshop()
+    workshop.close()
+    assert_same_bits(workshop.load(SOLDERING), skill)
+    child = child_of(workshop)
+    workshop.close()
+    workshop.close()
+    assert not is_there(child)
+
+
+def test_a_skill_outlives_the_workshop_that_made_it(skill: Skill) -> None:
+    workshop = Workshop()
+    made = workshop.adapt(skill, PLACES, tolerance=0.05)
+    workshop.close()
+    assert_same_bits(made, adapted(skill, PLACES, tolerance=0.05))

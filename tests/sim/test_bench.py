@@ -1,0 +1,326 @@
+"""The bench: physics that follow commands, a task that succeeds only when the tool is where it must
+be, and its channels on the network.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+import zenoh
+from wam import JOINT_NAMES
+
+from service.client import endpoints, open_session
+from service.config import WAM
+from service.contract import cdr, channels, messages
+from sim.bench import Bench, Observation
+from sim.network import Commands, Dropout, Live, RunReport, run
+from sim.scene import Scene
+from sim.script import HandScript, Teacher
+
+SCENE = Scene()
+STILL = (0.0,) * 7
+
+
+class Follower:
+    """Joint commands that bring the tool plate to a point: one damped least-squares step a tick,
+    posture in the null space.
+    """
+
+    def __init__(self, joints: tuple[float, ...]) -> None:
+        self.model = pin.buildModelFromUrdf(str(WAM))
+        self.data = self.model.createData()
+        self.frame = self.model.getFrameId("tool_plate")
+        self.joints = np.array(joints)
+        self.posture = self.joints.copy()
+
+    def command(self, point: npt.ArrayLike) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        jacobian = pin.computeFrameJacobian(self.model, self.data, self.joints, self.frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        pin.framesForwardKinematics(self.model, self.data, self.joints)
+        error = np.subtract(point, self.data.oMf[self.frame].translation)
+        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + 1e-4 * np.eye(3))
+        velocity = inverse @ (30.0 * error) + (np.eye(7) - inverse @ jacobian) @ (self.posture - self.joints)
+        velocity = np.clip(velocity, -1.5, 1.5)
+        self.joints = self.joints + 0.002 * velocity
+        return tuple(self.joints.tolist()), tuple(velocity.tolist())
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with Bench(HandScript(SCENE, seed=1)) as built:
+        yield built
+
+
+def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[Observation]:
+    """A whole run in which the tool goes as it was taught, but `aside` [m] of it."""
+    follower, teacher = Follower(bench.observe().joints), Teacher(SCENE, seed=1, clock=bench.script.clock)
+    for _ in range(750):
+        bench.step(*follower.command(teacher.truth(0.0).position))
+    bench.begin()
+    seen = []
+    while not bench.finished:
+        seen.append(bench.step(*follower.command(teacher.truth(bench.time_s).position + aside)))
+    return seen
+
+
+def test_a_tool_that_goes_as_taught_does_the_task(bench: Bench) -> None:
+    play(bench)
+    events = bench.events()
+    assert events.success
+    assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 30.0
+    assert [round(event.time_s, 1) for event in (events.handover, events.grasp, events.carry)] == [3.0, 6.9, 10.3]
+    world = bench.world
+    assert np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.08
+    assert np.linalg.norm(np.subtract(world.pose(world.glass).position, SCENE.carry)) < 0.06
+    assert np.linalg.norm(np.subtract(world.pose(world.iron).position, SCENE.right_final)) < 0.06
+
+
+def test_a_tool_that_passes_six_centimetres_above_misses_every_event(bench: Bench) -> None:
+    play(bench, aside=(0.0, 0.0, 0.06))
+    events = bench.events()
+    assert not any(event.reached for event in (events.handover, events.grasp, events.carry))
+    assert events.handover.error_mm == pytest.approx(60.0, abs=20.0)
+    world = bench.world
+    assert world.pose(world.glass).position == pytest.approx(SCENE.glass)
+
+
+def test_two_runs_with_the_same_commands_are_identical() -> None:
+    traces = []
+    for _ in range(2):
+        with Bench(HandScript(SCENE, seed=2)) as bench:
+            traces.append([(seen.joints, seen.tool) for seen in play(bench)[::50]])
+    assert traces[0] == traces[1]
+
+
+def test_the_arm_follows_moving_commands_within_a_millimetre(bench: Bench) -> None:
+    start, wrong = np.array(bench.observe().joints), []
+    for tick in range(1000):
+        t = 0.002 * tick
+        position, velocity = start + 0.2 * (1 - np.cos(2 * t)), np.full(7, 0.4 * np.sin(2 * t))
+        seen = bench.step(tuple(position), tuple(velocity))
+        # Velocity fed forward: a command is where the arm starts the period, and it ends it one
+        # period on.
+        wrong.append(np.abs(np.array(seen.joints) - position - 0.002 * velocity).max())
+    assert max(wrong) < 1e-4  # [rad]
+
+
+def test_the_arm_holds_its_posture_until_the_first_command(bench: Bench) -> None:
+    start = bench.observe().joints
+    for _ in range(200):
+        seen = bench.step()
+    assert seen.joints == pytest.approx(start, abs=1e-3)
+
+
+def test_the_arm_brakes_twenty_milliseconds_after_the_last_command(bench: Bench) -> None:
+    joints = np.array(bench.observe().joints)
+    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
+    for _ in range(100):
+        joints = joints + 0.002 * speed
+        bench.step(tuple(joints), tuple(speed))
+    for _ in range(9):
+        bench.step()
+    assert bench.observe().joint_velocities[0] == pytest.approx(0.8, abs=0.01)
+    for _ in range(20):
+        seen = bench.step()
+    assert np.abs(seen.joint_velocities).max() < 0.02
+    assert seen.joints[0] - joints[0] < 0.8 * 0.025
+
+
+def test_hands_rest_at_their_start_until_the_script_begins_and_come_back_the_way_they_went() -> None:
+    with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench:
+        start = bench.observe().hands.left.position
+        for _ in range(20):
+            np.testing.assert_array_equal(bench.step().hands.left.position, start)
+        bench.begin()
+        forth = []
+        while not bench.finished:
+            forth.append(bench.step().hands.left.position)
+        bench.turn_back()
+        steps = 0
+        while not bench.back:
+            seen, steps = bench.step(), steps + 1
+            assert min(np.linalg.norm(np.subtract(seen.hands.left.position, was)) for was in (start, *forth)) < 1e-9
+        np.testing.assert_array_equal(seen.hands.left.position, start)
+        assert steps == np.ceil(bench.script.duration_s / 0.002)
+
+
+def test_clearance_tells_how_near_the_arm_is_to_a_hand(bench: Bench) -> None:
+    tool, hand = bench.observe().tool.position, SCENE.left_start
+    assert 0.2 < bench.world.clearance(bench.world.left) < np.linalg.norm(np.subtract(tool, hand))
+
+
+# --- on the network ------------------------------------------------------------------------------
+
+
+class Service:
+    """Stands in for the daemon: holds the arm where it is, answering each hand sample at once."""
+
+    def __init__(self, session: zenoh.Session, cell: str) -> None:
+        self.hands: dict[str, list[messages.PoseStamped]] = {"left": [], "right": []}
+        self.joints: messages.JointState | None = None
+        self._command = session.declare_publisher(channels.key(cell, "joints/command"))
+        self._subscribers = [
+            session.declare_subscriber(channels.key(cell, "joints/state"), self.state),
+            session.declare_subscriber(channels.key(cell, "hands/*"), self.hand),
+        ]
+
+    def state(self, sample: zenoh.Sample) -> None:
+        self.joints = self.joints or cdr.decode_joints(sample.payload.to_bytes())
+
+    def hand(self, sample: zenoh.Sample) -> None:
+        pose = cdr.decode_pose(sample.payload.to_bytes())
+        self.hands[str(sample.key_expr).rpartition("/")[2]].append(pose)
+        if self.joints is not None:
+            command = messages.JointState(pose.stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL)
+            attachment = messages.Attachment(len(self.hands["left"]), time.time_ns(), pose.stamp_ns)
+            self._command.put(cdr.encode_joints(command), attachment=cdr.encode_attachment(attachment))
+
+
+@pytest.fixture
+def network() -> Iterator[tuple[zenoh.Session, str]]:
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        yield session, endpoints(session)[0]
+
+
+def test_a_run_on_the_network_reports_events_and_latency_and_leaves_a_hidden_hand_out(
+    network: tuple[zenoh.Session, str],
+) -> None:
+    listening, endpoint = network
+    service = Service(listening, "lab/bench")
+    reports: list[RunReport] = []
+    lines: list[str] = []
+    live = Live(cell="lab/bench", once=True, wait_s=10.0, dropout=Dropout(start_s=0.2, lasts_s=0.2, hand="right"))
+    with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench, open_session(connect=[endpoint]) as session:
+        run(bench, session, live, stop=threading.Event(), report=reports.append, say=lines.append)
+    (report,) = reports
+    assert not report.success
+    assert report.scene == SCENE
+    assert service.joints is not None
+    assert service.joints.names == JOINT_NAMES
+    assert {pose.frame for pose in service.hands["left"]} == {"base"}
+    assert 0 < report.answered <= report.hands
+    assert report.commands > report.hands  # one for each hand
+    assert 0.0 < report.latency_ms.p50 <= report.latency_ms.p99 <= report.latency_ms.max
+    assert [line.split(":")[0] for line in lines[-3:]] == ["handover", "grasp", "carry"]
+    left, right = ({pose.stamp_ns for pose in service.hands[hand]} for hand in ("left", "right"))
+    assert 15 <= len(left - right) <= 25
+
+
+def test_the_bench_says_so_when_no_command_comes(network: tuple[zenoh.Session, str]) -> None:
+    result = sim("--connect", network[1], "--once", "--wait", "0.2")
+    assert result.returncode == 1
+    assert "no command on thirdhand/joints/command within 0.2 s" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
+    network: tuple[zenoh.Session, str], tmp_path: Path
+) -> None:
+    service = Service(network[0], "thirdhand")
+    target = tmp_path / "report.json"
+    command = [
+        sys.executable,
+        "-m",
+        "sim",
+        "--connect",
+        network[1],
+        "--json",
+        str(target),
+        "--speed",
+        "20",
+        "--seed",
+        "5",
+    ]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1]
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "the hands go back" in line:
+                process.send_signal(signal.SIGTERM)
+                break
+        rest = process.stderr.read()
+        assert process.wait(timeout=10) == 0, rest
+    assert service.hands["left"]
+    (line,) = target.read_text().splitlines()
+    report = json.loads(line)
+    assert report["seed"] == 5
+    assert set(report["events"]) == {"handover", "grasp", "carry"}
+    assert set(report["events"]["carry"]) == {"reached", "error_mm", "time_s"}
+    assert set(report["latency_ms"]) == {"p50", "p99", "max"}
+
+
+def test_bad_usage_and_bad_scenes_have_their_exit_codes(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text("glass = [0.5, 0.38, 0.5]")
+    usage = sim("--once", "--hands-rate", "7")
+    assert usage.returncode == 2
+    assert "30 to 500 accepted" in usage.stderr
+    bad = sim("--connect", "tcp/127.0.0.1:1", "--scene", str(tmp_path / "scene.toml"))
+    assert bad.returncode == 1
+    assert "34.0 cm" in bad.stderr
+    assert "example:" in sim("--help").stdout
+
+
+def sim(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-m", "sim", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+        cwd=Path(__file__).parents[1],
+        env={**os.environ},
+    )
+
+
+class _Bytes:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+
+class _Sample:
+    def __init__(self, payload: bytes, attachment: bytes | None = None) -> None:
+        self.payload = _Bytes(payload)
+        self.attachment = None if attachment is None else _Bytes(attachment)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x00\x01\x00\x00garbage",
+        cdr.encode_joints(messages.JointState(1, ("somebody/else",) * 7, STILL, STILL)),
+        cdr.encode_joints(messages.JointState(1, JOINT_NAMES, (float("nan"),) * 7, STILL)),
+    ],
+)
+def test_a_command_that_is_none_is_counted_and_never_followed(payload: bytes) -> None:
+    commands = Commands(JOINT_NAMES)
+    commands.receive(_Sample(payload))  # type: ignore[arg-type]
+    assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))
+    assert commands.last_error
+
+
+def test_only_the_first_answer_to_each_hand_sample_tells_of_latency() -> None:
+    commands = Commands(JOINT_NAMES)
+    payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
+    now = time.time_ns()
+    for stamp in (now - 10**10, now, now, now + 1, now, now + 1):  # the first is older than the counting
+        commands.receive(_Sample(payload, cdr.encode_attachment(messages.Attachment(1, 0, stamp))))  # type: ignore[arg-type]
+    assert commands.count == 6
+    assert len(commands.latencies_ms) == 2
+    assert commands.take() == (STILL, STILL)
+    assert commands.take() == (None, None)

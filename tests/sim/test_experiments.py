@@ -1,0 +1,177 @@
+"""Each experiment at a reduced size makes its figures, numbers and recording, and the numbers bear
+out what it claims.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
+pytest.importorskip(
+    "movement_primitives", reason="ProMPs need movement_primitives: pip install 'thirdhand[experiments]'"
+)
+
+from kmp import GaussianMixture
+from sim.experiments import rivals
+from sim.experiments.__main__ import ABOUT, main
+from sim.experiments.rehearsal import demonstrated
+from sim.experiments.results import ExperimentError
+from sim.experiments.scenes import draw
+from sim.experiments.statistics import wilson
+from sim.experiments.writing import recorded, write
+from sim.scene import MOST_MOVED, Scene
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def letters(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of letters as others record them."""
+    folder = tmp_path_factory.mktemp("letters")
+    for name in "DG":
+        np.savez(
+            folder / f"{name}.npz", **{f"demo{k:02d}": one[::2] for k, one in enumerate(write(name, count=6, seed=9))}
+        )
+    return folder
+
+
+@pytest.fixture
+def close_figures() -> Iterator[None]:
+    from matplotlib import pyplot as plt
+
+    yield
+    plt.close("all")
+
+
+def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
+    """The JSON of an experiment at a tenth of its size, once its files are there."""
+    assert main([name, "--output", str(folder), "--share", "0.1", "--workers", "1", "--quiet", *more]) == 0
+    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text())
+    assert found["figures"]
+    for figure in found["figures"]:
+        assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
+    return found
+
+
+@pytest.mark.usefixtures("close_figures")
+class TestExperiments:
+    """One test each."""
+
+    def test_letters_go_through_their_desired_points_and_stay_as_they_were_elsewhere(
+        self, tmp_path: Path, letters: Path
+    ) -> None:
+        found = numbers("letters", tmp_path, "--letters", str(letters))
+        for summary in (found["model_summary"], found["recorded_summary"]):
+            assert summary["largest_miss_at_desired_points_cm"] < 0.01
+            assert summary["rms_deviation_elsewhere_cm"] < 1.0
+        assert (tmp_path / "letters.rrd").stat().st_size > 1000
+
+    def test_promp_meets_them_too_and_its_basis_functions_explode(self, tmp_path: Path) -> None:
+        found = numbers("promp", tmp_path)
+        assert found["model_summary"]["promp"]["largest_miss_cm"] < 0.01
+        assert found["model_summary"]["promp_without_ridge"]["largest_miss_cm"] > 0.1
+        at_six = {one["method"]: one for one in found["dimensions"] if one["inputs"] == 6}
+        assert at_six["KMP"]["functions"] == 200
+        assert at_six["ProMP, 10 per input"]["functions"] == 10**6
+        assert at_six["ProMP, 10 per input"]["error"] is None
+
+    def test_learned_correlations_lower_the_cost_and_keep_the_via_point(self, tmp_path: Path) -> None:
+        found = numbers("correlation", tmp_path)
+        assert found["cost_at_last_rad"]["mean"] < found["cost_at_first_rad"]
+        assert found["largest_miss_of_the_via_point_cm"] < 0.01
+
+    def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
+        assert numbers("hands", tmp_path)["figures"] == ["hands-stages.png", "hands.png"]
+
+    def test_statistics_compare_five_methods_in_the_same_scenes(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("sim.experiments.statistics.SCENES", 10)
+        monkeypatch.setattr("sim.experiments.statistics.OURS_HZ", 250)
+        found = numbers("statistics", tmp_path)
+        assert list(found["methods"]) == ["ours", "gaussian_process", "paper", "promp", "gmr"]
+        assert found["methods"]["ours"]["successes"] == found["scenes"] == 1
+        assert found["methods"]["gmr"]["successes"] == 0
+
+    def test_hands_that_go_back_take_the_robot_back(self, tmp_path: Path) -> None:
+        found = numbers("phase", tmp_path)
+        assert found["ours"]["back_against_forth_rms_mm"] < 10
+        assert found["promp"]["back_against_forth_rms_mm"] > 100
+        assert found["ours"]["success"]
+
+    def test_few_demonstrations_are_enough_where_the_places_are_taught(self, tmp_path: Path) -> None:
+        assert numbers("demonstrations", tmp_path)["by_count"]["1"]["success_percent"] > 95
+
+    def test_the_tool_turns_to_the_eyes_over_the_board(self, tmp_path: Path) -> None:
+        found = numbers("orientation", tmp_path)
+        assert found["scenes"]["nominal"]["from_the_eyes_in_the_last_second_deg"] < 5
+        assert found["scenes"]["nominal"]["success"]
+        assert found["nominal_with_a_constant_orientation"]["from_the_eyes_in_the_last_second_deg"] > 30
+
+
+def test_every_experiment_has_a_test() -> None:
+    assert set(ABOUT) == {
+        "letters",
+        "promp",
+        "correlation",
+        "hands",
+        "statistics",
+        "phase",
+        "demonstrations",
+        "orientation",
+    }
+
+
+@pytest.mark.parametrize("number", range(100))
+def test_random_scenes_are_within_reach_and_end(number: int) -> None:
+    drawn, nominal = draw(number), Scene()
+    for name in ("handover", "glass", "soldering"):
+        place = getattr(drawn.scene, name)
+        assert np.linalg.norm(np.subtract(place, getattr(nominal, name))) <= MOST_MOVED
+        assert place[2] >= 0.05
+    script = drawn.script()
+    progress = [script.clock.at(t)[0] for t in np.arange(0, script.duration_s, 0.05)]
+    assert min(progress) > -0.05  # before the start the hands rest
+    assert script.clock.at(script.duration_s)[0] == pytest.approx(drawn.scene.duration_s, abs=1e-6)
+    assert max(progress) <= drawn.scene.duration_s + 1e-6
+
+
+def test_the_fast_regression_of_the_rival_is_that_of_the_library() -> None:
+    samples = rivals._samples(demonstrated(2))[::10]
+    mixture = GaussianMixture.fit(samples, components=5, seed=0)
+    np.testing.assert_allclose(
+        rivals._regression(mixture)(samples[:, :6]), mixture.regress(samples[:, :6]).mean, atol=1e-12
+    )
+
+
+def test_the_interval_of_a_rate_is_wilsons() -> None:
+    assert wilson(98, 100) == pytest.approx((0.9300, 0.9945), abs=1e-4)  # as in Newcombe 1998, method 3
+    assert wilson(100, 100)[1] == pytest.approx(1.0)
+
+
+def test_written_letters_are_the_same_for_the_same_seed_and_vary_between_repetitions() -> None:
+    one = write("G", seed=4)
+    assert one.tobytes() == write("G", seed=4).tobytes()
+    assert 0.2 < one.std(axis=0).mean() < 2.0
+
+
+def test_a_folder_without_letters_says_what_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ExperimentError, match="demo00"):
+        recorded(tmp_path)
+    assert main(["letters", "--output", str(tmp_path), "--letters", str(tmp_path), "--share", "0.1", "--quiet"]) == 1
+    assert "No letters in" in capsys.readouterr().err
+
+
+def test_without_matplotlib_the_command_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["letters", "--output", str(tmp_path)]) == 1
+    assert "thirdhand[experiments]" in capsys.readouterr().err

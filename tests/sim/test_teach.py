@@ -1,0 +1,59 @@
+"""Demonstrations: files that repeat to the byte and hold what was taught."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from service.contract import cdr, messages
+from sim import teach
+from sim.scene import Scene
+
+
+def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        assert teach.main(["--output", str(tmp_path / name), "--count", "2", "--seed", "3"]) == 0
+    one, two = ([path.read_bytes() for path in sorted((tmp_path / name).iterdir())] for name in ("one", "two"))
+    assert len(one) == 2
+    assert one == two
+    assert one[0] != one[1]
+
+
+def test_a_file_holds_hands_and_tool_at_a_hundred_hertz_in_frame_base(tmp_path: Path) -> None:
+    assert teach.main(["--output", str(tmp_path), "--count", "1", "--seed", "3", "--cell", "lab/bench2"]) == 0
+    taught = teach.demonstrations(Scene(), count=1, seed=3)[0]
+    with (tmp_path / "demonstration-1.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        found: dict[str, list[messages.PoseStamped]] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            assert (schema.name, schema.encoding, channel.message_encoding) == (
+                "geometry_msgs/msg/PoseStamped",
+                "ros2msg",
+                "cdr",
+            )
+            found.setdefault(channel.topic, []).append(cdr.decode_pose(message.data))
+    assert set(found) == {"lab/bench2/hands/left", "lab/bench2/hands/right", "lab/bench2/tool/pose"}
+    for topic, poses in (("hands/left", taught.left), ("hands/right", taught.right), ("tool/pose", taught.tool)):
+        messages = found[f"lab/bench2/{topic}"]
+        assert {message.frame for message in messages} == {"base"}
+        np.testing.assert_array_equal([message.stamp_ns for message in messages], taught.stamps_ns)
+        np.testing.assert_array_equal([(*message.position, *message.orientation) for message in messages], poses)
+    assert set(np.diff(taught.stamps_ns)) == {10_000_000}
+
+
+def test_the_first_demonstrations_do_not_depend_on_how_many_there_are() -> None:
+    few, many = (teach.demonstrations(Scene(), count=count, seed=1) for count in (2, 3))
+    np.testing.assert_array_equal(few[1].left, many[1].left)
+
+
+def test_bad_usage_and_failure_have_their_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        teach.main(["--output", str(tmp_path), "--count", "0"])
+    (tmp_path / "scene.toml").write_text("glas = [0, 0, 0]")
+    assert teach.main(["--output", str(tmp_path), "--scene", str(tmp_path / "scene.toml")]) == 1
+    assert "glas" in capsys.readouterr().err

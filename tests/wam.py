@@ -1,0 +1,12 @@
+"""The shipped arm as tests need it: its joints' names, its description, and the layouts of what is
+recorded of it.
+"""
+
+from __future__ import annotations
+
+from service.config import WAM, Settings
+from service.core.frame import frame_layout, state_layout
+
+JOINT_NAMES = Settings().joints.names
+URDF = WAM.read_text(encoding="utf-8")
+FRAME, STATE = frame_layout(len(JOINT_NAMES)), state_layout(len(JOINT_NAMES))
