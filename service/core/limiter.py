@@ -69,6 +69,7 @@ class Limiter:
         self._input.max_jerk = list(limits.jerk)
         self._trajectory = ruckig.Trajectory(count)
         self._rest = [0.0] * count
+        self._origin = np.zeros(count)
 
     def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited:
         """The joints one period later on the way to `velocity`; all (J,) [rad, rad/s, rad/s²].
@@ -145,10 +146,11 @@ class Limiter:
 
     def _stop_range(self, q: Vector, dq: Vector, ddq: Vector) -> tuple[Vector, Vector]:
         """Lowest and highest position (J,) [rad] of a stop; unbounded where there is none."""
-        if not self._calculate(q, dq, ddq, self._rest):
+        # Ruckig's extrema of a velocity profile count 0 among the positions, so each joint stops as from there.
+        if not self._calculate(self._origin, dq, ddq, self._rest):
             return np.full(len(q), -np.inf), np.full(len(q), np.inf)
         extrema = self._trajectory.position_extrema
-        return np.array([bound.min for bound in extrema]), np.array([bound.max for bound in extrema])
+        return q + np.array([bound.min for bound in extrema]), q + np.array([bound.max for bound in extrema])
 
     def _calculate(self, q: Vector, dq: Vector, ddq: Vector, target: list[float]) -> bool:
         """Whether Ruckig found a profile; it is then in `_trajectory`."""

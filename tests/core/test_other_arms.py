@@ -1,0 +1,130 @@
+"""The core on arms that we did not write: a Panda, its fingers locked, and a UR5 of six joints."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from in_process import frames, ticks_of
+
+from service.config import Settings, SettingsError, parse, robot_description
+from service.contract.records import Mode
+from service.core.arm import Arm
+from service.core.controller import Controller, run
+from service.core.frame import Frame, Tick
+from service.core.skill import Skill
+from service.learning.learn import learn
+from service.recorder.recording import Recorder
+from service.recorder.replay import replay
+from sim.scene import Scene
+from sim.script import HandScript
+from sim.teach import demonstrations
+
+
+class Model(NamedTuple):
+    """An arm: its file among the robots, the link that carries the tool, and joints at the tool's
+    start [rad].
+    """
+
+    file: str
+    plate: str
+    posture: tuple[float, ...]
+
+
+# The postures have the tool where the demonstrations begin, 45 degrees down.
+MODELS = {
+    "panda": Model("panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)),
+    "ur5": Model("ur5_robot.urdf", "tool0", (-0.39, -1.67, 2.129, -2.772, -1.303, 0.0)),
+}
+
+
+def urdf_of(model: Model) -> Path:
+    """Where the file is installed."""
+    return next(Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == model.file)
+
+
+def toml_of(model: Model, **changed: str) -> str:
+    """The settings of a cell with this arm; a line left empty is left out."""
+    count = len(model.posture)
+    lines = {
+        "urdf": f"[arm]\nurdf = {json.dumps(str(urdf_of(model)))}",
+        "plate": f'plate = "{model.plate}"',
+        "source": 'source = "assumed"',
+        "posture": f"posture = {list(model.posture)}",
+        "acceleration": f"[joints]\nacceleration = {[10.0] * count}",
+        "jerk": f"jerk = {[500.0] * count}",
+    }
+    return "\n".join((lines | changed).values())
+
+
+@pytest.fixture(scope="module")
+def reach() -> Skill:
+    """A coarse skill of two demonstrations, with which the tool goes a metre."""
+    return learn([one.every(2) for one in demonstrations(Scene(), count=2, seed=1)], components=5, points=60)
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def cell(request: pytest.FixtureRequest) -> Settings:
+    return parse(toml_of(MODELS[request.param]), origin=request.param)
+
+
+def test_it_follows_moving_targets_with_every_limit_held(cell: Settings, reach: Skill) -> None:
+    seen = frames(Controller(cell, reach), ticks_of(HandScript(Scene(), seed=3)))
+    assert (seen["mode"] == Mode.FOLLOW).all()
+    error_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)
+    assert np.sqrt(np.mean(error_mm**2)) < 0.05, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
+    assert error_mm.max() < 1.0, f"{error_mm.max():.3f} mm"
+    assert np.ptp(seen["tool"], axis=0).max() > 0.3
+    limits = cell.joints
+    assert seen["joints"].shape[1] == len(limits.names)
+    assert (seen["joints"] >= limits.lower).all()
+    assert (seen["joints"] <= limits.upper).all()
+    velocity, acceleration = seen["joint_velocities"], seen["joint_accelerations"]
+    assert (np.abs(velocity) <= limits.velocity).all()
+    assert (np.abs(acceleration) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(acceleration, axis=0)) / cell.period_s <= np.array(limits.jerk) * (1 + 1e-6)).all()
+    assert np.abs(np.diff(seen["joints"], axis=0) / cell.period_s).max() <= max(limits.velocity) * (1 + 1e-6)
+
+
+def test_its_recording_replays_identically(cell: Settings, reach: Skill, tmp_path: Path) -> None:
+    controller = Controller(cell, reach)
+    with Recorder(tmp_path / "a.mcap", settings=cell, skill=reach.file, state=controller.state) as recorder:
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
+
+        run(controller, list(ticks_of(HandScript(Scene(), seed=3)))[:1500], [keep])
+    assert replay(tmp_path / "a.mcap").text() == "1500 ticks, 1500 frames identical"
+
+
+def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> None:
+    arm = Arm(cell, robot_description(cell))
+    position, rotation = arm.pose(np.array(cell.arm.posture))
+    assert position == pytest.approx(Scene().robot_start, abs=0.03)
+    assert rotation[:, 2] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)], abs=0.01)
+    assert len(cell.joints.names) == len(cell.joints.lower) == len(cell.arm.posture)
+    assert 0.3 < cell.reach.inner < cell.reach.outer < 1.4
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"plate": ""}, "$.arm.plate: missing; the link that carries the tool needed, the last ones are"),
+        ({"plate": 'plate = "gripper"'}, "no link 'gripper'"),
+        ({"posture": ""}, "$.arm.posture: missing; a URDF does not say it, 6 numbers needed"),
+        ({"jerk": ""}, "$.joints.jerk: missing"),
+        ({"posture": "posture = [0, 0, 0]"}, "$.arm.posture: 3 numbers, 6 needed, one for each of $.joints.names"),
+        ({"jerk": f"jerk = {[500] * 6}\nvelocity = {[9] * 6}"}, "$.joints.velocity[0]: 9.0 given; up to 3.15 accepted"),
+        ({"jerk": f'jerk = {[500] * 6}\nnames = ["a", "b", "c", "d", "e", "f"]'}, "$.joints.names: ['a', 'b'"),
+        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "$.arm.urdf: cannot read nowhere.urdf"),
+    ],
+)
+def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str, str], message: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        parse(toml_of(MODELS["ur5"], **changed), origin="cell.toml")
+    assert str(caught.value).startswith("cell.toml: ")
+    assert message in str(caught.value)
