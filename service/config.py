@@ -311,18 +311,25 @@ def _check_against_urdf(settings: Settings) -> None:
                 )
 
 
-def parse(text: str, *, origin: str) -> Settings:
-    """Settings from TOML text; `origin` names it in errors. Raises SettingsError."""
+def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
+    """Settings from TOML text; `origin` names it in errors. Raises SettingsError.
+
+    Where the arm's URDF is not an absolute path it lies in `folder`.
+    """
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{origin}: {error}") from None
+    arm = given.get("arm")
+    if folder is not None and isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
+        arm["urdf"] = str(folder / Path(arm["urdf"]).expanduser())
     return converted(given, origin=origin)
 
 
 def load(path: Path) -> Settings:
     """Settings from a TOML file. Raises SettingsError."""
     try:
-        return parse(path.read_text(encoding="utf-8"), origin=str(path))
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(f"cannot read configuration {path}: {error}") from None
+    return parse(text, origin=str(path), folder=path.parent)

@@ -9,8 +9,9 @@ import json
 import select
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from service.contract.explain import ExplainedError
 
 START_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 60.0
+BENCH_TIMEOUT_S = 120.0
 
 
 class LaunchError(ExplainedError, RuntimeError):
@@ -84,3 +86,33 @@ def _endpoint(process: subprocess.Popen[str], log: Path) -> str:
         if not line:
             break
     raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")
+
+
+def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda line: None) -> str:
+    """The report of one run of the bench (`python -m sim` with the arguments) as JSON; it `say`s
+    how it goes.
+
+    Raises LaunchError.
+    """
+    command = [sys.executable, "-m", "sim", "--connect", endpoint, "--once", "--json", "-", *arguments]
+    bench = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    clock = threading.Timer(BENCH_TIMEOUT_S, bench.kill)
+    clock.start()
+    said: list[str] = []
+    try:
+        assert bench.stderr is not None
+        assert bench.stdout is not None
+        for line in bench.stderr:
+            if not line.startswith("pybullet build time"):
+                said.append(line.rstrip())
+                say(f"  {said[-1]}")
+        report = bench.stdout.read()
+        if bench.wait() != 0:
+            raise LaunchError(
+                f"the bench ended with code {bench.returncode}: {said[-1] if said else 'it gave no reason'}"
+            )
+    finally:
+        clock.cancel()
+        bench.kill()
+        bench.communicate()
+    return next((line for line in report.splitlines() if line.startswith("{")), "")

@@ -9,6 +9,7 @@ import contextlib
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,10 @@ from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, decode_request
 from service.core.frame import TIMING
-from service.launch import launched
+from service.launch import launched, played
 from service.recorder.recording import Recording
 
 START_TIMEOUT_S = 60.0
-BENCH_TIMEOUT_S = 120.0
 EVENTS = {"handover": "board handed over", "grasp": "magnifying glass fetched", "carry": "glass held over the board"}
 
 
@@ -37,7 +37,7 @@ def demo(args: argparse.Namespace) -> int:
     return 0 if report["success"] else 1
 
 
-def run(out: Path, *, scene: Path | None, say: Any) -> dict[str, Any]:
+def run(out: Path, *, scene: Path | None, say: Callable[[str], None]) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
     out.mkdir(parents=True, exist_ok=True)
     request = _output([sys.executable, "-m", "sim.scene", *([str(scene)] if scene else [])])
@@ -51,7 +51,7 @@ def run(out: Path, *, scene: Path | None, say: Any) -> dict[str, Any]:
                 f"{point['name']} (missed by {1000 * point['missed_by_m']:.1f} mm)" for point in reply["points"]
             )
             say(f"taught while it runs, in force since tick {reply['tick']}: {names}")
-            report = json.loads(_bench(service.endpoint, scene))
+            report = json.loads(played(service.endpoint, *([] if scene is None else ["--scene", str(scene)]), say=say))
             status = client.status()
         if (code := service.stop()) != 0:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
@@ -122,32 +122,3 @@ def _output(command: list[str]) -> str:
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
     return done.stdout
-
-
-def _bench(endpoint: str, scene: Path | None) -> str:
-    """One run of the bench: its report as JSON. Its progress goes to standard error."""
-    command = [
-        sys.executable,
-        "-m",
-        "sim",
-        "--connect",
-        endpoint,
-        "--once",
-        "--json",
-        "-",
-        *(["--scene", str(scene)] if scene else []),
-    ]
-    bench = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert bench.stderr is not None
-        assert bench.stdout is not None
-        for line in bench.stderr:
-            if not line.startswith("pybullet build time"):
-                print(f"  {line.rstrip()}", file=sys.stderr, flush=True)
-        result = bench.stdout.read()
-        if bench.wait(BENCH_TIMEOUT_S) != 0:
-            raise DemoError(f"the bench ended with code {bench.returncode}")
-    finally:
-        bench.kill()
-        bench.wait()
-    return result

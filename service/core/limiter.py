@@ -146,7 +146,8 @@ class Limiter:
 
     def _stop_range(self, q: Vector, dq: Vector, ddq: Vector) -> tuple[Vector, Vector]:
         """Lowest and highest position (J,) [rad] of a stop; unbounded where there is none."""
-        # Ruckig's extrema of a velocity profile count 0 among the positions, so each joint stops as from there.
+        # Ruckig's extrema of a velocity profile count 0 among the positions, so each joint stops as
+        # from there.
         if not self._calculate(self._origin, dq, ddq, self._rest):
             return np.full(len(q), -np.inf), np.full(len(q), np.inf)
         extrema = self._trajectory.position_extrema

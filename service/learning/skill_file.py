@@ -32,7 +32,7 @@ class SkillError(ExplainedError, ValueError):
 
 
 def with_file(skill: Skill) -> Skill:
-    """The same skill, with the bytes of its file."""
+    """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
         format=np.array(FORMAT),

@@ -78,7 +78,7 @@ class Drawing:
         self._thread.join(DRAW_END_S)
 
 
-class Scribe:
+class ScribeProcess:
     """What the process does with what it is told.
 
     A failure ends what it happened in, is reported, and spares the rest.
@@ -222,7 +222,7 @@ def _work(source: socket.socket) -> None:
                     time.sleep(POLL_S)
         ended.set()
 
-    scribe = Scribe(task, skills[0] if skills else None, source)
+    scribe = ScribeProcess(task, skills[0] if skills else None, source)
     threading.Thread(target=read, name="socket", daemon=True).start()
     flushed = drawn = time.monotonic()
     over = False

@@ -193,7 +193,7 @@ class Daemon:
     # --- beside the loop ---
 
     def status(self) -> Status:
-        """What is, at most a tenth of a second ago."""
+        """The newest status, at most a tenth of a second old."""
         return self._status or self._survey()
 
     def _report(self) -> None:
@@ -216,7 +216,7 @@ class Daemon:
                 log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
 
     def _survey(self) -> Status:
-        """What is, now."""
+        """The status at this moment."""
         frame, clock = self._frame, self._clock
         reason = Reason(int(frame["reason"]))
         skill = self._controller.skill

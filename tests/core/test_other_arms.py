@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from in_process import frames, ticks_of
 
-from service.config import Settings, SettingsError, parse, robot_description
+from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
 from service.core.arm import Arm
 from service.core.controller import Controller, run
@@ -128,3 +128,9 @@ def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str,
         parse(toml_of(MODELS["ur5"], **changed), origin="cell.toml")
     assert str(caught.value).startswith("cell.toml: ")
     assert message in str(caught.value)
+
+
+def test_a_description_is_looked_for_beside_the_settings(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_bytes(urdf_of(MODELS["ur5"]).read_bytes())
+    (tmp_path / "cell.toml").write_text(toml_of(MODELS["ur5"], urdf='[arm]\nurdf = "arm.urdf"'))
+    assert load(tmp_path / "cell.toml").joints.names[0] == "shoulder_pan_joint"

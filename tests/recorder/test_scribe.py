@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from test_recording import SKILL, at_ns, state_after, ticks
 
-from service.config import Settings
+from service.config import Files, Settings
 from service.core.frame import Event, Record, Tick, encode
 from service.recorder.client import Scribe
 from service.recorder.protocol import pack, unpack
@@ -80,6 +80,16 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
     assert [step.tick for step in steps if step.state is not None] == [49, 99, 149, 199]
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
     assert Path(status["rrd"]).stat().st_size > 20_000
+
+
+def test_a_cell_may_record_without_a_drawing(tmp_path: Path) -> None:
+    one = Scribe(Settings(rate_hz=50, files=Files(rerun=False)), folder=tmp_path)
+    one.start(skill=SKILL, state=state_after(-1))
+    try:
+        tell(one, 20)
+    finally:
+        one.close(10)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mcap"]
 
 
 def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(tmp_path: Path) -> None:
