@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kmp.immutable import frozen
+
 Array: TypeAlias = NDArray[np.float64]
-_Some = TypeVar("_Some", bound=NDArray[Any])
 
 
 class ViaPointMissed(UserWarning):
@@ -18,17 +19,6 @@ class ViaPointMissed(UserWarning):
 
 class RankReached(UserWarning):
     """The rank was too low for the data, and accuracy was lost."""
-
-
-def frozen(array: _Some) -> _Some:
-    """The same array, read-only."""
-    array.setflags(write=False)
-    return array
-
-
-def unpickled(state: dict[str, Any]) -> dict[str, Any]:
-    """The state of a frozen value as it was: arrays come back from a pickle writeable."""
-    return {name: frozen(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
 
 
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
 from kmp.primitive import KMP
 
 Reward = Callable[[Array], float]
@@ -27,7 +27,7 @@ _SMALLEST = 0.05  # of Lambda: below it a covariance would be near to singular
 
 
 @dataclass(frozen=True, eq=False)
-class Correlation:
+class Correlation(Immutable):
     """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions: one factor for each of O outputs.
 
     centres (B, I) and width [unit of the inputs] of the basis functions, theta (B, O). Read-only. Lambda = 1 leaves the
@@ -42,9 +42,6 @@ class Correlation:
         object.__setattr__(self, "centres", numbers("centres", self.centres, "B", "I"))
         object.__setattr__(self, "width", positive("width", self.width))
         object.__setattr__(self, "theta", numbers("theta", self.theta, len(self.centres), "O"))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     @classmethod
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
@@ -79,7 +76,7 @@ class Correlation:
 
 
 @dataclass(frozen=True, eq=False)
-class Improvement:
+class Improvement(Immutable):
     """What `improve` found."""
 
     correlation: Correlation

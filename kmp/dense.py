@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array, frozen, unpickled
+from kmp.checks import Array
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
+from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.kernel import Kernel, spread
 from kmp.problem import Problem
-from kmp.whitener import Whitener
 
 _COLUMNS = 64  # of a factor, copied at once
 
 
 @dataclass(frozen=True, eq=False)
-class Dense:
+class Dense(Immutable):
     """The solution for N points with N O x N O numbers. Immutable; the factors are made when first asked for."""
+
+    # A copy in another process predicts at once; the factors, which only `adapted` needs, are made again there.
+    _not_pickled = frozenset({"_factor", "_covariance_factor"})
 
     kernel: Kernel
     problem: Problem
@@ -49,12 +52,12 @@ class Dense:
 
     def unexplained_one(self, row: Array) -> Array:
         """k(s, s) - k (K + lambda_c Sigma)^-1 k^T of one query, whose kernel row is (N,) or (C, N C): (O, O)."""
-        root = self._whitener.one(row.T)
+        root = self._inverse_factor.times_one(row.T)
         return np.asarray(self._own - blas.dgemm(1.0, root, root, trans_b=1))
 
     def unexplained(self, rows: Array) -> Array:
         """The same of M queries, whose kernel rows are (M C, N C): (M, O, O)."""
-        roots = self._whitener.many(rows.T, self.kernel.channels)
+        roots = self._inverse_factor.times_many(rows.T, self.kernel.channels)
         return np.asarray(self._own - roots.transpose(0, 2, 1) @ roots)
 
     def adapted(self, same: int, inputs: Array, reference: Gaussians) -> Dense:
@@ -70,8 +73,8 @@ class Dense:
         return frozen(spread(self.kernel.own, self._copies))
 
     @cached_property
-    def _whitener(self) -> Whitener:
-        return Whitener(self._covariance_factor, self._copies)
+    def _inverse_factor(self) -> InverseCholeskyFactor:
+        return InverseCholeskyFactor.of(self._covariance_factor, self._copies)
 
     @cached_property
     def _factor(self) -> Array:
@@ -111,10 +114,3 @@ class Dense:
                 f"with lambda {penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
             )
         return frozen(factor)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy in another process predicts at once; the factors, which only `adapted` needs, are made again there.
-        return {name: value for name, value in self.__dict__.items() if name not in {"_factor", "_covariance_factor"}}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from kmp.checks import Array, frozen, unpickled
+from kmp.checks import Array
+from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel
 
 _CANDIDATES = 4096  # inputs among which pivots are sought at once
@@ -25,7 +25,7 @@ FLOOR = 1e-14  # of k(s, s): below it the share left is rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class Features(Immutable):
     """z(s) = L^-1 k(S_p, s), with the pivots S_p (r, I) and L the Cholesky factor of their kernel matrix. Read-only."""
 
     kernel: Kernel
@@ -90,9 +90,6 @@ class Features:
         c = self.kernel.channels
         factor, info = lapack.dpotrf(self.kernel(self.pivots, self.pivots)[::c, ::c], lower=1, clean=1)
         return frozen(np.asfortranarray(factor)), int(info)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
 
 def _pivots(kernel: Kernel, inputs: Array, rank: int, tolerance: float) -> NDArray[np.intp]:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, ViaPointMissed, frozen, numbers, unpickled
+from kmp.checks import Array, ViaPointMissed, numbers
+from kmp.immutable import Immutable, frozen
 
 _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance that was meant to be symmetric
 _MISSED = 3.0  # of a via-point's deviations: more is a miss
@@ -19,7 +20,7 @@ _MACHINE = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussians:
+class Gaussians(Immutable):
     """N normal distributions over O outputs: mean (N, O) [unit], covariance (N, O, O) [unit^2]. Read-only.
 
     Each covariance is symmetric and positive definite, or the constructor says which is not.
@@ -48,9 +49,6 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.mean)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     @property
     def outputs(self) -> int:

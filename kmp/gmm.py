@@ -6,21 +6,21 @@ The paper, section II-A.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianMixture:
+class GaussianMixture(Immutable):
     """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l): weights (K,), means (K, I+O), covariances (K, I+O, I+O). Read-only."""
 
     weights: Array
@@ -36,9 +36,6 @@ class GaussianMixture:
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "means", components.mean)
         object.__setattr__(self, "covariances", components.covariance)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
+from kmp.immutable import Immutable, frozen
 
 
 class Kernel(Protocol):
@@ -55,7 +56,7 @@ def spread(blocks: Array, copies: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianKernel:
+class GaussianKernel(Immutable):
     """The kernel k(s, s') = exp(-ell |s - s'|^2), section III of the paper; `ell` in 1 / (unit of the inputs)^2.
 
     Given as an array (I,), `ell` has one value for each input: k(s, s') = exp(-sum_i ell_i (s_i - s'_i)^2).
@@ -80,9 +81,6 @@ class GaussianKernel:
 
     def __hash__(self) -> int:
         return hash(np.asarray(self.ell).tobytes())
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     @property
     def channels(self) -> int:
@@ -154,7 +152,7 @@ class GaussianKernel:
 
 
 @dataclass(frozen=True)
-class VelocityKernel:
+class VelocityKernel(Immutable):
     """The kernel of skills driven by time whose outputs are a value and its rate: [xi, dxi/dt], 2 D outputs.
 
     IJRR 2019, section on time-driven trajectories: k(t, t') and its derivatives, exact, so that a via-point can fix the

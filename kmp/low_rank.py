@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array, frozen, unpickled
+from kmp.checks import Array
 from kmp.features import Features
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
+from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.kernel import Kernel, spread
 from kmp.problem import Problem
-from kmp.whitener import Whitener
 
 _BLOCK = 8192  # rows at once, which bounds the memory
 _KEPT = 50_000_000  # numbers of features that are kept during a fit: 400 MB; more are made again for each pass
@@ -27,8 +27,10 @@ _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
 @dataclass(frozen=True, eq=False)
-class LowRank:
+class LowRank(Immutable):
     """The solution on r features. Immutable; the factors are made when first asked for."""
+
+    _not_pickled = frozenset({"_factors"})
 
     problem: Problem
     features: Features
@@ -110,9 +112,9 @@ class LowRank:
         return {}
 
     @cached_property
-    def whitener(self) -> Whitener:
+    def inverse_factor(self) -> InverseCholeskyFactor:
         """The inverse of the factor for the covariance."""
-        return Whitener(self.factor(self.problem.lambda_covariance), self.w.shape[1])
+        return InverseCholeskyFactor.of(self.factor(self.problem.lambda_covariance), self.w.shape[1])
 
     def unexplained_one(self, row: Array) -> Array:
         """k(s, s) - k (K + lambda_c Sigma)^-1 k^T of one query, whose kernel row is (r,) or (C, r C): (O, O)."""
@@ -128,27 +130,21 @@ class LowRank:
         """The features (r, C) of one query, and what P leaves of them: (O, r D)."""
         c = self.kernel.channels
         z = self.features.whitened(row[..., : len(self.centres) * c : c].T)
-        return z.reshape(-1, c), self.whitener.one(z)
+        return z.reshape(-1, c), self.inverse_factor.times_one(z)
 
     def roots(self, rows: Array) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries, and what P leaves of them: (M, r D, O)."""
         c = self.kernel.channels
         z = self.features.whitened(rows[:, : len(self.centres) * c : c].T)
-        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.whitener.many(z, c)
+        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.inverse_factor.times_many(z, c)
 
     def remainder(self, explained: Array) -> Array:
         """k(s, s) less what the features explain of it (..., C, C), for each output: (..., O, O)."""
         return spread(self.kernel.own - explained, self.w.shape[1])
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_factors"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
-
 
 @dataclass(frozen=True, eq=False)
-class Conditioned:
+class Conditioned(Immutable):
     """The low rank solution after V points were added and R taken out: a normal conditioned on a few more normals.
 
     Adding is a term of rank O for each point. A point is taken out by adding it again with minus its covariance.
@@ -223,7 +219,7 @@ class Conditioned:
 
     @cached_property
     def _z(self) -> Array:
-        return self.base.features(self.inputs)  # (r, U C)
+        return frozen(self.base.features(self.inputs))  # (r, U C)
 
     @cached_property
     def _covariance_system(self) -> tuple[Array, tuple[Array, Array]]:
@@ -252,16 +248,13 @@ class Conditioned:
                 f"The via-points contradict each other to working precision, with lambda {penalty:g}. "
                 "Give those that are near to others more variance."
             )
-        return cross, (lu, pivots)
+        return frozen(cross), (frozen(lu), frozen(pivots))
 
     @staticmethod
     def _solve(system: tuple[Array, Array], right: Array) -> Array:
         lu, pivots = system
         # SciPy counts the pivots it is given from one while it solves, which threads that share them would see.
         return np.asarray(lapack.dgetrs(lu, pivots.copy(), right)[0])
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
 
 def _add_information(total: Array, z: Array, precision: Array) -> None:

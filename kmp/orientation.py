@@ -9,13 +9,13 @@ rotations multiply from the left, so that axes, angular velocities and deviation
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, frozen, numbers, unpickled
+from kmp.checks import Array, numbers
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
 from kmp.primitive import KMP
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
@@ -73,7 +73,7 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class OrientationKMP:
+class OrientationKMP(Immutable):
     """A skill whose output is an orientation: a primitive of zeta, or over time of zeta with its rate. Immutable.
 
     Learn it so: make each demonstration's quaternions `continuous`, take `log` with a common auxiliary quaternion
@@ -90,9 +90,6 @@ class OrientationKMP:
         if self.primitive.outputs != wanted:
             raise ValueError(f"primitive: {self.primitive.outputs} outputs given, {wanted} needed for an orientation.")
         object.__setattr__(self, "auxiliary", frozen(_unit("auxiliary", np.atleast_2d(self.auxiliary))[0].copy()))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     def mean(self, queries: ArrayLike) -> Array:
         """The orientations (M, 4) at queries (M, I). x y z w."""

@@ -15,10 +15,11 @@ from scipy.spatial.distance import cdist
 
 from kmp import storage
 from kmp.bound import error_bound
-from kmp.checks import Array, RankReached, frozen, numbers, positive, unpickled
+from kmp.checks import Array, RankReached, numbers, positive
 from kmp.dense import Dense
 from kmp.features import Features
 from kmp.gaussians import Gaussians, check_pairs, warn_of_missed
+from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel, spread
 from kmp.low_rank import Conditioned, LowRank
 from kmp.problem import Problem
@@ -36,7 +37,7 @@ _LEFT = 1e-10  # the same, for the uncertainty that is distance from the data
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class Uncertainty(Immutable):
     """The covariance of `predict` in two parts, each (M, O, O) [unit of the outputs^2], whose sum it is."""
 
     variability: Array
@@ -46,7 +47,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class KMP:
+class KMP(Immutable):
     """A skill: the reference database, the via-points in it, and its solution. From `fit`, `adapt`, `from_arrays`.
 
     N points in all, I inputs, O outputs. Immutable, so that threads may share it. `inputs` (N, I) and `reference` (N)
@@ -358,9 +359,6 @@ class KMP:
         if s.shape != (self._dimensions,):
             raise ValueError(f"{name}: shape {s.shape} given, {(self._dimensions,)} needed.")
         return s
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
 
 def _finite(found: Array) -> Array:

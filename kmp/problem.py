@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians, check_pairs
+from kmp.immutable import Immutable
 from kmp.kernel import Kernel
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Immutable):
     """The parameters of the costs: equation (4) for the mean, IJRR 2019 for the covariance."""
 
     lambda_mean: float
@@ -43,6 +43,3 @@ class Problem:
         if kernel.channels > 1 and (rates := prior[outputs // kernel.channels :]).any():
             raise ValueError(f"prior_mean: rates of {rates} given; the rate of a constant is 0.")
         return cls(penalty, other, prior)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))

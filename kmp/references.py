@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, unpickled
+from kmp.checks import Array, numbers
 from kmp.gaussians import Gaussians, check_pairs
 from kmp.gmm import GaussianMixture
+from kmp.immutable import Immutable
 from kmp.kernel import Kernel
 from kmp.primitive import KMP
 
@@ -41,7 +41,7 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(Immutable):
     """Task parameters (A, b): where a frame lies, xi = A xi' + b for its coordinates xi'. matrix (O, O), offset (O,).
 
     Read-only. Rotations and translations keep the unit; any matrix that can be inverted will do.
@@ -57,9 +57,6 @@ class Frame:
             raise ValueError(f"matrix: {matrix.tolist()} given, and it must have an inverse.")
         object.__setattr__(self, "offset", offset)
         object.__setattr__(self, "matrix", matrix)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
 
     @classmethod
     def at(cls, origin: ArrayLike) -> Frame:
@@ -93,7 +90,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class LocalKMP:
+class LocalKMP(Immutable):
     """A skill in F frames at once: one primitive in each one's coordinates, and where the frames are now. IJRR 2019.
 
     From `learn`, for the frames of the last demonstration; `placed` moves it. Each frame's prediction is mapped back,

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, frozen, numbers
+from kmp.checks import Array, numbers
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
+from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
 from kmp.primitive import KMP
 
@@ -26,7 +27,7 @@ _HELD_OUT = 200  # points of a demonstration that are predicted
 
 
 @dataclass(frozen=True, eq=False)
-class Score:
+class Score(Immutable):
     """How well some hyper-parameters predict a demonstration that was left out."""
 
     ell: float | Array
@@ -40,7 +41,7 @@ class Score:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class Learned(Immutable):
     """A primitive, the mixture that its reference is from, and the scores of all that was tried, the best first."""
 
     primitive: KMP

@@ -296,7 +296,7 @@ def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
             one.prior_mean,
             one.reference.mean,
             one.via_inputs,
-            *one.solution._whitener.bands,
+            *one.solution._inverse_factor.bands,
         ]
         assert not any(array.flags.writeable for array in arrays)
 

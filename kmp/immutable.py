@@ -1,0 +1,38 @@
+"""Values that never change: threads may share them, and a copy in another process is as read-only as the first."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Some = TypeVar("_Some", bound=NDArray[Any])
+
+
+def frozen(array: _Some) -> _Some:
+    """The same array, read-only."""
+    array.setflags(write=False)
+    return array
+
+
+class Immutable:
+    """A value whose arrays are read-only, in copies and after unpickling too, where NumPy makes them writeable."""
+
+    _not_pickled: ClassVar[frozenset[str]] = frozenset()
+    """Cached properties that a pickle leaves out: large, and made again where they are asked for."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._not_pickled}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _freeze(tuple(state.values()))
+        self.__dict__.update(state)
+
+
+def _freeze(value: object) -> None:
+    if isinstance(value, np.ndarray):
+        frozen(value)
+    elif isinstance(value, tuple):
+        for part in value:
+            _freeze(part)
