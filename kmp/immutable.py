@@ -1,8 +1,9 @@
-"""Values that never change: threads may share them, and a copy in another process is as read-only as the first."""
+"""Values that never change: threads may share them, and copies are as read-only as they are."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeVar
+import copy
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,10 @@ def frozen(array: _Some) -> _Some:
 
 
 class Immutable:
-    """A value whose arrays are read-only, in copies and after unpickling too, where NumPy makes them writeable."""
+    """A value whose arrays are read-only, after copying and unpickling too (as NumPy's are not)."""
 
     _not_pickled: ClassVar[frozenset[str]] = frozenset()
-    """Cached properties that a pickle leaves out: large, and made again where they are asked for."""
+    """Cached properties that a pickle leaves out: large, and made again when asked for."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in self._not_pickled}
@@ -28,6 +29,12 @@ class Immutable:
     def __setstate__(self, state: dict[str, Any]) -> None:
         _freeze(tuple(state.values()))
         self.__dict__.update(state)
+
+    def _with_cached(self, **known: object) -> Self:
+        """A copy of this value that knows some of its cached properties from the start."""
+        other = copy.copy(self)
+        other.__dict__.update(known)
+        return other
 
 
 def _freeze(value: object) -> None:

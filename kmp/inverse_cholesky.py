@@ -1,4 +1,4 @@
-"""The inverse of a Cholesky factor, kept so that the covariance of one query costs one multiplication."""
+"""The inverse of a Cholesky factor, with which a query's covariance costs one multiplication."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _BANDS = 4  # with 4, five eighths of the square are kept
 
 @dataclass(frozen=True, eq=False)
 class InverseCholeskyFactor(Immutable):
-    """L^-1 of a lower triangular L (n D, n D), for products L^-1 (x (x) I) with the unit matrix of size D.
+    """L^-1 of a lower triangular L (n D, n D), for products L^-1 (x (x) I) with I of size D.
 
-    The Kronecker product x (x) I is never formed: a column of x goes through D columns of L^-1 at once.
+    The Kronecker product x (x) I is never formed: a column of x goes through D columns of L^-1 at
+    once.
     """
 
-    copies: int
-    """D."""
+    copies: int  # D
     bands: tuple[Array, ...]
-    """Bands of rows of L^-1, each without the columns beyond the triangle: b columns, D of L^-1 side by side in each."""
+    """Bands of rows of L^-1 without the columns beyond the triangle, D columns stacked."""
 
     @classmethod
     def of(cls, factor: Array, copies: int) -> InverseCholeskyFactor:
