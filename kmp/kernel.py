@@ -21,9 +21,9 @@ from kmp.immutable import Immutable, frozen
 class Kernel(Protocol):
     """What a primitive asks of its kernel. R centres, I inputs, C channels, D outputs a channel.
 
-    `values`, `row`, `jacobian` and `curvature` serve one query s, where the microseconds count.
-    They are functions of arrays alone, in coordinates in which the kernel is one of distance: of
-    the offsets x - x_r (R, I) with x = stretch * s, of the values (R,) there, and of the scale.
+    `values`, `row`, `jacobian` and `curvature` serve one query s, where microseconds count. They
+    are functions of arrays alone, in the coordinates x = stretch * s, in which one scale serves all
+    inputs: of the offsets x - x_r (R, I) from the centres, and of the values (R,) there.
     """
 
     @property

@@ -23,6 +23,7 @@ _NAMES = (
     *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
     *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
 )
+_OF_LOW_RANK = ("pivots", "information", "features")
 
 
 def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str, NDArray[Any]]:
@@ -50,8 +51,9 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, Solution]:
     """What `to_arrays` was given. Raises ValueError if arrays lack or do not go together."""
-    if missing := [name for name in _NAMES if name not in arrays]:
-        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(_NAMES)}.")
+    names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
+    if missing := [name for name in names if name not in arrays]:
+        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
     base = _base(arrays)
     changes = _changes(arrays, base.database)
     if len(changes.inputs) == 0:

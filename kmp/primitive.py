@@ -122,8 +122,8 @@ class KMP(Immutable):
 
         The mean is that of `mean`, bit for bit. Covariance: N / lambda_c (k(s, s) I - k (K +
         lambda_c Sigma)^-1 k^T), IJRR 2019. The first prediction inverts the triangular factor: make
-        one before there is a deadline. Raises ValueError if the shape is another or a number is not
-        finite.
+        one before there is a deadline. Raises ValueError if the shape is another, a number is not
+        finite, or what was stored cannot be solved here.
         """
         s = self._checked_many(queries)
         if len(s) == 1:

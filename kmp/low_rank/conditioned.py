@@ -27,7 +27,7 @@ class _System(NamedTuple):
     cross: Array
     """(r D, U O) L^-1 of their features, with the factor L of the base's normal equations."""
     lu: Array
-    """(U O, U O) the factors of their own covariance given the base."""
+    """(U O, U O) the factors of their covariance, given the base."""
     pivots: NDArray[np.intc]
 
     def solve(self, right: Array) -> Array:
@@ -145,12 +145,12 @@ class Conditioned(Immutable):
 
     def _system(self, penalty: float, base_factor: Array) -> _System:
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
-        added, own = self.changes.inputs, self._added_columns
+        added, first = self.changes.inputs, self._added_columns
         lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
-        between = self.base.features.kernel(added, added) - self._z[:, :own].T @ self._z[:, :own]
+        between = self.base.features.kernel(added, added) - self._z[:, :first].T @ self._z[:, :first]
         for i in range(d):
             lifted[:, i, :, i] = self._z
-            residual[:own, i, :own, i] = between
+            residual[:first, i, :first, i] = between
         cross, _ = lapack.dtrtrs(base_factor, lifted.reshape(r * d, -1), lower=1)
         matrix = penalty * (cross.T @ cross) + residual.reshape(columns * d, columns * d)
         blocks = matrix.reshape(count, -1, count, columns * d // count)

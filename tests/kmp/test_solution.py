@@ -92,6 +92,14 @@ def test_each_is_stored_with_what_its_base_needs(primitive):
     assert np.array_equal(again.mean(S), primitive.mean(S))
 
 
+@pytest.mark.parametrize("name", ["information", "features"])
+def test_an_array_of_the_low_rank_solution_that_lacks_is_named(name):
+    arrays = fitted("low_rank").to_arrays()
+    del arrays[name]
+    with pytest.raises(ValueError, match=f"The primitive's arrays lack {name}. Needed are .*pivots"):
+        KMP.from_arrays(arrays)
+
+
 def test_pivots_that_rounding_does_not_tell_apart_are_refused():
     arrays = fitted("low_rank").to_arrays()
     pivots = arrays["pivots"].copy()
