@@ -1,10 +1,14 @@
-"""Kernelized movement primitives: robot skills learned from few demonstrations, driven by inputs of any dimension.
+"""Kernelized movement primitives: robot skills learned from few demonstrations.
 
-"The paper" in this package is Huang, Rozo, Silverio, Caldwell: Non-parametric Imitation Learning of Robot Motor Skills,
-ICRA 2019; the covariance is from their Kernelized Movement Primitives, IJRR 2019 ("IJRR 2019").
+They are driven by inputs of any dimension: time, or the positions of two hands.
 
-Symbols: s an input (I,), xi an output (O,), (s_n, mu_n, Sigma_n) the N reference points, k the kernel with
-parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, O) the fitted weights.
+"The paper" in this package is Huang, Rozo, Silverio, Caldwell: Non-parametric Imitation Learning of
+Robot Motor Skills, ICRA 2019; the covariance is from their Kernelized Movement Primitives, IJRR
+2019 ("IJRR 2019").
+
+Symbols: s an input (I,), xi an output (O,), (s_n, mu_n, Sigma_n) the N reference points, k the
+kernel with parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, O) the
+fitted weights.
 """
 
 from kmp.checks import RankReached, ViaPointMissed
@@ -14,20 +18,22 @@ from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel, VelocityKernel
 from kmp.orientation import OrientationKMP
 from kmp.primitive import KMP, Uncertainty
-from kmp.references import Frame, LocalKMP, superposed
+from kmp.query import MotionPrediction
+from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 
 __all__ = [
     "KMP",
+    "CoordinateFrame",
     "Correlation",
-    "Frame",
     "GaussianKernel",
     "GaussianMixture",
     "Gaussians",
     "Improvement",
     "Learned",
     "LocalKMP",
+    "MotionPrediction",
     "OrientationKMP",
     "RankReached",
     "Score",

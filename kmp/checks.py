@@ -1,15 +1,16 @@
-"""What every value of this package demands of the numbers that it is made of."""
+"""What the values of this package demand of the numbers they are made of, and what it warns of."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kmp.immutable import frozen
+
 Array: TypeAlias = NDArray[np.float64]
-_Some = TypeVar("_Some", bound=NDArray[Any])
 
 
 class ViaPointMissed(UserWarning):
@@ -20,32 +21,38 @@ class RankReached(UserWarning):
     """The rank was too low for the data, and accuracy was lost."""
 
 
-def frozen(array: _Some) -> _Some:
-    """The same array, read-only."""
-    array.setflags(write=False)
-    return array
-
-
-def unpickled(state: dict[str, Any]) -> dict[str, Any]:
-    """The state of a frozen value as it was: arrays come back from a pickle writeable."""
-    return {name: frozen(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
-
-
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
-    """A read-only copy of `value`: every number finite, and of the given shape, where a word stands for any length."""
+    """A read-only copy of `value` of the given shape, where a word stands for any length.
+
+    Raises ValueError if the shape is another or a number is not finite.
+    """
     array = np.array(value, dtype=np.float64, order="C")
-    fits = array.ndim == len(shape) and all(n in (m, str(n)) for n, m in zip(shape, array.shape, strict=True))
-    if not fits:
-        wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-        raise ValueError(f"{name}: shape {array.shape} given, ({wanted}) needed.")
-    if not np.isfinite(array).all():
-        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name}{list(place)} is {array[place]}, and every number must be finite.")
+    check_shape(name, array, *shape)
+    check_finite(name, array)
     return frozen(array)
 
 
+def check_finite(name: str, array: Array) -> None:
+    """Raises ValueError unless every number is finite."""
+    flat = array.ravel()
+    if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
+        return
+    for place in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise ValueError(f"{name}{place} is {array[tuple(place)]}, and every number must be finite.")
+
+
+def check_shape(name: str, array: Array, *shape: int | str) -> None:
+    """Raises ValueError unless the array has that shape, where a word stands for any length."""
+    if array.shape == shape:
+        return
+    if array.ndim == len(shape) and all(n == m or isinstance(n, str) for n, m in zip(shape, array.shape, strict=True)):
+        return
+    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    raise ValueError(f"{name}: shape {array.shape} given, ({wanted}) needed.")
+
+
 def positive(name: str, value: float) -> float:
-    """The value as a float, finite and above zero."""
+    """The value as a float. Raises ValueError unless it is finite and above zero."""
     number = float(value)
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"{name} is {number:g}, and must be finite and above 0.")

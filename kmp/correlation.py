@@ -1,22 +1,22 @@
-"""Correlation-adaptive imitation: how strongly the outputs are tied to each other, learned from a reward.
+"""Correlation-adaptive imitation: how the outputs are tied together, learned from a reward.
 
-The paper, section II-D: the reference's covariances become Lambda(s)^T Sigma Lambda(s), equation (11), and the diagonal
-Lambda(s) is found by policy improvement with path integrals with constant exploration, as in section III-B; the reward
-is the caller's.
+The paper, section II-D: the reference's covariances become Lambda(s)^T Sigma Lambda(s), equation
+(11), and the diagonal Lambda(s) is found by policy improvement with path integrals with constant
+exploration, as in section III-B; the reward is the caller's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
 from kmp.primitive import KMP
 
 Reward = Callable[[Array], float]
@@ -27,11 +27,12 @@ _SMALLEST = 0.05  # of Lambda: below it a covariance would be near to singular
 
 
 @dataclass(frozen=True, eq=False)
-class Correlation:
-    """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions: one factor for each of O outputs.
+class Correlation(Immutable):
+    """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions. Read-only.
 
-    centres (B, I) and width [unit of the inputs] of the basis functions, theta (B, O). Read-only. Lambda = 1 leaves the
-    covariances as they are. Factors below 0.05 are 0.05.
+    centres (B, I) and width [unit of the inputs] of the basis functions; theta (B, O), a factor for
+    each output. Lambda = 1 leaves the covariances as they are; factors below 0.05 are 0.05. Raises
+    ValueError if shapes do not agree, a number is not finite, or the width is not above 0.
     """
 
     centres: Array
@@ -43,43 +44,38 @@ class Correlation:
         object.__setattr__(self, "width", positive("width", self.width))
         object.__setattr__(self, "theta", numbers("theta", self.theta, len(self.centres), "O"))
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
-
     @classmethod
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
-        """Lambda = 1 everywhere, for so many outputs."""
+        """Lambda = 1 everywhere, for so many outputs. Raises ValueError as the constructor does."""
         places = numbers("centres", centres, "B", "I")
         return cls(places, width, np.ones((len(places), outputs)))
 
     def __call__(self, inputs: ArrayLike) -> Array:
-        """The diagonals of Lambda at inputs (N, I): (N, O)."""
+        """The diagonals of Lambda at inputs (N, I): (N, O).
+
+        Raises ValueError if the shape is another or a number is not finite.
+        """
         s = numbers("inputs", inputs, "N", self.centres.shape[1])
         exponent = -0.5 * cdist(s, self.centres, "sqeuclidean") / self.width**2
         phi = np.exp(exponent - exponent.max(axis=1, keepdims=True))
-        return np.asarray(np.maximum((phi / phi.sum(axis=1, keepdims=True)) @ self.theta, _SMALLEST))
+        share = phi / phi.sum(axis=1, keepdims=True)
+        return np.asarray(np.maximum(share @ self.theta, _SMALLEST))
 
     def applied(self, primitive: KMP) -> KMP:
-        """The primitive of the cost (11): its base's covariances changed, and its via-points as they were."""
+        """The primitive of the cost (11): the base's covariances changed, the via-points kept.
+
+        Raises ValueError if it has another number of inputs or outputs.
+        """
         base = primitive.base
+        if (given := self.theta.shape[1]) != base.outputs:
+            raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
         scale = self(base.inputs)
         covariance = scale[:, :, None] * base.reference.covariance * scale[:, None, :]
-        adapted = KMP.fit(
-            base.inputs,
-            Gaussians(base.reference.mean, covariance),
-            kernel=base.kernel,
-            lambda_mean=base.lambda_mean,
-            lambda_covariance=base.lambda_covariance,
-            prior_mean=base.prior_mean,
-            representation=base.representation,
-        )
-        if len(primitive.via_inputs) == 0:
-            return adapted
-        return adapted.changed(primitive.replaced, primitive.via_inputs, primitive.via_points)
+        return primitive.refitted(Gaussians(base.reference.mean, covariance))
 
 
 @dataclass(frozen=True, eq=False)
-class Improvement:
+class Improvement(Immutable):
     """What `improve` found."""
 
     correlation: Correlation
@@ -101,18 +97,20 @@ def improve(
     rollouts: int,
     seed: int,
 ) -> Improvement:
-    """The Lambda(s) that makes the trajectory at `queries` (M, I) more rewarding. The paper, equation (11), section III-B.
+    """The Lambda(s) that makes the trajectory at `queries` (M, I) more rewarding: equation (11).
 
-    Each update draws `rollouts` theta + epsilon, epsilon of standard deviation `exploration`, the same in each update
-    (constant exploration); fits and adapts the primitive with each; and moves theta by the mean of the epsilons,
-    weighted with exp(h (R - max R) / (max R - min R)), h = 10. The via-points of the primitive are kept.
+    Each update draws `rollouts` theta + epsilon, epsilon of standard deviation `exploration`, the
+    same in each update (constant exploration); fits and adapts the primitive with each; and moves
+    theta by the mean of the epsilons, weighted with exp(h (R - max R) / (max R - min R)), h = 10.
+    The via-points of the primitive are kept. The paper, section III-B.
+
+    Raises ValueError if shapes do not agree, a parameter is out of its range, or a reward is not
+    finite.
     """
     s = numbers("queries", queries, "M", primitive.inputs.shape[1])
     positive("exploration", exploration)
     if rollouts < 2 or updates < 1:
         raise ValueError(f"{rollouts} rollouts and {updates} updates given; at least 2 and 1 are needed.")
-    if correlation.theta.shape[1] != primitive.outputs:
-        raise ValueError(f"correlation: {correlation.theta.shape[1]} outputs given, {primitive.outputs} needed.")
     random = np.random.default_rng(seed)
 
     def tried(theta: Array) -> tuple[float, Correlation]:

@@ -1,120 +1,139 @@
-"""The exact solution of equation (9): one Cholesky factor of K + lambda Sigma, as many rows as there are numbers."""
+"""The exact solution of equation (9), by one Cholesky factor of K + lambda Sigma with N O rows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array, frozen, unpickled
-from kmp.gaussians import Gaussians
-from kmp.kernel import Kernel, spread
-from kmp.problem import Problem
-from kmp.whitener import Whitener
+from kmp.checks import Array
+from kmp.database import Changes, Database
+from kmp.hyperparameters import Hyperparameters
+from kmp.immutable import Immutable, frozen
+from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.linear_algebra import kron_identity
 
 _COLUMNS = 64  # of a factor, copied at once
 
 
 @dataclass(frozen=True, eq=False)
-class Dense:
-    """The solution for N points with N O x N O numbers. Immutable; the factors are made when first asked for."""
+class Dense(Immutable):
+    """The solution for N points, N O x N O numbers; the factors are made when first asked for.
 
-    kernel: Kernel
-    problem: Problem
-    inputs: Array
-    reference: Gaussians
+    The members are those of `Solution`.
+    """
+
+    # A copy in another process predicts at once; only `adapted` would need the factors again.
+    _not_pickled = frozenset({"_factor", "_covariance_factor"})
+
+    hyperparameters: Hyperparameters
+    database: Database
     base: Dense | None = None
     """The solution that shares the first `same` points, and so as many rows of the factors."""
     same: int = 0
 
+    representation: ClassVar[Literal["dense"]] = "dense"
+    error_bound: ClassVar[float] = 0.0
+
     @property
     def centres(self) -> Array:
-        """(N, I) where the mean's expansion has its kernels: equation (8)."""
-        return self.inputs
+        """(N, I) the reference points."""
+        return self.database.inputs
 
     @cached_property
     def weights(self) -> Array:
         """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        solution, _ = lapack.dpotrs(self._factor, (self.reference.mean - self.problem.prior_mean).ravel(), lower=1)
-        return frozen(np.ascontiguousarray(solution).reshape(self.reference.mean.shape))
+        mean = self.database.reference.mean
+        solution, _ = lapack.dpotrs(self._factor, (mean - self.hyperparameters.prior_mean).ravel(), lower=1)
+        return frozen(np.ascontiguousarray(solution).reshape(mean.shape))
 
-    def solved(self) -> Dense:
-        """The same, with all that can fail done."""
+    def solved(self) -> Self:
         self.weights  # noqa: B018
         self._covariance_factor  # noqa: B018
         return self
 
-    def unexplained_one(self, row: Array) -> Array:
-        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T of one query, whose kernel row is (N,) or (C, N C): (O, O)."""
-        root = self._whitener.one(row.T)
-        return np.asarray(self._own - blas.dgemm(1.0, root, root, trans_b=1))
+    def posterior_covariance_one(self, row: Array) -> Array:
+        root = self._inverse_factor.times_one(row.T)
+        return np.asarray(self._prior_covariance - blas.dgemm(1.0, root, root, trans_b=1))
 
-    def unexplained(self, rows: Array) -> Array:
-        """The same of M queries, whose kernel rows are (M C, N C): (M, O, O)."""
-        roots = self._whitener.many(rows.T, self.kernel.channels)
-        return np.asarray(self._own - roots.transpose(0, 2, 1) @ roots)
+    def posterior_covariance(self, rows: Array) -> Array:
+        roots = self._inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
+        return np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots)
 
-    def adapted(self, same: int, inputs: Array, reference: Gaussians) -> Dense:
-        """The solution of a changed database, whose first `same` points are this one's."""
-        return Dense(self.kernel, self.problem, inputs, reference, self, same)
+    def adapted(self, changes: Changes) -> Dense:
+        """The base's solution with these changes; they share the points before the first change."""
+        base = self.base or self
+        same = int(changes.replaced[0]) if len(changes.replaced) else len(base.database)
+        return Dense(self.hyperparameters, base.database.changed(changes), base, same)
 
-    @cached_property
-    def _copies(self) -> int:
-        return self.reference.outputs // self.kernel.channels
+    def with_weights(self, weights: Array) -> Self:
+        return self._with_cached(weights=weights)
 
-    @cached_property
-    def _own(self) -> Array:
-        return frozen(spread(self.kernel.own, self._copies))
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        return {}
 
     @cached_property
-    def _whitener(self) -> Whitener:
-        return Whitener(self._covariance_factor, self._copies)
+    def _prior_covariance(self) -> Array:
+        parameters = self.hyperparameters
+        return frozen(kron_identity(parameters.kernel.prior_variance, parameters.channel_outputs))
+
+    @cached_property
+    def _inverse_factor(self) -> InverseCholeskyFactor:
+        return InverseCholeskyFactor.of(self._covariance_factor, self.hyperparameters.channel_outputs)
 
     @cached_property
     def _factor(self) -> Array:
-        return self._factorised(self.problem.lambda_mean, self.base._factor if self.base else None)
+        return self._factorised(self.hyperparameters.lambda_mean, self.base._factor if self.base else None)
 
     @cached_property
     def _covariance_factor(self) -> Array:
-        if self.problem.lambda_covariance == self.problem.lambda_mean:
+        parameters = self.hyperparameters
+        if parameters.lambda_covariance == parameters.lambda_mean:
             return self._factor
-        return self._factorised(self.problem.lambda_covariance, self.base._covariance_factor if self.base else None)
+        return self._factorised(parameters.lambda_covariance, self.base._covariance_factor if self.base else None)
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
-        """The lower Cholesky factor (N O, N O) of K (x) I + lambda Sigma: the base's, down to the first changed row."""
-        o, c, d, same = self.reference.outputs, self.kernel.channels, self._copies, self.same
-        count, changed = len(self.inputs), len(self.inputs) - same
-        n, p = count * o, same * o
-        new = np.zeros((changed, c, d, count, c, d))
-        k = self.kernel(self.inputs[same:], self.inputs).reshape(changed, c, count, c)
-        for i in range(d):
-            new[:, :, i, :, :, i] = k
-        points = np.arange(changed)
-        blocks = new.reshape(changed, o, count, o)
-        blocks[points, :, points + same, :] += penalty * self.reference.covariance[same:]
-        rows = blocks.reshape(n - p, n)
-        if base_factor is None or p == 0:  # in place: symmetric, so that the transpose is as LAPACK reads it
+        """The lower Cholesky factor (N O, N O) of K (x) I + lambda Sigma."""
+        rows = self._rows(penalty)
+        if base_factor is None or self.same == 0:
+            # In place: the rows are symmetric, so that their transpose is as LAPACK reads it.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
         else:
-            factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
-            for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
-                factor[a:p, a : min(a + _COLUMNS, p)] = base_factor[a:p, a : min(a + _COLUMNS, p)]
-            left, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
-            factor[p:, :p] = left.T
-            factor[p:, p:], info = lapack.dpotrf(rows[:, p:] - left.T @ left, lower=1, clean=1)
+            factor, info = _bordered(base_factor, rows)
         if info:
+            point = self.same + (info - 1) // self.hyperparameters.outputs
             raise ValueError(
-                f"K + lambda Sigma is not positive definite to working precision at point {same + (info - 1) // o}, "
-                f"with lambda {penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
+                f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
+                f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
             )
         return frozen(factor)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy in another process predicts at once; the factors, which only `adapted` needs, are made again there.
-        return {name: value for name, value in self.__dict__.items() if name not in {"_factor", "_covariance_factor"}}
+    def _rows(self, penalty: float) -> Array:
+        """The rows of K (x) I + lambda Sigma that the base does not share: ((N - same) O, N O)."""
+        kernel, o = self.hyperparameters.kernel, self.hyperparameters.outputs
+        c, d, same = kernel.channels, self.hyperparameters.channel_outputs, self.same
+        inputs, count, changed = self.database.inputs, len(self.database), len(self.database) - same
+        rows = np.zeros((changed, c, d, count, c, d))
+        k = kernel(inputs[same:], inputs).reshape(changed, c, count, c)
+        for i in range(d):
+            rows[:, :, i, :, :, i] = k
+        points = np.arange(changed)
+        blocks = rows.reshape(changed, o, count, o)
+        blocks[points, :, points + same, :] += penalty * self.database.reference.covariance[same:]
+        return rows.reshape(changed * o, count * o)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
+
+def _bordered(base_factor: Array, rows: Array) -> tuple[Array, int]:
+    """The base's factor, bordered: that (n, n) of a matrix whose last rows are (m, n)."""
+    n, p = rows.shape[1], rows.shape[1] - len(rows)
+    factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
+    for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
+        factor[a:p, a : min(a + _COLUMNS, p)] = base_factor[a:p, a : min(a + _COLUMNS, p)]
+    border, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
+    factor[p:, :p] = border.T
+    factor[p:, p:], info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
+    return factor, int(info)

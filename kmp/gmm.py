@@ -1,4 +1,4 @@
-"""The joint distribution of inputs and outputs in the demonstrations, and the reference drawn from it.
+"""The joint distribution of inputs and outputs in the demonstrations, and the reference from it.
 
 The paper, section II-A.
 """
@@ -6,22 +6,27 @@ The paper, section II-A.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
+from kmp.linear_algebra import symmetric
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianMixture:
-    """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l): weights (K,), means (K, I+O), covariances (K, I+O, I+O). Read-only."""
+class GaussianMixture(Immutable):
+    """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l), K components over I + O dimensions. Read-only.
+
+    weights (K,), means (K, I+O) [unit], covariances (K, I+O, I+O) [unit^2]. Raises ValueError if
+    the weights are not of sum 1 or one is below 0, and as `Gaussians` does.
+    """
 
     weights: Array
     means: Array
@@ -37,22 +42,24 @@ class GaussianMixture:
         object.__setattr__(self, "means", components.mean)
         object.__setattr__(self, "covariances", components.covariance)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
-
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
-        """The mixture of full covariances that EM finds from a k-means start; samples (M, I+O), the inputs first.
+        """The mixture that EM finds from a k-means start: samples (M, I+O), the inputs first.
 
-        `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2 where the unit is the
-        metre. The same seed gives the same mixture, whatever the number of threads.
+        `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2
+        where the unit is the metre. The same seed gives the same mixture, whatever the number of
+        threads.
+
+        Raises ValueError if the shape is another, a number is not finite, there are fewer samples
+        than components, or a parameter is out of its range.
         """
         data = numbers("samples", samples, "M", "I+O")
         positive("regularization", regularization)
         if components < 1:
             raise ValueError(f"components is {components}, and must be at least 1.")
         if len(data) < components:
-            raise ValueError(f"{len(data)} samples given for {components} components: give at least {components} samples, or fewer components.")
+            given = f"{len(data)} samples given for {components} components"
+            raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
         # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
         from sklearn.mixture import GaussianMixture as Estimator
         from threadpoolctl import threadpool_limits
@@ -67,13 +74,15 @@ class GaussianMixture:
                 tol=_TOLERANCE,
                 max_iter=_ITERATIONS,
             ).fit(data)
-        covariances = (found.covariances_ + found.covariances_.swapaxes(1, 2)) / 2
-        return cls(found.weights_, found.means_, covariances)
+        return cls(found.weights_, found.means_, symmetric(found.covariances_))
 
     def regress(self, inputs: ArrayLike) -> Gaussians:
-        """xi | s at each input (N, I), by Gaussian mixture regression: the conditional mixture's mean and covariance.
+        """xi | s at each input (N, I): N normals, by Gaussian mixture regression.
 
-        The covariance follows the law of total variance: the components' own, and that of their means about the mean.
+        They have the conditional mixture's mean and covariance; by the law of total variance, that
+        is the covariance within the components and that of their means about the mean.
+
+        Raises ValueError if the shape is another, a number is not finite, or no output is left.
         """
         s = numbers("inputs", inputs, "N", "I")
         i = self._checked_dimensions(s.shape[1])
@@ -90,12 +99,16 @@ class GaussianMixture:
         means = self.means[:, i:] + np.einsum("nki,kio->nko", to_input, gain)
         within = self.covariances[:, i:, i:] - across.transpose(0, 2, 1) @ gain  # (K, O, O)
         mean = np.einsum("nk,nko->no", share, means)
-        spread = means - mean[:, None, :]
-        covariance = np.einsum("nk,kop->nop", share, within) + np.einsum("nk,nko,nkp->nop", share, spread, spread)
-        return Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2)
+        apart = means - mean[:, None, :]
+        covariance = np.einsum("nk,kop->nop", share, within)
+        covariance = covariance + np.einsum("nk,nko,nkp->nop", share, apart, apart)
+        return Gaussians(mean, symmetric(covariance))
 
     def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
-        """Inputs (count, I) drawn from the marginal P(s), I = `dimensions`: the reference's, if not driven by time."""
+        """Inputs (count, I) drawn from the marginal P(s), with I = `dimensions`: a reference's.
+
+        Raises ValueError if the count is below 1, or no output is left.
+        """
         if count < 1:
             raise ValueError(f"count is {count}, and must be at least 1.")
         i = self._checked_dimensions(dimensions)
@@ -108,5 +121,6 @@ class GaussianMixture:
     def _checked_dimensions(self, inputs: int) -> int:
         total = self.means.shape[1]
         if not 1 <= inputs < total:
-            raise ValueError(f"{inputs} input dimensions given; this mixture of {total} dimensions in all takes 1 to {total - 1}.")
+            takes = f"this mixture of {total} dimensions in all takes 1 to {total - 1}"
+            raise ValueError(f"{inputs} input dimensions given; {takes}.")
         return inputs

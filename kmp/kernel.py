@@ -1,69 +1,78 @@
-"""The kernels that stand for the basis functions: how alike two inputs are (the paper, equation (7)).
+"""The kernels that stand for the basis functions: how alike two inputs are. Equation (7).
 
-A kernel has C channels: 1 where the outputs are values, 2 where they are a value and its rate. Rows and columns of its
-matrices are (point, channel), the channel running faster, so that O = C D outputs share each entry D times.
+A kernel has C channels: 1 where the outputs are values, 2 where they are a value and its rate. Rows
+and columns of its matrices are (point, channel), the channel running faster, so that the O = C D
+outputs share each entry D times.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, frozen, numbers, positive, unpickled
+from kmp.checks import Array, numbers, positive
+from kmp.immutable import Immutable, frozen
 
 
 class Kernel(Protocol):
-    """What a primitive asks of its kernel. R centres, I inputs, C channels, D outputs a channel, O = C D."""
+    """What a primitive asks of its kernel. R centres, I inputs, C channels, D outputs a channel.
+
+    `values`, `row`, `jacobian` and `curvature` serve one query s, where microseconds count. They
+    are functions of arrays alone, in the coordinates x = stretch * s, in which one scale serves all
+    inputs: of the offsets x - x_r (R, I) from the centres, and of the values (R,) there.
+    """
 
     @property
     def ell(self) -> float | Array:
-        """[1 / (unit of the inputs)^2] the parameter."""
+        """The parameter [1 / (unit of the inputs)^2]."""
 
     @property
     def channels(self) -> int:
         """C."""
 
     @property
-    def own(self) -> Array:
+    def prior_variance(self) -> Array:
         """k(s, s) (C, C), the same at every input."""
 
     def check(self, inputs: int, outputs: int) -> None:
         """Raises ValueError where the kernel does not go with so many inputs and outputs."""
 
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        """The scale, and the stretch (I,) of each input."""
+
     def __call__(self, a: Array, b: Array) -> Array:
         """k(a, b) for every pair: (A, I), (B, I) -> (A C, B C)."""
 
-    def row_at(self, offsets: Array) -> Array:
-        """k(s, s_r) of one query, from s - s_r (R, I): (R,) or (C, R C)."""
+    @staticmethod
+    def values(offsets: Array, scale: float) -> Array:
+        """exp(-scale |x - x_r|^2): (R,)."""
 
-    def jacobian_of(self, offsets: Array, rows: Array) -> Array:
-        """d/ds of sum_r k(s, s_r) w_r, with rows (D, R C) of the weights: (O, I)."""
+    @staticmethod
+    def row(offsets: Array, values: Array, scale: float) -> Array:
+        """k(s, s_r): (R,) where C is 1, else (C, R C)."""
 
-    def curvature_of(self, offsets: Array, direction: Array, weights: Array) -> Array:
-        """d^2/dt^2 of sum_r k(s + t v, s_r) w_r at t = 0, with weights (R C, D): (O,)."""
+    @staticmethod
+    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
+        """d/dx of sum_r k(s, s_r) w_r, with the weights' rows (D, R C): (O, I)."""
 
-
-def spread(blocks: Array, copies: int) -> Array:
-    """x (x) I for blocks (..., C, C) and a unit matrix of size D = `copies`: (..., C D, C D)."""
-    c = blocks.shape[-1]
-    wide = blocks[..., :, None, :, None] * np.eye(copies)[:, None, :]
-    return np.asarray(wide.reshape(*blocks.shape[:-2], c * copies, c * copies))
+    @staticmethod
+    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
+        """d^2/dt^2 of that sum at x + t v for t = 0, with v (I,) and the weights (R C, D): (O,)."""
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianKernel:
-    """The kernel k(s, s') = exp(-ell |s - s'|^2), section III of the paper; `ell` in 1 / (unit of the inputs)^2.
+class GaussianKernel(Immutable):
+    """k(s, s') = exp(-ell |s - s'|^2), `ell` in 1 / (unit of the inputs)^2. The paper, section III.
 
-    Given as an array (I,), `ell` has one value for each input: k(s, s') = exp(-sum_i ell_i (s_i - s'_i)^2).
-
-    Two sets of inputs go into the call and into `gradient`. The methods `..._at` and `..._of` are for one query at a
-    time, where the microseconds count: they take its offsets s - s_n (N, I) from N inputs.
+    Given as an array (I,), `ell` has one value for each input, to multiply (s_i - s'_i)^2 with. The
+    methods are those of `Kernel`. Raises ValueError unless every ell is finite and above 0.
     """
 
+    channels: ClassVar[int] = 1
     ell: float | Array
 
     def __post_init__(self) -> None:
@@ -81,136 +90,107 @@ class GaussianKernel:
     def __hash__(self) -> int:
         return hash(np.asarray(self.ell).tobytes())
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
-
-    @property
-    def channels(self) -> int:
-        """1: the outputs are values."""
-        return 1
-
     @cached_property
-    def own(self) -> Array:
-        """k(s, s) = 1."""
+    def prior_variance(self) -> Array:
         return frozen(np.ones((1, 1)))
 
-    @cached_property
-    def _scalar(self) -> float:
-        # The parameter in coordinates stretched so that one number does.
-        return self.ell if isinstance(self.ell, float) else 1.0
-
-    @cached_property
-    def _stretch(self) -> Array | None:
-        return None if isinstance(self.ell, float) else frozen(np.sqrt(self.ell))
-
     def check(self, inputs: int, outputs: int) -> None:
-        """One ell for each input, or one for all."""
-        if self._stretch is not None and len(self._stretch) != inputs:
-            raise ValueError(f"ell: {len(self._stretch)} values given, 1 or {inputs} needed for {inputs} inputs.")
+        """Raises ValueError unless there is one ell for each input, or one for all."""
+        if np.ndim(self.ell) and np.size(self.ell) != inputs:
+            raise ValueError(f"ell: {np.size(self.ell)} values given, 1 or {inputs} needed for {inputs} inputs.")
+
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        if np.ndim(self.ell):
+            return 1.0, frozen(np.sqrt(self.ell))
+        return float(self.ell), frozen(np.ones(inputs))
 
     def __call__(self, a: Array, b: Array) -> Array:
-        """k(a, b) for every pair: (A, I), (B, I) -> (A, B)."""
-        if self._stretch is not None:
-            a, b = a * self._stretch, b * self._stretch
-        return np.exp(-self._scalar * cdist(a, b, "sqeuclidean"))
+        scale, stretch = self.coordinates(a.shape[1])
+        return np.exp(-scale * cdist(a * stretch, b * stretch, "sqeuclidean"))
 
-    def gradient(self, a: Array, b: Array) -> Array:
-        """dk(a, b)/da for every pair: (A, I), (B, I) -> (A, B, I)."""
-        offsets = a[:, None, :] - b[None, :, :]
-        return np.asarray(-2 * self.ell * self(a, b)[:, :, None] * offsets)
-
-    def value_at(self, offsets: Array) -> Array:
-        """k(s, s_n): (N, I) -> (N,)."""
-        if self._stretch is not None:
-            offsets = offsets * self._stretch
+    @staticmethod
+    def values(offsets: Array, scale: float) -> Array:
         value = np.vecdot(offsets, offsets)
-        value *= -self._scalar
+        value *= -scale
         return np.asarray(np.exp(value, value))
 
-    row_at = value_at
+    @staticmethod
+    def row(offsets: Array, values: Array, scale: float) -> Array:
+        return values
 
-    def slope_at(self, offsets: Array) -> Array:
-        """What each offset is multiplied by to give dk(s, s_n)/ds, but for ell if that is an array: (N, I) -> (N,)."""
-        value = self.value_at(offsets)
-        value *= -2 * self._scalar
-        return value
+    @staticmethod
+    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
+        return np.asarray((weight_rows * (values * (-2 * scale))) @ offsets)
 
-    def curvature_at(self, offsets: Array, direction: Array) -> Array:
-        """d^2 k(s + t v, s_n)/dt^2 at t = 0 along the direction v: (N, I), (I,) -> (N,)."""
-        value = self.value_at(offsets)
-        if self._stretch is not None:
-            offsets, direction = offsets * self._stretch, direction * self._stretch
-        slope = (2 * self._scalar) * (offsets @ direction)
-        return np.asarray(value * (slope * slope - 2 * self._scalar * float(direction @ direction)))
-
-    def jacobian_of(self, offsets: Array, rows: Array) -> Array:
-        """d/ds of sum_r k(s, s_r) w_r, rows (O, R): (O, I)."""
-        jacobian = (rows * self.slope_at(offsets)) @ offsets
-        return np.asarray(jacobian if self._stretch is None else jacobian * self.ell)
-
-    def curvature_of(self, offsets: Array, direction: Array, weights: Array) -> Array:
-        """d^2/dt^2 of sum_r k(s + t v, s_r) w_r at t = 0, weights (R, O): (O,)."""
-        return self.curvature_at(offsets, direction) @ weights
+    @staticmethod
+    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
+        slope = (2 * scale) * (offsets @ direction)
+        return np.asarray((values * (slope * slope - 2 * scale * float(direction @ direction))) @ weights)
 
 
 @dataclass(frozen=True)
-class VelocityKernel:
-    """The kernel of skills driven by time whose outputs are a value and its rate: [xi, dxi/dt], 2 D outputs.
+class VelocityKernel(Immutable):
+    """The kernel of skills over time whose 2 D outputs are a value and its rate: [xi, dxi/dt].
 
-    IJRR 2019, section on time-driven trajectories: k(t, t') and its derivatives, exact, so that a via-point can fix the
-    velocity too. With r = t - t' the block of two points is [[k, 2 ell r k], [-2 ell r k, (2 ell - 4 ell^2 r^2) k]];
-    `ell` in 1 / (unit of time)^2. One input.
+    k(t, t') and its derivatives, exact, so that a via-point can fix the velocity too (IJRR 2019, on
+    time-driven trajectories). With r = t - t' the block of two points is
+    [[k, 2 ell r k], [-2 ell r k, (2 ell - 4 ell^2 r^2) k]]; `ell` in 1 / (unit of time)^2. It
+    takes one input. The methods are those of `Kernel`. Raises ValueError unless ell is finite and
+    above 0.
     """
 
+    channels: ClassVar[int] = 2
     ell: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ell", positive("ell", self.ell))
 
-    @property
-    def channels(self) -> int:
-        """2: value and rate."""
-        return 2
-
     @cached_property
-    def own(self) -> Array:
-        """k(t, t) (2, 2)."""
+    def prior_variance(self) -> Array:
         return frozen(np.diag([1.0, 2 * self.ell]))
 
     def check(self, inputs: int, outputs: int) -> None:
-        """One input, and as many rates as values."""
+        """Raises ValueError unless there is one input, and there are as many rates as values."""
         if inputs != 1 or outputs % 2:
             raise ValueError(
                 f"{inputs} inputs and {outputs} outputs given; value and rate over time need "
                 "1 input and an even number of outputs: the values, then their rates."
             )
 
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        return self.ell, frozen(np.ones(inputs))
+
     def __call__(self, a: Array, b: Array) -> Array:
-        """k(a, b) for every pair: (A, 1), (B, 1) -> (2 A, 2 B)."""
-        return self._blocks(a - b.T, 0).transpose(0, 2, 1, 3).reshape(2 * len(a), 2 * len(b))
+        r = a - b.T
+        blocks = _rate_blocks(r, np.exp(-self.ell * r * r), self.ell, order=0)
+        return blocks.transpose(0, 2, 1, 3).reshape(2 * len(a), 2 * len(b))
 
-    def row_at(self, offsets: Array) -> Array:
-        """k(t, t_r): (R, 1) -> (2, 2 R)."""
-        return self._row(offsets, 0)
+    @staticmethod
+    def values(offsets: Array, scale: float) -> Array:
+        r = offsets[:, 0]
+        return np.asarray(np.exp(-scale * r * r))
 
-    def jacobian_of(self, offsets: Array, rows: Array) -> Array:
-        """d/dt of sum_r k(t, t_r) w_r, rows (D, 2 R): (O, 1)."""
-        return np.asarray((self._row(offsets, 1) @ rows.T).reshape(-1, 1))
-
-    def curvature_of(self, offsets: Array, direction: Array, weights: Array) -> Array:
-        """d^2/dt^2 of sum_r k(t, t_r) w_r times the direction squared, weights (2 R, D): (O,)."""
-        return np.asarray((self._row(offsets, 2) @ weights).ravel() * float(direction @ direction))
-
-    def _row(self, offsets: Array, order: int) -> Array:
-        blocks = self._blocks(offsets.T, order)[0]  # (R, 2, 2)
+    @staticmethod
+    def row(offsets: Array, values: Array, scale: float, order: int = 0) -> Array:
+        """The row, or its derivative of that order by t."""
+        blocks = _rate_blocks(offsets[:, 0], values, scale, order)
         return np.ascontiguousarray(blocks.transpose(1, 0, 2)).reshape(2, -1)
 
-    def _blocks(self, r: Array, order: int) -> Array:
-        """The derivative of that order with respect to t, r (A, B): (A, B, 2, 2)."""
-        # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
-        k = [np.exp(-self.ell * r * r)]
-        k.append(-2 * self.ell * r * k[0])
-        for n in range(1, order + 2):
-            k.append(-2 * self.ell * (r * k[n] + n * k[n - 1]))
-        a, b, c = k[order : order + 3]
-        return np.stack([a, -b, b, -c], axis=-1).reshape(*r.shape, 2, 2)
+    @staticmethod
+    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
+        return np.asarray((VelocityKernel.row(offsets, values, scale, 1) @ weight_rows.T).reshape(-1, 1))
+
+    @staticmethod
+    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
+        row = VelocityKernel.row(offsets, values, scale, 2)
+        return np.asarray((row @ weights).ravel() * float(direction @ direction))
+
+
+def _rate_blocks(r: Array, values: Array, ell: float, order: int) -> Array:
+    """The derivative of that order by t of the kernel's blocks at r = t - t' (...): (..., 2, 2)."""
+    # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
+    k = [values, -2 * ell * r * values]
+    for n in range(1, order + 2):
+        k.append(-2 * ell * (r * k[n] + n * k[n - 1]))
+    a, b, c = k[order : order + 3]
+    return np.stack([a, -b, b, -c], axis=-1).reshape(*r.shape, 2, 2)

@@ -1,30 +1,36 @@
 """Orientation as a skill: unit quaternions in a tangent space, with angular velocity.
 
-Huang et al., Generalized Orientation Learning in Robot Task Space, ICRA 2019, and Toward Orientation Learning and
-Adaptation in Cartesian Space, T-RO 2021 ("T-RO"). zeta = log(q conj(q_a)) (3) lies in the tangent space at an auxiliary
-quaternion q_a; |zeta| is half of the angle of rotation. Quaternions are x y z w, and q and -q are one orientation;
-rotations multiply from the left, so that axes, angular velocities and deviations are those of the world.
+Huang et al., Generalized Orientation Learning in Robot Task Space, ICRA 2019, and Toward
+Orientation Learning and Adaptation in Cartesian Space, T-RO 2021 ("T-RO"). zeta = log(q conj(q_a))
+(3) lies in the tangent space at an auxiliary quaternion q_a; |zeta| is half of the angle of
+rotation. Quaternions are x y z w, and q and -q are one orientation; rotations multiply from the
+left, so that axes, angular velocities and deviations are those of the world.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, frozen, numbers, unpickled
+from kmp.checks import Array, numbers
 from kmp.gaussians import Gaussians
+from kmp.immutable import Immutable, frozen
+from kmp.linear_algebra import symmetric
 from kmp.primitive import KMP
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
 _CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
 _UNIT = 1e-3  # of the norm: what is farther from 1 was not meant to be a unit quaternion
+_FREE = 1e6  # times the largest variance of the reference: the deviation of a rate that may be any
 
 
 def continuous(quaternions: ArrayLike) -> Array:
-    """The same orientations (T, 4), of norm 1, with signs such that neighbours are near each other. x y z w."""
+    """The same orientations (T, 4), of norm 1, with signs that make neighbours near. x y z w.
+
+    Raises ValueError if the shape is another, a number is not finite, or a norm is far from 1.
+    """
     q = _unit("quaternions", quaternions).copy()
     signs = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     q[1:] *= np.cumprod(signs)[:, None]
@@ -32,35 +38,43 @@ def continuous(quaternions: ArrayLike) -> Array:
 
 
 def multiplied(a: Array, b: Array) -> Array:
-    """The products a b (..., 4): first b, then a. x y z w."""
+    """The products a b (..., 4): first b, then a. x y z w. Raises ValueError if shapes differ."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
 
 
 def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
-    """zeta = log(q conj(q_a)) (T, 3) [rad, half the angle]. T-RO, section II; signs as they are given.
+    """zeta = log(q conj(q_a)) (T, 3) [rad, half the angle], for q (T, 4), q_a (4,).
 
-    Defined for all but q = -q_a, where the angle of rotation would be 360 degrees.
+    T-RO, section II. Signs count as they are given. Raises ValueError if a shape is another, a
+    number is not finite, a norm is far from 1, or q = -q_a, where the angle of rotation would be
+    360 degrees.
     """
-    q = multiplied(_unit("quaternions", quaternions), _unit("auxiliary", np.atleast_2d(auxiliary))[0] * _CONJUGATE)
+    q_a = _unit("auxiliary", np.atleast_2d(auxiliary))[0]
+    q = multiplied(_unit("quaternions", quaternions), q_a * _CONJUGATE)
     length = np.linalg.norm(q[:, :3], axis=1, keepdims=True)
     angle = np.arctan2(length, q[:, 3:])
     for n in np.flatnonzero(angle > np.pi - 1e-6)[:1]:
         raise ValueError(f"quaternions[{n}] is the auxiliary one with the sign changed: give -q, the same orientation.")
-    return np.asarray(np.where(length > _TINY, angle / np.maximum(length, _TINY), 1 + length**2 / 6) * q[:, :3])
+    series = 1 + length**2 / 6
+    return np.asarray(np.where(length > _TINY, angle / np.maximum(length, _TINY), series) * q[:, :3])
 
 
 def exp(zeta: Array, auxiliary: Array) -> Array:
-    """q = exp(zeta) q_a (T, 4) for zeta (T, 3) [rad, half the angle]. T-RO, section II. x y z w."""
+    """q = exp(zeta) q_a (T, 4) for zeta (T, 3) [rad, half the angle], q_a (4,). x y z w.
+
+    T-RO, section II. Raises ValueError if a shape is another.
+    """
     angle = np.linalg.norm(zeta, axis=1, keepdims=True)
     return multiplied(np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary)
 
 
 def rotation_per_zeta(zeta: ArrayLike) -> Array:
-    """J (3, 3): small rotations [rad], and angular velocities, are J times changes of zeta, here (3,).
+    """J (3, 3): small rotations [rad] and angular velocities are J times changes of zeta (3,).
 
-    Twice the left Jacobian of the rotation by 2 zeta: exact where the papers take differences over a step of time.
+    Twice the left Jacobian of the rotation by 2 zeta: exact where the papers take differences over
+    a step of time. Raises ValueError if the shape is another or a number is not finite.
     """
     vector = 2 * numbers("zeta", zeta, 3)
     angle = float(np.linalg.norm(vector))
@@ -73,12 +87,13 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class OrientationKMP:
-    """A skill whose output is an orientation: a primitive of zeta, or over time of zeta with its rate. Immutable.
+class OrientationKMP(Immutable):
+    """A skill whose output is an orientation: a primitive of zeta, over time with its rate.
 
-    Learn it so: make each demonstration's quaternions `continuous`, take `log` with a common auxiliary quaternion
-    (any in the midst of them), learn a reference of zeta (with its rate, and a VelocityKernel, if driven by time), and
-    fit the primitive.
+    Learn it so: make each demonstration's quaternions `continuous`, take `log` with a common
+    auxiliary quaternion (any in the midst of them), learn a reference of zeta (with its rate, and a
+    VelocityKernel, if driven by time), and fit the primitive. Raises ValueError if the primitive
+    has other outputs, or the auxiliary quaternion is none.
     """
 
     primitive: KMP
@@ -87,32 +102,34 @@ class OrientationKMP:
 
     def __post_init__(self) -> None:
         wanted = 3 * self.primitive.kernel.channels
-        if self.primitive.outputs != wanted:
-            raise ValueError(f"primitive: {self.primitive.outputs} outputs given, {wanted} needed for an orientation.")
-        object.__setattr__(self, "auxiliary", frozen(_unit("auxiliary", np.atleast_2d(self.auxiliary))[0].copy()))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
+        if (outputs := self.primitive.outputs) != wanted:
+            raise ValueError(f"primitive: {outputs} outputs given, {wanted} needed for an orientation.")
+        auxiliary = _unit("auxiliary", np.atleast_2d(self.auxiliary))[0]
+        object.__setattr__(self, "auxiliary", frozen(auxiliary.copy()))
 
     def mean(self, queries: ArrayLike) -> Array:
-        """The orientations (M, 4) at queries (M, I). x y z w."""
+        """The orientations (M, 4) at queries (M, I), x y z w. Raises ValueError as `KMP.mean`."""
         return exp(self.primitive.mean(queries)[:, :3], self.auxiliary)
 
     def predict(self, queries: ArrayLike) -> tuple[Array, Array]:
-        """The orientations (M, 4), and the covariances (M, 3, 3) [rad^2] of small rotations from them, at (M, I)."""
+        """The orientations (M, 4) at queries (M, I), and covariances (M, 3, 3) [rad^2] about them.
+
+        The covariances are of small rotations, in the world. Raises ValueError as `KMP.predict`.
+        """
         found = self.primitive.predict(queries)
         zeta = found.mean[:, :3]
         turn = np.array([rotation_per_zeta(one) for one in zeta]).reshape(-1, 3, 3)
         return exp(zeta, self.auxiliary), turn @ found.covariance[:, :3, :3] @ turn.transpose(0, 2, 1)
 
     def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
-        """omega (3,) [rad/s] at one query (I,) whose input moves with the velocity (I,) [unit of the inputs/s].
+        """omega (3,) [rad/s] at one query (I,) that moves with (I,) [unit of the inputs / s].
 
-        Over time the velocity of the input is 1.
+        Over time the velocity of the input is 1. Raises ValueError if a shape is another or a
+        number is not finite.
         """
         s = np.asarray(query, dtype=np.float64)
-        rate = self.primitive.jacobian(s)[:3] @ numbers("velocity", velocity, len(s))
-        return np.asarray(rotation_per_zeta(self.primitive.mean(s[None])[0, :3]) @ rate)
+        moving = self.primitive.predict_motion(s, velocity, np.zeros_like(s), covariance=False)
+        return np.asarray(rotation_per_zeta(moving.mean[:3]) @ moving.velocity[:3])
 
     def adapt(
         self,
@@ -124,53 +141,59 @@ class OrientationKMP:
         angular_velocities: ArrayLike | None = None,
         velocity_covariance: ArrayLike | None = None,
     ) -> OrientationKMP:
-        """A new skill that also goes through orientations (V, 4) at inputs (V, I). Of q and -q, the nearer is taken.
+        """A new skill that also goes through orientations (V, 4) at inputs (V, I). x y z w.
 
-        `covariance` (3, 3) or (V, 3, 3) [rad^2] is of small rotations. Skills over time take angular velocities too,
-        (V, 3) [rad/s] with their covariance [(rad/s)^2]; left out, they are free.
+        Of q and -q, the nearer is taken. `covariance` (3, 3) or (V, 3, 3) [rad^2] is of small
+        rotations. Skills over time take angular velocities too, (V, 3) [rad/s] with their
+        covariance [(rad/s)^2]; left out, they are free. `tolerance` [unit of the inputs] is that of
+        `KMP.adapt`.
+
+        Raises ValueError as that does, if a quaternion is none, or if rates do not go with the
+        skill.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
         q = numbers("quaternions", quaternions, len(where), 4)
         zeta = self._nearest(where, q)
         back = np.array([np.linalg.inv(rotation_per_zeta(one)) for one in zeta]).reshape(-1, 3, 3)
-        spread = back @ _each("covariance", covariance, len(where)) @ back.transpose(0, 2, 1)
+        turned = back @ _each("covariance", covariance, len(where)) @ back.transpose(0, 2, 1)
         if self.primitive.kernel.channels == 1:
             if angular_velocities is not None or velocity_covariance is not None:
-                raise ValueError("angular_velocities: this skill's outputs have no rates; fit it with a VelocityKernel.")
-            return self._adapted(where, Gaussians(zeta, _symmetric(spread)), tolerance)
+                raise ValueError("angular_velocities: the skill has no rates; fit it with a VelocityKernel.")
+            return self._adapted(where, Gaussians(zeta, symmetric(turned)), tolerance)
         if (angular_velocities is None) != (velocity_covariance is None):
             raise ValueError("angular_velocities and velocity_covariance: give both, or none.")
-        now = self.primitive.mean(where)[:, 3:]
-        rates, loose = now, np.tile(1e6 * np.max(np.abs(self.primitive.reference.covariance)) * np.eye(3), (len(where), 1, 1))
-        if angular_velocities is not None and velocity_covariance is not None:
+        if angular_velocities is None or velocity_covariance is None:
+            rates = self.primitive.mean(where)[:, 3:]
+            variance = _FREE * np.max(np.abs(self.primitive.reference.covariance))
+            rate_covariance = np.tile(variance * np.eye(3), (len(where), 1, 1))
+        else:
             omega = numbers("angular_velocities", angular_velocities, len(where), 3)
             rates = (back @ omega[:, :, None])[:, :, 0]
-            loose = back @ _each("velocity_covariance", velocity_covariance, len(where)) @ back.transpose(0, 2, 1)
+            given = _each("velocity_covariance", velocity_covariance, len(where))
+            rate_covariance = back @ given @ back.transpose(0, 2, 1)
         whole = np.zeros((len(where), 6, 6))
-        whole[:, :3, :3], whole[:, 3:, 3:] = spread, loose
-        return self._adapted(where, Gaussians(np.hstack([zeta, rates]), _symmetric(whole)), tolerance)
+        whole[:, :3, :3], whole[:, 3:, 3:] = turned, rate_covariance
+        return self._adapted(where, Gaussians(np.hstack([zeta, rates]), symmetric(whole)), tolerance)
 
     def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float) -> OrientationKMP:
         return OrientationKMP(self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary)
 
     def _nearest(self, inputs: Array, quaternions: Array) -> Array:
-        # The sign that is nearer to what the skill does there now.
+        """zeta (V, 3) of the signs that are nearer to what the skill does there now."""
         signs = np.where((self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-        return log(signs * quaternions, self.auxiliary) if len(inputs) else np.zeros((0, 3))
+        return log(signs * quaternions, self.auxiliary)
 
 
 def _unit(name: str, quaternions: ArrayLike) -> Array:
     q = numbers(name, quaternions, "T", 4)
     length = np.linalg.norm(q, axis=1, keepdims=True)
     for n in np.flatnonzero(np.abs(length - 1) > _UNIT)[:1]:
-        raise ValueError(f"{name}[{n}] has norm {length[n, 0]:.4g}, and must have 1. Divide by it, if that is what is meant.")
+        norm = f"{length[n, 0]:.4g}"
+        raise ValueError(f"{name}[{n}] has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
     return np.asarray(q / length)
 
 
 def _each(name: str, covariance: ArrayLike, count: int) -> Array:
     given = np.asarray(covariance, dtype=np.float64)
-    return numbers(name, np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given, count, 3, 3)
-
-
-def _symmetric(covariance: Array) -> Array:
-    return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
+    each = np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given
+    return numbers(name, each, count, 3, 3)

@@ -1,50 +1,67 @@
-"""References from others: several in one by priority, and frames that move with the task (IJRR 2019)."""
+"""References from others: several in one by priority, and frames that move with the task.
+
+Both as in IJRR 2019.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, unpickled
-from kmp.gaussians import Gaussians, check_pairs
+from kmp.checks import Array, numbers
+from kmp.gaussians import Gaussians, check_pairs, fused_mean
 from kmp.gmm import GaussianMixture
+from kmp.immutable import Immutable
 from kmp.kernel import Kernel
+from kmp.linear_algebra import symmetric
 from kmp.primitive import KMP
 
 
 def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussians:
-    """The reference that L references over the same N inputs agree on, by their priorities (L,) or (L, N), of sum 1.
+    """The reference that L references over the same N inputs agree on, by their priorities.
 
-    Sigma = (sum_l (Sigma_l / g_l)^-1)^-1, mu = Sigma sum_l (Sigma_l / g_l)^-1 mu_l. IJRR 2019, superposition. A
-    reference of priority 0 has no say; priorities that change along the inputs blend from one reference to the next.
+    Priorities (L,) or (L, N) have the sum 1: Sigma = (sum_l (Sigma_l / g_l)^-1)^-1,
+    mu = Sigma sum_l (Sigma_l / g_l)^-1 mu_l. A reference of priority 0 has no say; priorities that
+    change along the inputs blend from one reference to the next. IJRR 2019, superposition.
+
+    Raises ValueError if there is no reference, shapes do not agree, or a priority is below 0 or
+    their sum is not 1.
     """
     if len(references) == 0:
         raise ValueError("references: none given, at least 1 needed.")
-    first = references[0]
-    for n, other in enumerate(references):
-        if other.mean.shape != first.mean.shape:
-            raise ValueError(f"references[{n}]: means of shape {other.mean.shape} given, {first.mean.shape} needed.")
-    given = np.asarray(priorities, dtype=np.float64)
-    g = numbers("priorities", given[:, None] if given.ndim == 1 else given, len(references), "N")
-    if g.shape[1] not in {1, len(first)}:
-        raise ValueError(f"priorities: shape {given.shape} given, ({len(references)},) or {(len(references), len(first))} needed.")
-    if (g < 0).any() or np.abs(g.sum(axis=0) - 1).max() > 1e-6:
-        raise ValueError(f"priorities: from {g.min():g}, of sum {g.sum(axis=0)[0]:g} given; needed are sums of 1, none below 0.")
-    precisions = [weight[:, None, None] * np.linalg.inv(one.covariance) for weight, one in zip(g, references, strict=True)]
+    n, outputs = references[0].mean.shape
+    for i, other in enumerate(references):
+        if other.mean.shape != (n, outputs):
+            raise ValueError(f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed.")
+    g = _priorities(priorities, len(references), n)
+    inverses = [np.linalg.inv(one.covariance) for one in references]
+    precisions = [weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)]
     covariance = np.linalg.inv(np.sum(precisions, axis=0))
-    pulls = [precision @ one.mean[:, :, None] for precision, one in zip(precisions, references, strict=True)]
-    return Gaussians((covariance @ np.sum(pulls, axis=0))[:, :, 0], (covariance + covariance.swapaxes(1, 2)) / 2)
+    return Gaussians(fused_mean(covariance, precisions, references), symmetric(covariance))
+
+
+def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
+    """The priorities (L, N) or (L, 1), checked."""
+    given = np.asarray(priorities, dtype=np.float64)
+    g = numbers("priorities", given[:, None] if given.ndim == 1 else given, count, "N")
+    if g.shape[1] not in {1, n}:
+        raise ValueError(f"priorities: shape {given.shape} given, ({count},) or {(count, n)} needed.")
+    least, total = g.min(), g.sum(axis=0)
+    if least < 0 or np.abs(total - 1).max() > 1e-6:
+        raise ValueError(f"priorities: from {least:g}, of sum {total[0]:g} given; needed are sums of 1, none below 0.")
+    return g
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """Task parameters (A, b): where a frame lies, xi = A xi' + b for its coordinates xi'. matrix (O, O), offset (O,).
+class CoordinateFrame(Immutable):
+    """Task parameters (A, b): xi = A xi' + b for coordinates xi' in the frame. Read-only.
 
-    Read-only. Rotations and translations keep the unit; any matrix that can be inverted will do.
+    matrix (O, O), offset (O,) [unit of the outputs]. Rotations and translations keep the unit; any
+    matrix that can be inverted will do. Raises ValueError if shapes do not agree, a number is not
+    finite, or the matrix has no inverse.
     """
 
     matrix: Array
@@ -58,56 +75,66 @@ class Frame:
         object.__setattr__(self, "offset", offset)
         object.__setattr__(self, "matrix", matrix)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(unpickled(state))
-
     @classmethod
-    def at(cls, origin: ArrayLike) -> Frame:
-        """The frame at an origin (O,), not turned: a start, or a goal."""
+    def at(cls, origin: ArrayLike) -> CoordinateFrame:
+        """The frame at an origin (O,), not turned: a start, or a goal.
+
+        Raises ValueError if the shape is another or a number is not finite.
+        """
         offset = numbers("origin", origin, "O")
         return cls(np.eye(len(offset)), offset)
 
     @classmethod
-    def start_and_goal(cls, path: ArrayLike) -> tuple[Frame, Frame]:
-        """The frames at the first and the last point of a path (T, O)."""
+    def start_and_goal(cls, path: ArrayLike) -> tuple[CoordinateFrame, CoordinateFrame]:
+        """The frames at the first and the last point of a path (T, O).
+
+        Raises ValueError if the shape is another, a number is not finite, or there is no point.
+        """
         points = numbers("path", path, "T", "O")
+        if len(points) == 0:
+            raise ValueError("path: no point given, at least 1 needed.")
         return cls.at(points[0]), cls.at(points[-1])
 
-    def with_velocity(self) -> Frame:
-        """The frame of positions and their velocities, 2 O outputs: a velocity is turned and not moved."""
-        o = len(self.offset)
-        return Frame(np.asarray(np.kron(np.eye(2), self.matrix), dtype=np.float64), np.concatenate([self.offset, np.zeros(o)]))
+    def with_velocity(self) -> CoordinateFrame:
+        """The frame of values and their rates, 2 O outputs: a rate is turned and not moved."""
+        matrix = np.asarray(np.kron(np.eye(2), self.matrix), dtype=np.float64)
+        return CoordinateFrame(matrix, np.concatenate([self.offset, np.zeros(len(self.offset))]))
 
     def local(self, points: ArrayLike) -> Array:
-        """The coordinates in this frame of points (T, O)."""
-        return np.asarray(np.linalg.solve(self.matrix, (numbers("points", points, "T", len(self.offset)) - self.offset).T).T)
+        """The coordinates (T, O) in this frame of points (T, O).
+
+        Raises ValueError if the shape is another or a number is not finite.
+        """
+        moved = numbers("points", points, "T", len(self.offset)) - self.offset
+        return np.asarray(np.linalg.solve(self.matrix, moved.T).T)
 
     def localised(self, normals: Gaussians) -> Gaussians:
-        """The same normals in this frame's coordinates."""
+        """The same normals in this frame's coordinates. Raises ValueError if O is another."""
         inverse = np.linalg.inv(self.matrix)
         return normals.affine(inverse, -inverse @ self.offset)
 
     def placed(self, normals: Gaussians) -> Gaussians:
-        """The normals that are given in this frame's coordinates, in those of the world."""
+        """Normals of this frame's coordinates in the world's. Raises ValueError if O is another."""
         return normals.affine(self.matrix, self.offset)
 
 
 @dataclass(frozen=True, eq=False)
-class LocalKMP:
-    """A skill in F frames at once: one primitive in each one's coordinates, and where the frames are now. IJRR 2019.
+class LocalKMP(Immutable):
+    """A skill in F coordinate frames at once: a primitive in each, and where the frames are now.
 
-    From `learn`, for the frames of the last demonstration; `placed` moves it. Each frame's prediction is mapped back,
-    (A mu + b, A Sigma A^T), and the product of the normals is the prediction: the frame that is surer prevails.
+    From `learn`, for the frames of the last demonstration; `placed` moves it. Each frame's
+    prediction is mapped back, (A mu + b, A Sigma A^T), and the product of the normals is the
+    prediction: the frame that is surer prevails. IJRR 2019.
     """
 
     primitives: tuple[KMP, ...]
-    frames: tuple[Frame, ...]
+    frames: tuple[CoordinateFrame, ...]
 
     @classmethod
     def learn(
         cls,
         demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
-        frames: Sequence[Sequence[Frame]],
+        frames: Sequence[Sequence[CoordinateFrame]],
         inputs: ArrayLike,
         *,
         kernel: Kernel,
@@ -117,55 +144,72 @@ class LocalKMP:
         seed: int,
         regularization: float = 1e-6,
     ) -> LocalKMP:
-        """The skill of demonstrations, each inputs (T, I) and outputs (T, O), and F frames for each.
+        """The skill of demonstrations, each inputs (T, I), outputs (T, O), and F frames for each.
 
-        In each frame a mixture of `components` gives the reference at `inputs` (N, I), and that the primitive.
+        In each frame a mixture of `components` gives the reference at `inputs` (N, I), and that the
+        primitive. The other parameters are those of `GaussianMixture.fit` and `KMP.fit`.
+
+        Raises ValueError if not each demonstration has F frames, and as these two do.
         """
-        if len(frames) != len(demonstrations) or len(frames) == 0 or len({len(one) for one in frames}) != 1:
-            raise ValueError(f"frames: {[len(one) for one in frames]} given for {len(demonstrations)} demonstrations, as many for each needed.")
+        counts = [len(one) for one in frames]
+        if len(counts) != len(demonstrations) or len(set(counts)) != 1:
+            count = len(demonstrations)
+            raise ValueError(f"frames: {counts} given for {count} demonstrations, as many for each needed.")
         where = numbers("inputs", inputs, "N", "I")
         primitives = []
-        for f in range(len(frames[0])):
+        for f in range(counts[0]):
             samples = [
                 np.hstack([numbers("inputs", s, "T", where.shape[1]), frame[f].local(xi)])
                 for (s, xi), frame in zip(demonstrations, frames, strict=True)
             ]
-            mixture = GaussianMixture.fit(np.concatenate(samples), components=components, seed=seed, regularization=regularization)
+            mixture = GaussianMixture.fit(
+                np.concatenate(samples),
+                components=components,
+                seed=seed,
+                regularization=regularization,
+            )
             reference = mixture.regress(where)
             prior = reference.mean.mean(axis=0)
             prior[len(prior) // kernel.channels :] = 0
-            primitives.append(
-                KMP.fit(
-                    where,
-                    reference,
-                    kernel=kernel,
-                    lambda_mean=lambda_mean,
-                    lambda_covariance=lambda_covariance,
-                    prior_mean=prior,
-                )
+            primitive = KMP.fit(
+                where,
+                reference,
+                kernel=kernel,
+                lambda_mean=lambda_mean,
+                lambda_covariance=lambda_covariance,
+                prior_mean=prior,
             )
+            primitives.append(primitive)
         return cls(tuple(primitives), tuple(frames[-1]))
 
-    def placed(self, frames: Sequence[Frame]) -> LocalKMP:
-        """The skill with its frames elsewhere."""
+    def placed(self, frames: Sequence[CoordinateFrame]) -> LocalKMP:
+        """The skill with its F frames elsewhere. Raises ValueError if F or O is another."""
         if [len(frame.offset) for frame in frames] != [len(frame.offset) for frame in self.frames]:
-            raise ValueError(f"frames: {len(frames)} given, {len(self.frames)} over {len(self.frames[0].offset)} outputs needed.")
+            count, outputs = len(self.frames), len(self.frames[0].offset)
+            raise ValueError(f"frames: {len(frames)} given, {count} over {outputs} outputs needed.")
         return LocalKMP(self.primitives, tuple(frames))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
-        """xi(s) with its covariance at queries (M, I): the product of what the frames say."""
-        first, *others = (frame.placed(primitive.predict(queries)) for frame, primitive in zip(self.frames, self.primitives, strict=True))
+        """The product of what the frames predict at queries (M, I): M normals.
+
+        Raises ValueError as `KMP.predict` does.
+        """
+        pairs = zip(self.frames, self.primitives, strict=True)
+        first, *others = (frame.placed(primitive.predict(queries)) for frame, primitive in pairs)
         return first.product(*others)
 
     def mean(self, queries: ArrayLike) -> Array:
-        """xi(s) at queries (M, I): (M, O)."""
+        """The mean (M, O) [unit of the outputs] of `predict`. Raises ValueError as that does."""
         return self.predict(queries).mean
 
     def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> LocalKMP:
-        """A new skill through desired points (V, I), V normals in the world's coordinates: mapped into each frame."""
+        """A new skill through desired points (V, I), V normals in the world's coordinates.
+
+        They are mapped into each frame, where `tolerance` [unit of the inputs] is that of
+        `KMP.adapt`. Raises ValueError as that does.
+        """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
         check_pairs(via, desired, self.primitives[0].outputs)
-        adapted = [
-            primitive.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, primitive in zip(self.frames, self.primitives, strict=True)
-        ]
+        pairs = zip(self.frames, self.primitives, strict=True)
+        adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)
         return LocalKMP(tuple(adapted), self.frames)

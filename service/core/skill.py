@@ -58,19 +58,16 @@ class Skill:
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
         """
-        s = hands.reshape(6)
-        v = velocities.reshape(6)
-        if covariance is None:
-            normal = self.primitive.predict(s[None])
-            mean, covariance = normal.mean[0], np.round(normal.covariance[0], 10)
-        else:
-            mean = self.primitive.mean(s[None])[0]
-        jacobian = np.round(self.primitive.jacobian(s), 6)
-        curvature = self.primitive.curvature(s, v)
+        v, a = velocities.reshape(6), accelerations.reshape(6)
+        found = self.primitive.predict_motion(hands.reshape(6), v, a, covariance=covariance is None)
+        if found.covariance is not None:
+            covariance = np.round(found.covariance, 10)
+        assert covariance is not None
+        jacobian = np.round(found.jacobian, 6)
         return Prediction(
-            np.round(mean, 6),
+            np.round(found.mean, 6),
             np.round(jacobian @ v, 6),
-            np.round(jacobian @ accelerations.reshape(6) + curvature, 6),
+            np.round(jacobian @ a + found.curvature, 6),
             covariance,
             math.sqrt(float(np.trace(covariance)) / 3),
         )

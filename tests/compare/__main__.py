@@ -1,11 +1,12 @@
-"""The same demonstrations through this package and its peers: what each can do, how well, how fast. Table I, executed.
+"""The same demonstrations through this package and its peers: how well, how fast. Table I, run.
 
     pip install -e '.[compare]'
     OPENBLAS_NUM_THREADS=1 python -m tests.compare
 
-Two tasks. "Over time": a planar letter, 2 outputs, adapted to a via-point in its midst and to another end. "By hands": a
-tool that goes with two hands, 6 inputs, 3 outputs, adapted to a place that was not demonstrated. All in metres and
-seconds; errors are root mean squares on a demonstration that was left out, or distances at the adapted point.
+Two tasks. "Over time": a planar letter, 2 outputs, adapted to a via-point in its midst and to
+another end. "By hands": a tool that goes with two hands, 6 inputs, 3 outputs, adapted to a place
+that was not demonstrated. All in metres and seconds: the RMSE on a demonstration that was left
+out, or the distance at the adapted point.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ class Outcome(NamedTuple):
     mean_s: float | None = None
     covariance_s: float | None = None
     adapt_s: float | None = None
-    error_m: float | None = None
+    rmse_m: float | None = None
     via_m: float | None = None
     end_m: float | None = None
 
 
 class Data(NamedTuple):
-    """Demonstrations (inputs (T, I), outputs (T, O)), one held out, and desired points (inputs (1, I), outputs (1, O))."""
+    """Demonstrations: inputs (T, I), outputs (T, O), one held out. Points: (1, I), (1, O)."""
 
     demonstrations: list[tuple[np.ndarray, np.ndarray]]
     held_out: tuple[np.ndarray, np.ndarray]
@@ -96,7 +97,7 @@ def hands() -> Data:
     return Data(demonstrations[:5], demonstrations[5], (via[:, :6], via[:, 6:]), (end[:, :6], end[:, 6:]))
 
 
-def rms(found: np.ndarray, wanted: np.ndarray) -> float:
+def rmse(found: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.sqrt(((found - wanted) ** 2).sum(axis=-1).mean()))
 
 
@@ -105,20 +106,21 @@ def samples(data: Data) -> np.ndarray:
 
 
 def of_kmp(data: Data, ell: float, penalty: float) -> Outcome:
-    """With the paper's parameters. The fit is from the reference; what that costs is the fit of the mixture."""
+    """With the paper's parameters. The fit is from the reference, without that of the mixture."""
     inputs = data.demonstrations[0][0].shape[1]
     mixture = GaussianMixture.fit(samples(data), components=COMPONENTS, seed=0, regularization=1e-6)
     where = data.demonstrations[0][0] if inputs == 1 else mixture.sample_inputs(POINTS, dimensions=inputs, seed=0)
     reference = mixture.regress(where)
 
     def fit():
-        return KMP.fit(where, reference, kernel=GaussianKernel(ell), lambda_mean=penalty, prior_mean=reference.mean.mean(axis=0))
+        prior = reference.mean.mean(axis=0)
+        return KMP.fit(where, reference, kernel=GaussianKernel(ell), lambda_mean=penalty, prior_mean=prior)
 
     return measured("KMP (this package)", data, fit(), best(fit))
 
 
 def of_chosen_kmp(data: Data) -> Outcome:
-    """With lengths and lambdas by leaving one demonstration out; the fit is all of that, EM included."""
+    """With lengths and lambdas by leaving one demonstration out; the fit is all that, with EM."""
     start = time.perf_counter()
     learned = learn(data.demonstrations, components=COMPONENTS, seed=0, count=POINTS)
     return measured("KMP, parameters chosen", data, learned.primitive, time.perf_counter() - start)
@@ -136,8 +138,8 @@ def measured(name: str, data: Data, skill: KMP, fit_s: float) -> Outcome:
         best(lambda: skill.mean(query), 500),
         best(lambda: skill.predict(query), 200),
         best(lambda: adapt(data.via)),
-        rms(skill.mean(data.held_out[0]), data.held_out[1]),
-        *(rms(adapt(point).mean(point[0]), point[1]) for point in (data.via, data.end)),
+        rmse(skill.mean(data.held_out[0]), data.held_out[1]),
+        *(rmse(adapt(point).mean(point[0]), point[1]) for point in (data.via, data.end)),
     )
 
 
@@ -147,7 +149,14 @@ def of_regression(data: Data) -> Outcome:
 
     mixture, query = fit(), data.held_out[0][50:51]
     both = best(lambda: mixture.regress(query), 100)
-    return Outcome("GMM/GMR (this package)", best(fit, 3), both, both, None, rms(mixture.regress(data.held_out[0]).mean, data.held_out[1]))
+    return Outcome(
+        "GMM/GMR (this package)",
+        best(fit, 3),
+        both,
+        both,
+        None,
+        rmse(mixture.regress(data.held_out[0]).mean, data.held_out[1]),
+    )
 
 
 def of_gmr(data: Data) -> Outcome:
@@ -163,12 +172,12 @@ def of_gmr(data: Data) -> Outcome:
         best(lambda: mixture.predict(index, query), 50),
         best(lambda: mixture.condition(index, query[0]).to_mvn(), 50),
         None,
-        rms(mixture.predict(index, data.held_out[0]), data.held_out[1]),
+        rmse(mixture.predict(index, data.held_out[0]), data.held_out[1]),
     )
 
 
 def of_gaussian_process(data: Data, ell: float) -> Outcome:
-    """On the samples, thinned to as many points; a via-point is one more sample of small noise and a new fit."""
+    """On the samples, thinned to as many points; a via-point is one more, of small noise."""
     every = samples(data)[:: len(samples(data)) // POINTS]
     i = data.held_out[0].shape[1]
     scale = every[:, i:].mean(axis=0)
@@ -187,13 +196,13 @@ def of_gaussian_process(data: Data, ell: float) -> Outcome:
         best(lambda: process.predict(query), 200),
         best(lambda: process.predict(query, return_std=True), 200),
         best(lambda: fit(data.via)),
-        rms(process.predict(data.held_out[0]) + scale, data.held_out[1]),
-        *(rms(fit(point).predict(point[0]) + scale, point[1]) for point in (data.via, data.end)),
+        rmse(process.predict(data.held_out[0]) + scale, data.held_out[1]),
+        *(rmse(fit(point).predict(point[0]) + scale, point[1]) for point in (data.via, data.end)),
     )
 
 
 def of_promp(data: Data) -> Outcome:
-    """Whole trajectories: the time of a query is that of the 200 points. It is given copies, since it writes to times."""
+    """Whole trajectories: a query's time is that of 200 points. It writes to the times."""
     if data.held_out[0].shape[1] > 1:
         return Outcome("ProMP (movement_primitives)")
     t = data.demonstrations[0][0][:, 0]
@@ -207,6 +216,10 @@ def of_promp(data: Data) -> Outcome:
     def adapt(point):
         return promp.condition_position(point[1][0], y_cov=VARIANCE * np.eye(2), t=point[0][0, 0], t_max=2.0)
 
+    def missed(point):
+        path = adapt(point).mean_trajectory(t.copy())
+        return rmse(path[np.abs(t - point[0][0, 0]).argmin()], point[1][0])
+
     promp = fit()
     return Outcome(
         "ProMP (movement_primitives)",
@@ -214,13 +227,13 @@ def of_promp(data: Data) -> Outcome:
         best(lambda: promp.mean_trajectory(t.copy())) / len(t),
         best(lambda: (promp.mean_trajectory(t.copy()), promp.var_trajectory(t.copy()))) / len(t),
         best(lambda: adapt(data.via)),
-        rms(promp.mean_trajectory(t.copy()), data.held_out[1]),
-        *(rms(adapt(p).mean_trajectory(t.copy())[np.abs(t - p[0][0, 0]).argmin()], p[1][0]) for p in (data.via, data.end)),
+        rmse(promp.mean_trajectory(t.copy()), data.held_out[1]),
+        *(missed(point) for point in (data.via, data.end)),
     )
 
 
 def of_dmp(data: Data) -> Outcome:
-    """One demonstration, as a DMP has it: their mean. The time of a query is that of the open loop over the points."""
+    """One demonstration, their mean. A query's time is that of the open loop over the points."""
     if data.held_out[0].shape[1] > 1:
         return Outcome("DMP (movement_primitives)")
     t = data.demonstrations[0][0][:, 0]
@@ -244,13 +257,13 @@ def of_dmp(data: Data) -> Outcome:
         best(dmp.open_loop, 3) / len(t),
         None,
         best(lambda: other.configure(goal_y=data.end[1][0])),
-        rms(path[: len(t)], data.held_out[1][: len(path)]),
+        rmse(path[: len(t)], data.held_out[1][: len(path)]),
         None,
-        rms(other.open_loop()[1][-1], data.end[1][0]),
+        rmse(other.open_loop()[1][-1], data.end[1][0]),
     )
 
 
-COLUMNS = ("fit ms", "query us", "+ cov. us", "adapt ms", "error mm", "via mm", "end mm")
+COLUMNS = ("fit ms", "query us", "+ cov. us", "adapt ms", "RMSE mm", "via mm", "end mm")
 SCALES = (1e3, 1e6, 1e6, 1e3, 1e3, 1e3, 1e3)
 
 
@@ -258,12 +271,13 @@ def printed(title: str, outcomes: list[Outcome]) -> None:
     print(f"\n{title}\n| {'':28} |" + "".join(f" {name:>9} |" for name in COLUMNS))
     print(f"|{'-' * 30}|" + f"{'-' * 10}:|" * len(COLUMNS))
     for one in outcomes:
-        cells = [CANNOT if value is None else f"{scale * value:.3g}" for value, scale in zip(one[1:], SCALES, strict=True)]
+        scaled = zip(one[1:], SCALES, strict=True)
+        cells = [CANNOT if value is None else f"{scale * value:.3g}" for value, scale in scaled]
         print(f"| {one.name:28} |" + "".join(f" {cell:>9} |" for cell in cells))
 
 
 def table_one(over_time: list[Outcome], by_hands: list[Outcome]) -> None:
-    """What Table I of the paper claims, each tick now run: met within 1 mm, a covariance, a fit to 6 inputs."""
+    """What Table I of the paper claims, run: met within 1 mm, a covariance, a fit to 6 inputs."""
     hands_by_name = {one.name: one for one in by_hands}
     print(f"\nTable I of the paper, executed\n| {'':28} | probabilistic | via-point | end-point | high-dim. inputs |")
     print(f"|{'-' * 30}|---|---|---|---|")

@@ -1,4 +1,4 @@
-"""The primitive: equations (8) and (9) against a naive solution, derivatives, adaptation, and what is kept of it."""
+"""The primitive: equations (8) and (9) against a naive solution, derivatives, adaptation."""
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
@@ -110,29 +110,6 @@ def test_many_queries_are_predicted_in_batches_as_in_one():
 
 
 @properties
-@given(seeds)
-def test_the_jacobian_agrees_with_finite_differences(seed):
-    primitive, h = skill(seed), 1e-5
-    s = np.random.default_rng(seed + 1).normal(size=4)
-    steps = h * np.eye(4)
-    numeric = (primitive.mean(s + steps) - primitive.mean(s - steps)).T / (2 * h)
-    assert primitive.jacobian(s).shape == (3, 4)
-    scale = np.abs(primitive.weights).max()
-    np.testing.assert_allclose(primitive.jacobian(s), numeric, rtol=1e-6, atol=1e-8 * max(1, scale))
-
-
-@properties
-@given(seeds)
-def test_the_curvature_agrees_with_finite_differences_of_the_jacobian(seed):
-    primitive, h = skill(seed), 1e-5
-    random = np.random.default_rng(seed + 1)
-    s, v = random.normal(size=4), random.normal(size=4)
-    numeric = (primitive.jacobian(s + h * v) - primitive.jacobian(s - h * v)) @ v / (2 * h)
-    scale = np.abs(primitive.weights).max()
-    np.testing.assert_allclose(primitive.curvature(s, v), numeric, rtol=1e-5, atol=1e-7 * max(1, scale))
-
-
-@properties
 @given(seeds, st.sampled_from([0.001, 0.1, 1.0]))
 def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed, spread):
     random = np.random.default_rng(seed)
@@ -159,12 +136,9 @@ def test_far_away_the_mean_is_the_prior_and_the_covariance_the_whole():
 
 def test_repeated_inputs_are_legal_and_give_the_same_as_their_mean_with_half_the_covariance():
     inputs, reference = database(count=8)
-    twice = KMP.fit(
-        np.tile(inputs, (2, 1)),
-        Gaussians(np.concatenate([reference.mean + 0.1, reference.mean - 0.1]), np.tile(reference.covariance, (2, 1, 1))),
-        kernel=kernel,
-        lambda_mean=2.0,
-    )
+    means = np.concatenate([reference.mean + 0.1, reference.mean - 0.1])
+    doubled = Gaussians(means, np.tile(reference.covariance, (2, 1, 1)))
+    twice = KMP.fit(np.tile(inputs, (2, 1)), doubled, kernel=kernel, lambda_mean=2.0)
     once = KMP.fit(inputs, Gaussians(reference.mean, reference.covariance / 2), kernel=kernel, lambda_mean=2.0)
     queries = np.random.default_rng(1).normal(size=(5, 4))
     np.testing.assert_allclose(twice.mean(queries), once.mean(queries), atol=1e-8)
@@ -188,7 +162,7 @@ def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
     primitive = skill()
     inputs = np.stack([primitive.inputs[7] + 0.01, np.full(4, 9.0)])
     adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
-    assert list(adapted.replaced) == [7]
+    assert list(adapted._changes.replaced) == [7]
     assert len(adapted.inputs) == 31
     np.testing.assert_array_equal(adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs]))
     np.testing.assert_array_equal(adapted.via_inputs, inputs)
@@ -199,15 +173,15 @@ def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
 
 def test_only_the_nearest_of_the_points_within_the_tolerance_is_replaced():
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
-    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2).replaced) == [0]
+    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2)._changes.replaced) == [0]
 
 
 def test_the_tolerance_itself_is_not_near_enough():
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
     point = Gaussians([[5.0]], [[[1e-6]]])
-    assert len(primitive.adapt([[0.25]], point, tolerance=0.25).replaced) == 0
-    assert list(primitive.adapt([[0.25]], point, tolerance=0.26).replaced) == [0]
-    assert list(primitive.adapt([[0.5]], point, tolerance=1).replaced) == [0, 1]
+    assert len(primitive.adapt([[0.25]], point, tolerance=0.25)._changes.replaced) == 0
+    assert list(primitive.adapt([[0.25]], point, tolerance=0.26)._changes.replaced) == [0]
+    assert list(primitive.adapt([[0.5]], point, tolerance=1)._changes.replaced) == [0, 1]
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
@@ -224,9 +198,10 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
     for n in range(5):
         singly = singly.adapt(inputs[n : n + 1], points.take(slice(n, n + 1)), tolerance=tolerance)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
-    assert np.array_equal(together.replaced, shuffled.replaced)
+    assert np.array_equal(together._changes.replaced, shuffled._changes.replaced)
     np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
-    np.testing.assert_allclose(shuffled.predict(queries).covariance, together.predict(queries).covariance, rtol=1e-6, atol=1e-7)
+    found, wanted = shuffled.predict(queries).covariance, together.predict(queries).covariance
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
     assert same_bits(singly, together, queries)
 
 
@@ -234,10 +209,12 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
 @given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
 def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, tolerance):
     adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
-    fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, lambda_mean=2.0, lambda_covariance=lambda_covariance)
+    lambdas = {"lambda_mean": 2.0, "lambda_covariance": lambda_covariance}
+    fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, **lambdas)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
-    np.testing.assert_allclose(adapted.predict(queries).covariance, fitted.predict(queries).covariance, rtol=1e-6, atol=1e-7)
+    found, wanted = adapted.predict(queries).covariance, fitted.predict(queries).covariance
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
 
 
 def test_every_point_of_the_base_may_be_replaced():
@@ -262,10 +239,24 @@ def test_adapting_leaves_the_primitive_as_it_was():
     assert np.array_equal(primitive.mean(queries), before.mean)
 
 
+@pytest.mark.parametrize("count", [0, 2])
+def test_refitted_to_its_own_reference_it_is_the_same_bit_for_bit(count):
+    primitive = skill(lambda_covariance=5.0).adapt(*via(1, count), tolerance=1.5)
+    queries = np.random.default_rng(2).normal(size=(3, 4))
+    assert same_bits(primitive.refitted(primitive.base.reference), primitive, queries)
+    other = Gaussians(primitive.base.reference.mean + 1, primitive.base.reference.covariance)
+    again = primitive.refitted(other)
+    assert np.array_equal(again.via_inputs, primitive.via_inputs)
+    assert np.array_equal(again.base.reference.mean, other.mean)
+    with pytest.raises(ValueError, match="29 normals over 3 outputs given for 30 inputs"):
+        primitive.refitted(other.take(slice(0, 29)))
+
+
 @pytest.mark.parametrize("lambda_covariance", [None, 6.0])
 @pytest.mark.parametrize("count", [0, 3])
 def test_saved_arrays_give_the_primitive_back_bit_for_bit(tmp_path, lambda_covariance, count):
-    primitive = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3]).adapt(*via(1, count), tolerance=1.5)
+    base = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3])
+    primitive = base.adapt(*via(1, count), tolerance=1.5)
     np.savez(tmp_path / "skill.npz", note=np.array("left alone"), **primitive.to_arrays())
     with np.load(tmp_path / "skill.npz") as arrays:
         again = KMP.from_arrays(arrays)
@@ -292,11 +283,11 @@ def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
         arrays = [
             one.inputs,
             one.weights,
-            one.replaced,
+            one._changes.replaced,
             one.prior_mean,
             one.reference.mean,
             one.via_inputs,
-            *one.solution._whitener.bands,
+            *one._solution._inverse_factor.bands,
         ]
         assert not any(array.flags.writeable for array in arrays)
 
@@ -305,7 +296,8 @@ def test_a_via_point_that_is_missed_is_named_with_the_numbers():
     primitive = skill()
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
     points = Gaussians([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], np.tile(1e-4 * np.eye(3), (3, 1, 1)))
-    with pytest.warns(ViaPointMissed, match=r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell") as told:
+    says = r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell"
+    with pytest.warns(ViaPointMissed, match=says) as told:
         adapted = primitive.adapt(near, points, tolerance=0)
     assert told[0].filename == __file__
     miss = np.linalg.norm(adapted.mean(near) - points.mean, axis=1)
@@ -411,10 +403,13 @@ def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
         (lambda: fit().predict(np.zeros((1, 3))), r"queries: shape \(1, 3\) given, \(M, 4\) needed"),
         (lambda: fit().jacobian(np.zeros((1, 4))), r"query: shape \(1, 4\) given, \(4,\) needed"),
         (lambda: fit().curvature(np.zeros(4), np.zeros(3)), r"direction: shape \(3,\) given, \(4,\) needed"),
-        (lambda: fit().mean([[0, np.nan, 0, 0]]), "The query holds a number that is not finite"),
-        (lambda: fit().predict([[0, np.nan, 0, 0]]), "The query holds a number that is not finite"),
-        (lambda: fit().jacobian([0, np.nan, 0, 0]), "The query holds a number that is not finite"),
-        (lambda: fit().predict(np.array([[0, 1, 0, 0], [0, np.nan, 0, 0]])), r"queries\[1\]: \[ ?0\. nan .* must be finite"),
+        (lambda: fit().mean([[0, np.nan, 0, 0]]), r"queries\[0, 1\] is nan, and every number must be finite"),
+        (lambda: fit().mean([[0, 0, np.inf, 0]]), r"queries\[0, 2\] is inf, and every number must be finite"),
+        (lambda: fit().predict([[0, np.nan, 0, 0]]), r"queries\[0, 1\] is nan, and every number must be finite"),
+        (lambda: fit().predict([[0, 1, 0, 0], [0, np.inf, 0, 0]]), r"queries\[1, 1\] is inf, and every number"),
+        (lambda: fit().uncertainty([[0, -np.inf, 0, 0]]), r"queries\[0, 1\] is -inf, and every number"),
+        (lambda: fit().jacobian([0, np.nan, 0, 0]), r"query\[1\] is nan, and every number must be finite"),
+        (lambda: fit().curvature(np.zeros(4), [0, 0, 0, np.nan]), r"direction\[3\] is nan, and every number"),
         (lambda: fit().adapt(*via(0, 1), tolerance=-1), "tolerance is -1, and must not be below 0"),
         (lambda: fit().adapt(*via(0, 1), tolerance=np.nan), "tolerance is nan"),
         (lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1), r"inputs: shape \(1, 2\) given, \(V, 4\) needed"),
@@ -425,6 +420,10 @@ def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
         (
             lambda: KMP.from_arrays({"ell": np.array(1.0)}),
             "The primitive's arrays lack base_inputs, base_mean, .* Needed are",
+        ),
+        (
+            lambda: KMP.from_arrays(ARRAYS | {"lambda_mean": np.ones(2)}),
+            r"lambda_mean: shape \(2,\) given, \(\) needed",
         ),
         (lambda: KMP.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
         (

@@ -75,7 +75,8 @@ def test_regression_with_one_component_is_the_conditional_normal():
 def test_regression_is_the_first_two_moments_of_the_conditional_mixture(seed):
     mix = mixture(seed)
     s = np.random.default_rng(seed).normal(size=2)
-    share = np.array([w * multivariate_normal(m[:2], c[:2, :2]).pdf(s) for w, m, c in zip(mix.weights, mix.means, mix.covariances, strict=True)])
+    components = list(zip(mix.weights, mix.means, mix.covariances, strict=True))
+    share = np.array([w * multivariate_normal(m[:2], c[:2, :2]).pdf(s) for w, m, c in components])
     share /= share.sum()
     first, second = np.zeros(2), np.zeros((2, 2))
     for h, m, c in zip(share, mix.means, mix.covariances, strict=True):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kmp import KMP, Frame, GaussianKernel, Gaussians, LocalKMP, VelocityKernel, superposed
+from kmp import KMP, CoordinateFrame, GaussianKernel, Gaussians, LocalKMP, VelocityKernel, superposed
 
 
 def some(seed, count=6, outputs=2):
@@ -60,7 +60,7 @@ def test_references_over_unlike_inputs_are_refused():
 
 
 def test_into_a_frame_and_back_changes_nothing():
-    frame = Frame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0])
+    frame = CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0])
     normals = some(0)
     back = frame.placed(frame.localised(normals))
     np.testing.assert_allclose(back.mean, normals.mean, atol=1e-12)
@@ -69,7 +69,7 @@ def test_into_a_frame_and_back_changes_nothing():
 
 
 def test_a_velocity_is_turned_and_not_moved():
-    frame = Frame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0]).with_velocity()
+    frame = CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0]).with_velocity()
     placed = frame.placed(Gaussians([[1.0, 0, 1, 0]], [np.eye(4)]))
     np.testing.assert_allclose(placed.mean, [[3.0, 5, 0, 1]])
 
@@ -81,8 +81,9 @@ def reaching(random, start, goal, t):
 
 def learned(velocity=False):
     random, t = np.random.default_rng(0), np.linspace(0, 1, 60)
-    paths = [reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + np.array([[0, 0], [1, 0]])), t) for _ in range(6)]
-    frames = [Frame.start_and_goal(path) for path in paths]
+    ends = np.array([[0, 0], [1, 0]])
+    paths = [reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + ends), t) for _ in range(6)]
+    frames = [CoordinateFrame.start_and_goal(path) for path in paths]
     if velocity:
         frames = [[frame.with_velocity() for frame in one] for one in frames]
         paths = [np.hstack([path, np.gradient(path, t, axis=0)]) for path in paths]
@@ -102,7 +103,7 @@ def learned(velocity=False):
 def test_start_and_goal_frames_carry_the_skill_to_new_places():
     skill, t = learned()
     start, goal = np.array([-0.6, 0.5]), np.array([1.5, -0.6])  # none of them demonstrated
-    path = skill.placed([Frame.at(start), Frame.at(goal)]).mean(t)
+    path = skill.placed([CoordinateFrame.at(start), CoordinateFrame.at(goal)]).mean(t)
     np.testing.assert_allclose(path[0], start, atol=0.02)
     np.testing.assert_allclose(path[-1], goal, atol=0.02)
 
@@ -110,7 +111,7 @@ def test_start_and_goal_frames_carry_the_skill_to_new_places():
 def test_via_points_of_the_world_are_met_in_frames_elsewhere():
     skill, t = learned()
     desired = Gaussians([[0.4, 0.9]], [1e-8 * np.eye(2)])
-    placed = skill.placed([Frame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), Frame.at([1.5, -0.6])])
+    placed = skill.placed([CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])])
     adapted = placed.adapt([[0.5]], desired, tolerance=0.01)
     np.testing.assert_allclose(adapted.mean([[0.5]]), desired.mean, atol=1e-3)
     np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
@@ -120,7 +121,7 @@ def test_turning_the_frames_turns_positions_and_velocities():
     skill, t = learned(velocity=True)
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     straight = skill.predict(t)
-    turned = skill.placed([Frame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]).predict(t)
+    turned = skill.placed([CoordinateFrame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]).predict(t)
     both = np.kron(np.eye(2), turn)
     np.testing.assert_allclose(turned.mean, straight.mean @ both.T, atol=1e-7)
     np.testing.assert_allclose(turned.covariance, both @ straight.covariance @ both.T, atol=1e-7)
@@ -128,14 +129,16 @@ def test_turning_the_frames_turns_positions_and_velocities():
 
 def test_frames_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="must have an inverse"):
-        Frame(np.zeros((2, 2)), np.zeros(2))
+        CoordinateFrame(np.zeros((2, 2)), np.zeros(2))
+    with pytest.raises(ValueError, match="path: no point given, at least 1 needed"):
+        CoordinateFrame.start_and_goal(np.empty((0, 2)))
     skill, t = learned()
     with pytest.raises(ValueError, match="frames: 1 given, 2 over 2 outputs needed"):
-        skill.placed([Frame.at([0.0, 0.0])])
+        skill.placed([CoordinateFrame.at([0.0, 0.0])])
     with pytest.raises(ValueError, match=r"frames: \[1, 2\] given for 2 demonstrations, as many for each needed"):
         LocalKMP.learn(
             [(t, np.zeros((60, 2)))] * 2,
-            [[Frame.at([0, 0])], [Frame.at([0, 0])] * 2],
+            [[CoordinateFrame.at([0, 0])], [CoordinateFrame.at([0, 0])] * 2],
             t,
             kernel=GaussianKernel(1.0),
             lambda_mean=1,

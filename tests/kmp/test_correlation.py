@@ -12,7 +12,13 @@ def letter(representation="dense"):
     """A planar curve whose outputs are strongly tied to each other."""
     mean = np.hstack([np.sin(2 * T), np.cos(3 * T)])
     tied = 0.02 * np.array([[1.0, 0.95], [0.95, 1.0]])
-    primitive = KMP.fit(T, Gaussians(mean, np.tile(tied, (60, 1, 1))), kernel=GaussianKernel(2.0), lambda_mean=2.0, representation=representation)
+    primitive = KMP.fit(
+        T,
+        Gaussians(mean, np.tile(tied, (60, 1, 1))),
+        kernel=GaussianKernel(2.0),
+        lambda_mean=2.0,
+        representation=representation,
+    )
     return primitive.adapt([[1.0]], Gaussians([[1.4, -1.2]], [1e-8 * np.eye(2)]), tolerance=0.02)
 
 
@@ -21,7 +27,7 @@ def basis(count=5):
 
 
 def roughness(path):
-    """Weighted smoothness, as in the paper: here the first output may not move away from the base's."""
+    """Weighted smoothness, as in the paper: the first output costs more than the second."""
     return float(np.exp(-5 * np.linalg.norm(np.diff(path, axis=0) * [3.0, 0.3], axis=1).sum() / 10))
 
 
@@ -55,7 +61,8 @@ def test_rewards_grow_and_the_via_point_is_still_met(seed):
 
 
 def test_the_same_seed_gives_the_same_policy():
-    a, b, c = (improve(letter(), roughness, T, correlation=basis(), exploration=0.3, updates=2, rollouts=4, seed=seed) for seed in (1, 1, 2))
+    options = {"correlation": basis(), "exploration": 0.3, "updates": 2, "rollouts": 4}
+    a, b, c = (improve(letter(), roughness, T, **options, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(a.correlation.theta, b.correlation.theta)
     assert not np.array_equal(a.correlation.theta, c.correlation.theta)
 
@@ -71,7 +78,12 @@ def test_what_cannot_be_done_is_refused_with_what_could():
         ({"exploration": 0}, "exploration is 0, and must be finite and above 0"),
         ({"rollouts": 1}, "1 rollouts and 1 updates given; at least 2 and 1 are needed"),
         ({"correlation": Correlation.neutral([[0.0]], width=1, outputs=3)}, "correlation: 3 outputs given, 2 needed"),
-        ({"reward": lambda path: np.nan}, r"The reward is nan, and must be a finite number for any trajectory \(M, O\)"),
+        (
+            {"reward": lambda path: np.nan},
+            r"The reward is nan, and must be a finite number for any trajectory \(M, O\)",
+        ),
     ):
         with pytest.raises(ValueError, match=says):
             improve(letter(), changed.pop("reward", roughness), T, **(options | changed))
+    with pytest.raises(ValueError, match="correlation: 1 outputs given, 2 needed"):
+        Correlation.neutral([[0.0]], width=1, outputs=1).applied(letter())

@@ -61,7 +61,8 @@ def test_signs_are_chosen_so_that_neighbours_are_near():
 
 
 def path(t):
-    return Rotation.from_rotvec([0.3, 0.2, -0.5]) * Rotation.from_rotvec(np.stack([np.sin(2 * t), t, 0.5 * t**2], axis=1))
+    turned = np.stack([np.sin(2 * t), t, 0.5 * t**2], axis=1)
+    return Rotation.from_rotvec([0.3, 0.2, -0.5]) * Rotation.from_rotvec(turned)
 
 
 def skill(velocity):
@@ -103,7 +104,14 @@ def test_a_via_point_can_fix_the_angular_velocity_too_or_leave_it_free():
     wanted = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
     free = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02)
     same(free.mean([[0.7]]), wanted)
-    fixed = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02, angular_velocities=omega, velocity_covariance=1e-8 * np.eye(3))
+    fixed = one.adapt(
+        [[0.7]],
+        wanted,
+        1e-8 * np.eye(3),
+        tolerance=0.02,
+        angular_velocities=omega,
+        velocity_covariance=1e-8 * np.eye(3),
+    )
     same(fixed.mean([[0.7]]), wanted)
     np.testing.assert_allclose(fixed.angular_velocity([0.7], [1.0]), omega[0], atol=1e-3)
 
@@ -119,6 +127,12 @@ def test_the_covariance_is_of_small_rotations_in_the_world():
     np.testing.assert_allclose(np.cov(turns.T) / 1e-6, covariance[0], atol=0.03 * scale)
 
 
+def test_adapting_to_nothing_changes_nothing():
+    one = skill(velocity=False)
+    same = one.adapt(np.empty((0, 1)), np.empty((0, 4)), np.eye(3), tolerance=0.02)
+    np.testing.assert_array_equal(same.mean([[0.7]]), one.mean([[0.7]]))
+
+
 def test_it_is_pickled_read_only():
     again = pickle.loads(pickle.dumps(skill(velocity=False)))
     assert not again.auxiliary.flags.writeable
@@ -132,10 +146,13 @@ def test_what_cannot_be_done_is_refused_with_what_could():
         (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
         (lambda: OrientationKMP(one.primitive, [0, 0, 1.0]), r"auxiliary: shape \(1, 3\) given, \(T, 4\) needed"),
         (lambda: one.adapt([[0.5]], q[:, :3], np.eye(3), tolerance=0), r"quaternions: shape \(1, 3\) given"),
-        (lambda: one.adapt([[0.5]], q, np.eye(2), tolerance=0), r"covariance: shape \(2, 2\) given, \(1, 3, 3\) needed"),
+        (
+            lambda: one.adapt([[0.5]], q, np.eye(2), tolerance=0),
+            r"covariance: shape \(2, 2\) given, \(1, 3, 3\) needed",
+        ),
         (
             lambda: one.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
-            "this skill's outputs have no rates; fit it with a VelocityKernel",
+            "the skill has no rates; fit it with a VelocityKernel",
         ),
     ):
         with pytest.raises(ValueError, match=says):

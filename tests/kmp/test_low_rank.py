@@ -1,4 +1,4 @@
-"""The low rank solution against the dense one: means, covariances, via-points, what is said when the rank is reached."""
+"""The low rank solution against the dense one, and what is said when the rank is reached."""
 
 import pickle
 import warnings
@@ -25,12 +25,17 @@ def tube(seed, count):
     inputs = path + 0.02 * random.normal(size=path.shape)
     tool = np.stack([np.sin(3 * t), 0.5 * np.cos(4 * t), t - t**2], axis=1) * 0.5
     root = STD * random.normal(size=(count, 3, 3))
-    return inputs, Gaussians(tool + 0.01 * random.normal(size=tool.shape), root @ root.swapaxes(1, 2) + 1e-5 * np.eye(3))
+    covariance = root @ root.swapaxes(1, 2) + 1e-5 * np.eye(3)
+    return inputs, Gaussians(tool + 0.01 * random.normal(size=tool.shape), covariance)
 
 
 def both(seed, count=300, **options):
     inputs, reference = tube(seed, count)
     options = {"kernel": kernel, "lambda_mean": 2.0, "prior_mean": [0.1, 0.2, 0.3]} | options
+    return of_both(inputs, reference, **options)
+
+
+def of_both(inputs, reference, **options):
     return [KMP.fit(inputs, reference, representation=r, **options) for r in ("dense", "low_rank")]
 
 
@@ -59,7 +64,7 @@ def agree(dense, low, queries, within=1e-6):
 def test_within_the_data_it_is_the_dense_solution_to_a_micrometre(seed, lambda_covariance):
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     assert (dense.representation, low.representation) == ("dense", "low_rank")
-    assert len(low.solution.centres) < 300
+    assert len(low._solution.centres) < 300
     agree(dense, low, np.concatenate([dense.inputs[:20], tube(seed + 7, 20)[0]]))
 
 
@@ -87,7 +92,7 @@ def test_so_many_changes_that_all_points_go_are_solved_anew():
     dense, low = both(0, count=60)
     inputs, desired = dense.inputs + 0.001, Gaussians(dense.reference.mean + 0.1, dense.reference.covariance)
     dense, low = (one.adapt(inputs, desired, tolerance=0.5) for one in (dense, low))
-    assert len(low.replaced) > 50
+    assert len(low._changes.replaced) > 50
     agree(dense, low, dense.inputs[:10], within=1e-5)
 
 
@@ -136,7 +141,7 @@ def test_threads_may_share_it():
 
 def test_a_tolerance_below_rounding_is_served_as_well_as_rounding_allows():
     inputs, reference = tube(0, 200)
-    dense, low = (KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=r, rank_tolerance=1e-18) for r in ("dense", "low_rank"))
+    dense, low = of_both(inputs, reference, kernel=kernel, lambda_mean=2.0, rank_tolerance=1e-18)
     agree(dense, low, inputs[:20])
 
 
@@ -151,10 +156,10 @@ def test_more_via_points_than_points():
 
 def test_what_is_too_much_to_keep_is_made_again_and_gives_the_same(monkeypatch):
     before = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
-    monkeypatch.setattr("kmp.low_rank._KEPT", 0)
-    monkeypatch.setattr("kmp.primitive._DISTANCES", 1)
+    monkeypatch.setattr("kmp.low_rank.solution._KEPT", 0)
+    monkeypatch.setattr("kmp.database._DISTANCES", 1)
     after = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
-    assert np.array_equal(before.replaced, after.replaced)
+    assert np.array_equal(before._changes.replaced, after._changes.replaced)
     assert np.array_equal(before.weights, after.weights)
 
 
@@ -167,7 +172,7 @@ def test_one_point_alone():
 def test_repeated_inputs_are_legal():
     inputs, reference = tube(0, 40)
     inputs, reference = np.tile(inputs, (3, 1)), Gaussians.concatenated([reference] * 3)
-    dense, low = (KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=r) for r in ("dense", "low_rank"))
+    dense, low = of_both(inputs, reference, kernel=kernel, lambda_mean=2.0)
     agree(dense, low, inputs[:10])
 
 
@@ -183,7 +188,7 @@ def test_position_with_velocity_too():
     t = np.linspace(0, 2, 150)[:, None]
     mean = np.hstack([np.sin(3 * t), np.cos(2 * t), 3 * np.cos(3 * t), -2 * np.sin(2 * t)])
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 2e-3, 0.1, 0.1]), (150, 1, 1)))
-    dense, low = (KMP.fit(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1, representation=r) for r in ("dense", "low_rank"))
+    dense, low = of_both(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1)
     agree(dense, low, t[::10] + 0.003, within=1e-5)
     via = [[0.77]], Gaussians([[0.9, 0.0, 0.5, -2.0]], [1e-8 * np.eye(4)])
     dense, low = (one.adapt(*via, tolerance=0.01) for one in (dense, low))
@@ -202,7 +207,8 @@ def test_large_problems_choose_the_low_rank_and_small_ones_the_dense_solution():
 def test_a_rank_that_is_reached_is_said_and_the_error_is_within_the_bound_that_is_said(rank):
     inputs, reference = tube(0, 300)
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
-    with pytest.warns(RankReached, match=rf"rank: {rank} features leave up to .* 4e-12 was asked .* Raise the rank") as said:
+    says = rf"rank: {rank} features leave up to .* 4e-12 was asked .* Raise the rank"
+    with pytest.warns(RankReached, match=says) as said:
         low = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank)
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
     assert 1e-6 < error < low.error_bound

@@ -14,7 +14,8 @@ def primitives():
     for representation in ("dense", "low_rank"):
         for kernel in (GaussianKernel(0.3), GaussianKernel(np.array([0.3, 0.7]))):
             yield KMP.fit(inputs, reference, kernel=kernel, lambda_mean=1.5, representation=representation)
-        yield KMP.fit(inputs[:, :1], reference, kernel=VelocityKernel(2.0), lambda_mean=1.5, representation=representation)
+        velocity = {"kernel": VelocityKernel(2.0), "representation": representation}
+        yield KMP.fit(inputs[:, :1], reference, lambda_mean=1.5, **velocity)
 
 
 @pytest.mark.parametrize("number", range(6))
@@ -23,7 +24,8 @@ def test_a_file_gives_the_primitive_and_its_units_back_bit_for_bit(tmp_path, num
     primitive = list(primitives())[number]
     queries = np.linspace(-1, 1, 4 * primitive.inputs.shape[1]).reshape(4, -1)
     if adapted:
-        primitive = primitive.adapt(queries[:1], Gaussians(primitive.mean(queries[:1]) + 0.05, [0.05 * np.eye(2)]), tolerance=0.3)
+        via = Gaussians(primitive.mean(queries[:1]) + 0.05, [0.05 * np.eye(2)])
+        primitive = primitive.adapt(queries[:1], via, tolerance=0.3)
     kmp.save(tmp_path / "skill", primitive, input_unit="m", output_unit="m, m/s")
     stored = kmp.load(tmp_path / "skill")
     assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
@@ -51,3 +53,21 @@ def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
         kmp.load(tmp_path / "half.npz")
     with pytest.raises(FileNotFoundError):
         kmp.load(tmp_path / "none.npz")
+    with pytest.raises(OSError, match=str(tmp_path)):
+        kmp.load(tmp_path)
+
+
+def test_a_file_that_is_cut_or_of_one_array_is_refused_with_its_name(tmp_path):
+    whole, part = tmp_path / "whole.npz", tmp_path / "part.npz"
+    kmp.save(whole, next(primitives()), input_unit="m", output_unit="m")
+    data = whole.read_bytes()
+    for size in (0, 3, 100, len(data) // 2, len(data) - 1):
+        part.write_bytes(data[:size])
+        with pytest.raises(ValueError, match=r"part\.npz: not an \.npz file that `kmp\.save` wrote"):
+            kmp.load(part)
+    part.write_bytes(data[:300] + bytes(8) + data[308:])
+    with pytest.raises(ValueError, match=r"part\.npz: not an \.npz file"):
+        kmp.load(part)
+    np.save(tmp_path / "one.npy", np.ones(3))
+    with pytest.raises(ValueError, match=r"one\.npy: not an \.npz file"):
+        kmp.load(tmp_path / "one.npy")

@@ -13,7 +13,8 @@ def driven_by_hands(seed=0, count=4):
     for _ in range(count):
         t = np.linspace(0, 1, 80)
         s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
-        demonstrations.append((s, np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1) + 0.01 * random.normal(size=(80, 2))))
+        xi = np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1)
+        demonstrations.append((s, xi + 0.01 * random.normal(size=(80, 2))))
     return demonstrations
 
 
@@ -39,12 +40,13 @@ def test_what_is_chosen_scores_best_of_all_that_was_tried_and_predicts_a_new_dem
     best = learned.scores[0]
     assert np.array_equal(best.ell, learned.primitive.kernel.ell)
     assert best.lambda_mean == learned.primitive.lambda_mean
-    assert best.error == min(score.error for score in learned.scores)
-    assert best.error < 1.1 * learned.regression_error
-    surprises = [score for score in learned.scores if score.surprise is not None]
-    assert min(surprises, key=lambda one: one.surprise).lambda_covariance == learned.primitive.lambda_covariance
+    assert best.rmse == min(score.rmse for score in learned.scores)
+    assert best.rmse < 1.1 * learned.regression_rmse
+    scored = [score for score in learned.scores if score.negative_log_likelihood is not None]
+    likeliest = min(scored, key=lambda one: one.negative_log_likelihood)
+    assert likeliest.lambda_covariance == learned.primitive.lambda_covariance
     s, xi = driven_by_hands(seed=9, count=1)[0]
-    assert np.sqrt(((learned.primitive.mean(s) - xi) ** 2).sum(axis=1).mean()) < 2 * best.error
+    assert np.sqrt(((learned.primitive.mean(s) - xi) ** 2).sum(axis=1).mean()) < 2 * best.rmse
     assert len(learned.report(3).splitlines()) == 5
 
 
@@ -53,7 +55,7 @@ def test_the_choice_follows_the_units():
     other = chosen([(c * s, c * xi) for s, xi in driven_by_hands()], regularization=1e-6 * c**2)
     np.testing.assert_allclose(other.primitive.kernel.ell, np.asarray(one.primitive.kernel.ell) / c**2, rtol=1e-6)
     np.testing.assert_allclose(other.primitive.lambda_mean, one.primitive.lambda_mean / c**2, rtol=1e-3)
-    np.testing.assert_allclose(other.scores[0].error, c * one.scores[0].error, rtol=1e-3)
+    np.testing.assert_allclose(other.scores[0].rmse, c * one.scores[0].rmse, rtol=1e-3)
 
 
 def test_what_is_given_is_kept():
@@ -76,7 +78,8 @@ def test_skills_over_time_have_their_reference_evenly_spaced(velocity):
 
 def test_what_cannot_be_done_is_refused_with_what_could():
     one = driven_by_hands(count=1)
-    with pytest.raises(ValueError, match=r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"):
+    says = r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"
+    with pytest.raises(ValueError, match=says):
         chosen(one)
     with pytest.raises(ValueError, match="demonstrations: none given"):
         kmp.learn([], components=1, seed=0)
@@ -84,5 +87,8 @@ def test_what_cannot_be_done_is_refused_with_what_could():
         chosen([*one, (np.zeros((80, 2)), np.zeros((80, 3)))])
     with pytest.raises(ValueError, match="160 samples given for 1000 components"):
         chosen(driven_by_hands(count=2), components=1000)
+    for name in ("lambda_mean", "lambda_covariance"):
+        with pytest.raises(ValueError, match=f"{name} is 0, and must be finite and above 0"):
+            chosen(**{name: 0.0})
     alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
-    assert np.isnan(alone.regression_error)
+    assert np.isnan(alone.regression_rmse)

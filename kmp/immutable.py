@@ -1,0 +1,45 @@
+"""Values that never change: threads may share them, and copies are as read-only as they are."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Some = TypeVar("_Some", bound=NDArray[Any])
+
+
+def frozen(array: _Some) -> _Some:
+    """The same array, read-only."""
+    array.setflags(write=False)
+    return array
+
+
+class Immutable:
+    """A value whose arrays are read-only, after copying and unpickling too (as NumPy's are not)."""
+
+    _not_pickled: ClassVar[frozenset[str]] = frozenset()
+    """Cached properties that a pickle leaves out: large, and made again when asked for."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._not_pickled}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _freeze(tuple(state.values()))
+        self.__dict__.update(state)
+
+    def _with_cached(self, **known: object) -> Self:
+        """A copy of this value that knows some of its cached properties from the start."""
+        other = copy.copy(self)
+        other.__dict__.update(known)
+        return other
+
+
+def _freeze(value: object) -> None:
+    if isinstance(value, np.ndarray):
+        frozen(value)
+    elif isinstance(value, tuple):
+        for part in value:
+            _freeze(part)

@@ -1,0 +1,40 @@
+"""Operations on stacks of small matrices that several modules need."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import lapack
+
+from kmp.checks import Array
+
+_MACHINE = float(np.finfo(np.float64).eps)
+
+
+def symmetric(matrices: Array) -> Array:
+    """The symmetric parts (..., n, n). A symmetric matrix is returned as it is, bit for bit."""
+    return np.asarray((matrices + matrices.swapaxes(-1, -2)) / 2)
+
+
+def kron_identity(blocks: Array, copies: int) -> Array:
+    """The Kronecker products x (x) I (..., C D, C D) of x (..., C, C), I of size D = `copies`."""
+    c = blocks.shape[-1]
+    wide = blocks[..., :, None, :, None] * np.eye(copies)[:, None, :]
+    return np.asarray(wide.reshape(*blocks.shape[:-2], c * copies, c * copies))
+
+
+def nearest_positive_semidefinite(covariance: Array) -> Array:
+    """The nearest positive semi-definite matrices (M, n, n): rounding can leave some just below.
+
+    Eigenvalues are raised to the machine's precision, so that the result has a Cholesky factor.
+    """
+    covariance = symmetric(covariance)
+    if len(covariance) == 1 and lapack.dpotrf(covariance[0])[1] == 0:
+        return covariance  # as below, without NumPy's overhead
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(covariance)
+        raised = (vectors * np.maximum(values, _MACHINE)[:, None, :]) @ vectors.swapaxes(1, 2)
+        below = (values[:, 0] < _MACHINE)[:, None, None]
+        covariance = np.where(below, symmetric(raised), covariance)
+    return covariance

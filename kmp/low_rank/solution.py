@@ -1,0 +1,208 @@
+"""The low rank solution of a database, by the normal equations of the cost (4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+
+from kmp.checks import Array, numbers
+from kmp.database import Changes, Database
+from kmp.hyperparameters import Hyperparameters
+from kmp.immutable import Immutable, frozen
+from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.linear_algebra import kron_identity
+from kmp.low_rank.conditioned import Conditioned
+from kmp.low_rank.error_bound import error_bound
+from kmp.low_rank.features import BLOCK, Features
+
+RANK = 400
+TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
+_KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are made again for each pass
+_REFINEMENTS = 2  # of W, against the rounding of the normal equations
+
+
+@dataclass(frozen=True, eq=False)
+class LowRank(Immutable):
+    """The solution on r features, with the members of `Solution`; factors are made when used."""
+
+    _not_pickled = frozenset({"mean_factor", "covariance_factor"})
+
+    hyperparameters: Hyperparameters
+    database: Database
+    features: Features
+    information: Array
+    """(r D, r D) sum_n z_n^T z_n (x) Sigma_n^-1: what the points say, whatever lambda is."""
+    w: Array  # W (r, D), the features' weights
+    base: LowRank | None = None
+    """The solution that was adapted, where so much changed that this one was fitted anew."""
+
+    representation: ClassVar[Literal["low_rank"]] = "low_rank"
+
+    @classmethod
+    def fit(
+        cls,
+        hyperparameters: Hyperparameters,
+        database: Database,
+        features: Features,
+        base: LowRank | None = None,
+    ) -> LowRank:
+        """The solution. Raises ValueError if the normal equations cannot be solved."""
+        r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
+        inputs = database.inputs
+        precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
+        target = database.reference.mean - hyperparameters.prior_mean
+        blocks = [slice(i, i + BLOCK) for i in range(0, len(inputs), BLOCK)]
+
+        def lifted(start: int) -> Array:
+            return features(inputs[start : start + BLOCK]).T.reshape(-1, c, r)
+
+        z = cache(lifted) if len(inputs) * c * r <= _KEPT else lifted
+        total = np.zeros((r, d, r, d))
+        for block in blocks:
+            _add_information(total, z(block.start), precision[block])
+        information = frozen(total.reshape(r * d, r * d))
+        factor, w = _factorised(information, hyperparameters.lambda_mean), np.zeros((r, d))
+        for _ in range(1 + _REFINEMENTS):
+            pull = -hyperparameters.lambda_mean * w
+            for block in blocks:
+                residual = target[block] - (z(block.start) @ w).reshape(-1, c * d)
+                pulls = (precision[block] @ residual[:, :, None]).reshape(-1, c, d)
+                pull += np.tensordot(z(block.start), pulls, axes=([0, 1], [0, 1]))
+            w = w + lapack.dpotrs(factor, pull.ravel(), lower=1)[0].reshape(r, d)
+        fitted = cls(hyperparameters, database, features, information, frozen(w), base)
+        return fitted._with_cached(mean_factor=factor)
+
+    @classmethod
+    def of_arrays(
+        cls,
+        hyperparameters: Hyperparameters,
+        database: Database,
+        arrays: Mapping[str, NDArray[Any]],
+    ) -> LowRank:
+        """The solution that gave these arrays. Raises ValueError if they do not go together."""
+        pivots = numbers("pivots", arrays["pivots"], "r", database.inputs.shape[1])
+        r, d = len(pivots), hyperparameters.channel_outputs
+        information = numbers("information", arrays["information"], r * d, r * d)
+        w = numbers("features", arrays["features"], r, d)
+        features = Features.at(hyperparameters.kernel, pivots)
+        if (usable := len(features.pivots)) < r:
+            raise ValueError(f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the primitive anew.")
+        return cls(hyperparameters, database, features, information, w)
+
+    @property
+    def centres(self) -> Array:
+        """(r, I) the pivots."""
+        return self.features.pivots
+
+    @cached_property
+    def weights(self) -> Array:
+        """(r, O) the weights of the pivots' kernels."""
+        return frozen(self.features.kernel_weights(self.w))
+
+    @cached_property
+    def error_bound(self) -> float:
+        return error_bound(self, self.features)
+
+    def solved(self) -> Self:
+        self.weights  # noqa: B018
+        self.covariance_factor  # noqa: B018
+        return self
+
+    def posterior_covariance_one(self, row: Array) -> Array:
+        z, root = self.whitened_one(row)
+        within = blas.dgemm(1.0, root, root, trans_b=1)
+        return self.residual_covariance(z.T @ z) + self.hyperparameters.lambda_covariance * within
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        z, roots = self.whitened(rows)
+        within = roots.transpose(0, 2, 1) @ roots
+        return self.residual_covariance(z.transpose(0, 2, 1) @ z) + self.hyperparameters.lambda_covariance * within
+
+    def adapted(self, changes: Changes) -> LowRank | Conditioned:
+        """The base's solution conditioned on these changes, or fitted anew if they are many."""
+        base = self.base or self
+        if len(changes.replaced) + len(changes.inputs) <= len(base.centres):
+            return Conditioned(base, changes)
+        # So many changes cost more, and lose more digits, than a new solution.
+        database = base.database.changed(changes)
+        rank = max(RANK, len(base.centres) + len(changes.inputs))
+        features, _ = Features.of(base.features.kernel, database.inputs, rank=rank, tolerance=TOLERANCE)
+        return LowRank.fit(self.hyperparameters, database, features, base)
+
+    def with_weights(self, weights: Array) -> Self:
+        return self._with_cached(weights=weights)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """The pivots, the information and W of the base."""
+        base = self.base or self
+        return {"pivots": base.centres, "information": base.information, "features": base.w}
+
+    def whitened_one(self, row: Array) -> tuple[Array, Array]:
+        """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
+        c = self.features.kernel.channels
+        z = self.features.of_kernel(row[..., : len(self.centres) * c : c].T)
+        return z.reshape(-1, c), self._inverse_factor.times_one(z)
+
+    def whitened(self, rows: Array) -> tuple[Array, Array]:
+        """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
+        c = self.features.kernel.channels
+        z = self.features.of_kernel(rows[:, : len(self.centres) * c : c].T)
+        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self._inverse_factor.times_many(z, c)
+
+    def residual_covariance(self, explained: Array) -> Array:
+        """k(s, s) less what the features explain (..., C, C), for each output: (..., O, O)."""
+        return kron_identity(self.features.kernel.prior_variance - explained, self.w.shape[1])
+
+    @cached_property
+    def mean_factor(self) -> Array:
+        """The lower Cholesky factor L of P = information + lambda I, of the normal equations."""
+        return _factorised(self.information, self.hyperparameters.lambda_mean)
+
+    @cached_property
+    def covariance_factor(self) -> Array:
+        """The same with the lambda of the covariance."""
+        parameters = self.hyperparameters
+        if parameters.lambda_covariance == parameters.lambda_mean:
+            return self.mean_factor
+        return _factorised(self.information, parameters.lambda_covariance)
+
+    @cached_property
+    def _inverse_factor(self) -> InverseCholeskyFactor:
+        return InverseCholeskyFactor.of(self.covariance_factor, self.w.shape[1])
+
+
+def _factorised(information: Array, penalty: float) -> Array:
+    factor, info = lapack.dpotrf(information + penalty * np.eye(len(information)), lower=1, clean=1)
+    if info:
+        raise ValueError(
+            f"The normal equations are not positive definite to working precision with lambda {penalty:g}. "
+            "Raise lambda, the smallest variances, or the tolerance of the rank."
+        )
+    return frozen(np.asfortranarray(factor))
+
+
+def _add_information(total: Array, z: Array, precision: Array) -> None:
+    """Adds sum_n z_n^T z_n (x) Sigma_n^-1 (r, D, r, D), of z (n, C, r), precisions (n, O, O)."""
+    n, c, _ = z.shape
+    d = total.shape[1]
+    blocks = precision.reshape(n, c, d, c, d)
+
+    def along(*outputs: int) -> Array:
+        # A A^T is twice as fast as A B, so off the diagonal: 2 a b = (a + b)^2 - a^2 - b^2.
+        root = np.linalg.cholesky(sum(blocks[:, :, i, :, j] for i in outputs for j in outputs))  # (n, C, C)
+        parts = (np.asarray(sum(z[:, b] * root[:, b, a, None] for b in range(a, c))) for a in range(c))
+        return np.asarray(sum((part.T @ part for part in parts), start=np.zeros(())))
+
+    diagonal = [along(i) for i in range(d)]
+    for i in range(d):
+        total[:, i, :, i] += diagonal[i]
+        for j in range(i):
+            share = (along(i, j) - diagonal[i] - diagonal[j]) / 2
+            total[:, i, :, j] += share
+            total[:, j, :, i] += share.T

@@ -1,0 +1,103 @@
+"""A primitive as named arrays, exact to the bit: what its file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.checks import numbers
+from kmp.database import Changes, Database
+from kmp.dense import Dense
+from kmp.gaussians import Gaussians, check_pairs
+from kmp.hyperparameters import Hyperparameters
+from kmp.immutable import frozen
+from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
+from kmp.low_rank import LowRank
+from kmp.solution import Solution
+
+_NAMES = (
+    *("base_inputs", "base_mean", "base_covariance", "base_weights"),
+    *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
+    *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
+)
+_OF_LOW_RANK = ("pivots", "information", "features")
+
+
+def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str, NDArray[Any]]:
+    """The arrays of a base, its changes, and the solution with these."""
+    parameters = base.hyperparameters
+    arrays = {
+        "base_inputs": base.database.inputs,
+        "base_mean": base.database.reference.mean,
+        "base_covariance": base.database.reference.covariance,
+        "base_weights": base.weights,
+        "via_inputs": changes.inputs,
+        "via_mean": changes.points.mean,
+        "via_covariance": changes.points.covariance,
+        "replaced": changes.replaced,
+        "weights": solution.weights,
+        "ell": np.array(parameters.kernel.ell),
+        "lambda_mean": np.array(parameters.lambda_mean),
+        "lambda_covariance": np.array(parameters.lambda_covariance),
+        "prior_mean": parameters.prior_mean,
+    }
+    if parameters.kernel.channels > 1:
+        arrays["channels"] = np.array(parameters.kernel.channels)
+    return arrays | base.to_arrays()
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, Solution]:
+    """What `to_arrays` was given. Raises ValueError if arrays lack or do not go together."""
+    names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
+    if missing := [name for name in names if name not in arrays]:
+        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
+    base = _base(arrays)
+    changes = _changes(arrays, base.database)
+    if len(changes.inputs) == 0:
+        return base, changes, base
+    return base, changes, _weighted(base.adapted(changes), "weights", arrays)
+
+
+def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
+    inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
+    reference = Gaussians(arrays["base_mean"], arrays["base_covariance"])
+    check_pairs(inputs, reference, reference.outputs)
+    parameters = Hyperparameters.checked(
+        _kernel(arrays),
+        float(numbers("lambda_mean", arrays["lambda_mean"])),
+        float(numbers("lambda_covariance", arrays["lambda_covariance"])),
+        arrays["prior_mean"],
+        inputs=inputs.shape[1],
+        outputs=reference.outputs,
+    )
+    database = Database(inputs, reference)
+    low_rank = "pivots" in arrays
+    solution = LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
+    return _weighted(solution, "base_weights", arrays)
+
+
+def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
+    via = numbers("via_inputs", arrays["via_inputs"], "V", database.inputs.shape[1])
+    points = Gaussians(arrays["via_mean"], arrays["via_covariance"])
+    check_pairs(via, points, database.reference.outputs)
+    replaced = np.array(arrays["replaced"], dtype=np.intp)
+    n = len(database)
+    if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
+        raise ValueError(f"replaced: {replaced} given, ascending indices of the {n} base points needed.")
+    return Changes(frozen(replaced), via, points)
+
+
+def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
+    parameters = solution.hyperparameters
+    return solution.with_weights(numbers(name, arrays[name], len(solution.centres), parameters.outputs))
+
+
+def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
+    if "channels" not in arrays:
+        return GaussianKernel(arrays["ell"])
+    if int(arrays["channels"]) != 2:
+        raise ValueError(f"channels: {int(arrays['channels'])} given, 2 needed where it is given.")
+    return VelocityKernel(float(numbers("ell", arrays["ell"])))

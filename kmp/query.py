@@ -1,0 +1,112 @@
+"""One query at a time: the mean, its motion and its covariance, from one kernel row.
+
+What a query touches is made ready once, as contiguous read-only arrays. From there on arrays go in
+and arrays come out, so that compiled functions can take the place of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from kmp.checks import Array
+from kmp.immutable import Immutable, frozen
+from kmp.kernel import Kernel
+from kmp.linear_algebra import nearest_positive_semidefinite
+from kmp.solution import Solution
+
+
+class MotionPrediction(NamedTuple):
+    """The output at one query whose input moves. I inputs, O outputs."""
+
+    mean: Array
+    """(O,) [unit of the outputs]"""
+    velocity: Array
+    """(O,) [unit of the outputs / s] the Jacobian times the input's velocity."""
+    acceleration: Array
+    """(O,) [unit of the outputs / s^2] the Jacobian times the input's, plus the curvature."""
+    covariance: Array | None
+    """(O, O) [unit of the outputs^2] of the mean; None where it was not asked for."""
+    jacobian: Array
+    """(O, I) [unit of the outputs / unit of the inputs] d mean / d input."""
+    curvature: Array
+    """(O,) [unit of the outputs / s^2] the acceleration that the input's velocity makes alone."""
+
+
+class KernelRow(NamedTuple):
+    """What R centres say of one query."""
+
+    offsets: Array  # (R, I) x - x_r, in the kernel's coordinates
+    values: Array  # (R,) exp(-scale |x - x_r|^2)
+    kernel: Array  # (R,) or (C, R C) k(s, s_r)
+
+
+@dataclass(frozen=True, eq=False)
+class Query(Immutable):
+    """A solution made ready for one query at a time: R centres, C channels, D outputs a channel."""
+
+    solution: Solution
+    kernel: Kernel
+    scale: float
+    stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
+    centres: Array  # (R, I), there
+    weights: Array  # (R C, D)
+    weight_rows: Array  # (D, R C), the same
+    prior_mean: Array  # (O,)
+    covariance_scale: float  # N / lambda_c
+
+    @classmethod
+    def of(cls, solution: Solution, count: int) -> Query:
+        """The solution of N = `count` points, ready. Raises ValueError if it cannot be solved."""
+        parameters, centres = solution.hyperparameters, solution.centres
+        scale, stretch = parameters.kernel.coordinates(centres.shape[1])
+        weights = solution.weights.reshape(-1, parameters.channel_outputs)
+        return cls(
+            solution,
+            parameters.kernel,
+            scale,
+            stretch,
+            frozen(centres * stretch),
+            weights,
+            frozen(np.ascontiguousarray(weights.T)),
+            parameters.prior_mean,
+            count / parameters.lambda_covariance,
+        )
+
+    def row(self, query: Array) -> KernelRow:
+        """The kernel row of a query (I,)."""
+        offsets = query * self.stretch - self.centres
+        values = self.kernel.values(offsets, self.scale)
+        return KernelRow(offsets, values, self.kernel.row(offsets, values, self.scale))
+
+    def mean(self, row: KernelRow) -> Array:
+        """xi(s) (O,). Equation (8)."""
+        return np.asarray((row.kernel @ self.weights).ravel() + self.prior_mean)
+
+    def covariance(self, row: KernelRow) -> Array:
+        """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O). IJRR 2019."""
+        posterior = self.solution.posterior_covariance_one(row.kernel)
+        return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * self.covariance_scale)
+
+    def jacobian(self, row: KernelRow) -> Array:
+        """dxi/ds (O, I). Equation (8), derived."""
+        return self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows) * self.stretch
+
+    def curvature(self, row: KernelRow, velocity: Array) -> Array:
+        """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""
+        return self.kernel.curvature(row.offsets, row.values, self.scale, self.weights, velocity * self.stretch)
+
+    def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
+        """All of these for a query (I,), and its velocity and acceleration."""
+        row = self.row(query)
+        jacobian, curvature = self.jacobian(row), self.curvature(row, velocity)
+        return MotionPrediction(
+            self.mean(row),
+            jacobian @ velocity,
+            jacobian @ acceleration + curvature,
+            self.covariance(row) if covariance else None,
+            jacobian,
+            curvature,
+        )

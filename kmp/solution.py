@@ -1,0 +1,69 @@
+"""What a solution of the costs is: all that a primitive asks of one, whichever way it was found."""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.checks import Array
+from kmp.database import Changes, Database
+from kmp.hyperparameters import Hyperparameters
+
+
+class Solution(Protocol):
+    """A database solved for its mean and its covariance; immutable. O outputs, C channels.
+
+    The mean is an expansion in R kernels, equation (8): xi(s) = sum_r k(s, s_r) w_r + prior mean.
+    """
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        """The kernel, the lambdas, the prior mean."""
+
+    @property
+    def database(self) -> Database:
+        """The N reference points, via-points included."""
+
+    @property
+    def representation(self) -> Literal["dense", "low_rank"]:
+        """How the costs are solved."""
+
+    @property
+    def centres(self) -> Array:
+        """s_r (R, I)."""
+
+    @property
+    def weights(self) -> Array:
+        """w_r (R, O)."""
+
+    @property
+    def error_bound(self) -> float:
+        """How far the mean can be from equation (9)'s at the points [unit of the outputs]."""
+
+    def solved(self) -> Self:
+        """This solution, its weights and factors made. Raises ValueError if that fails."""
+
+    def posterior_covariance_one(self, row: Array) -> Array:
+        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C)."""
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        """Those (M, O, O) of the kernel rows (M C, R C) of M queries."""
+
+    def adapted(self, changes: Changes) -> Solution:
+        """The solution of the database as it was before any adaptation, with these changes."""
+
+    def with_weights(self, weights: Array) -> Self:
+        """This solution with weights (R, O) that were stored, so that they need not be made."""
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """What a file must hold of the base's solution besides its database and its weights."""
+
+
+def mean_at(solution: Solution, queries: Array) -> Array:
+    """Equation (8) at queries (M, I): (M, O)."""
+    parameters = solution.hyperparameters
+    weights = solution.weights.reshape(-1, parameters.channel_outputs)
+    expansion = parameters.kernel(queries, solution.centres) @ weights
+    return expansion.reshape(len(queries), parameters.outputs) + parameters.prior_mean

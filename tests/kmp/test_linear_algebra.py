@@ -1,0 +1,51 @@
+"""Stacks of small matrices, and products with the inverse of a Cholesky factor."""
+
+import numpy as np
+import pytest
+
+from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite, symmetric
+
+
+def test_products_with_the_identity_are_those_of_numpy():
+    blocks = np.random.default_rng(0).normal(size=(3, 2, 2))
+    found = kron_identity(blocks, 4)
+    assert all(np.array_equal(found[n], np.kron(blocks[n], np.eye(4))) for n in range(3))
+
+
+def test_the_symmetric_part_of_a_symmetric_matrix_is_the_matrix_bit_for_bit():
+    a = np.random.default_rng(0).normal(size=(5, 3, 3))
+    assert np.array_equal(symmetric(symmetric(a)), symmetric(a))
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_what_is_positive_definite_stays_and_what_is_not_gets_a_cholesky_factor(count):
+    random = np.random.default_rng(0)
+    root = random.normal(size=(count, 3, 3))
+    good = symmetric(root @ root.swapaxes(1, 2) + np.eye(3))
+    assert np.array_equal(nearest_positive_semidefinite(good), good)
+    values, vectors = np.linalg.eigh(good)
+    bad = good.copy()
+    bad[-1] = symmetric((vectors[-1] * [-0.5, *values[-1, 1:]]) @ vectors[-1].T)
+    found = nearest_positive_semidefinite(bad)
+    assert np.array_equal(found[:-1], good[:-1])
+    np.linalg.cholesky(found)
+    raised = (vectors[-1] * [0, *values[-1, 1:]]) @ vectors[-1].T
+    np.testing.assert_allclose(found[-1], raised, atol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "copies"), [(1, 3), (3, 2), (21, 3), (40, 1)])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_products_with_the_inverse_factor_are_those_of_a_solution(n, copies, channels):
+    random = np.random.default_rng(0)
+    root = random.normal(size=(n * copies, n * copies))
+    factor = np.asfortranarray(np.linalg.cholesky(root @ root.T + n * np.eye(n * copies)))
+    x = random.normal(size=(n, 4 * channels))
+    inverse = InverseCholeskyFactor.of(factor, copies)
+    many = inverse.times_many(x, channels)
+    for m, columns in enumerate(np.split(x, 4, axis=1)):
+        wanted = np.linalg.solve(factor, np.kron(columns, np.eye(copies)))
+        np.testing.assert_allclose(inverse.times_one(columns), wanted.T, atol=1e-12)
+        np.testing.assert_allclose(many[m], wanted, atol=1e-12)
+    if channels == 1:
+        assert np.array_equal(inverse.times_one(x[:, 0]), inverse.times_one(x[:, :1]))

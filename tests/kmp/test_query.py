@@ -1,0 +1,138 @@
+"""One query: mean, motion and covariance, with every kernel and every solution."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+
+KERNELS = {
+    "one length": GaussianKernel(0.5),
+    "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
+    "velocity": VelocityKernel(2.0),
+}
+
+
+def primitive(kernel, representation, adapted):
+    random, kernel = np.random.default_rng(0), KERNELS[kernel]
+    t = np.linspace(0, 2, 60)[:, None]
+    inputs = t if kernel.channels == 2 else np.hstack([t, np.sin(3 * t), np.cos(2 * t)])
+    values, rates = np.hstack([np.sin(2 * t), np.cos(3 * t)]), np.hstack([2 * np.cos(2 * t), -3 * np.sin(3 * t)])
+    mean = np.hstack([values, rates]) if kernel.channels == 2 else values
+    root = 0.05 * random.normal(size=(60, mean.shape[1], mean.shape[1]))
+    reference = Gaussians(mean, root @ root.swapaxes(1, 2) + 1e-3 * np.eye(mean.shape[1]))
+    lambdas = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "prior_mean": [0.3, 0.2, 0, 0][: mean.shape[1]]}
+    fitted = KMP.fit(inputs, reference, kernel=kernel, representation=representation, **lambdas)
+    if not adapted:
+        return fitted
+    via = Gaussians(mean[20:22] + 0.05, np.tile(1e-3 * np.eye(mean.shape[1]), (2, 1, 1)))
+    return fitted.adapt(inputs[20:22] + 0.01, via, tolerance=0.02)
+
+
+@pytest.fixture(params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)], ids=str)
+def skill(request):
+    return primitive(*request.param)
+
+
+def moving(skill, seed=1):
+    """A query near the data, its velocity and acceleration."""
+    random, inputs = np.random.default_rng(seed), skill.inputs
+    return inputs[30] + 0.02, *random.normal(size=(2, inputs.shape[1]))
+
+
+def test_one_call_gives_what_the_others_give_bit_for_bit(skill):
+    s, v, a = moving(skill)
+    found, one = skill.predict_motion(s, v, a), skill.predict(s[None])
+    assert np.array_equal(found.mean, skill.mean(s[None])[0])
+    assert np.array_equal(found.mean, one.mean[0])
+    assert np.array_equal(found.covariance, one.covariance[0])
+    assert np.array_equal(found.jacobian, skill.jacobian(s))
+    assert np.array_equal(found.curvature, skill.curvature(s, v))
+    assert np.array_equal(found.velocity, found.jacobian @ v)
+    assert np.array_equal(found.acceleration, found.jacobian @ a + found.curvature)
+
+
+def test_one_query_agrees_with_it_in_a_set(skill):
+    s, v, a = moving(skill)
+    found, together = skill.predict_motion(s, v, a), skill.predict([s, s])
+    np.testing.assert_allclose(found.mean, together.mean[0], atol=1e-9)
+    np.testing.assert_allclose(found.covariance, together.covariance[0], rtol=1e-6, atol=1e-9)
+
+
+def test_the_jacobian_and_the_curvature_agree_with_finite_differences(skill):
+    (s, v, _), h = moving(skill), 1e-5
+    steps = h * np.eye(len(s))
+    numeric = (skill.mean(s + steps) - skill.mean(s - steps)).T / (2 * h)
+    np.testing.assert_allclose(skill.jacobian(s), numeric, rtol=1e-5, atol=1e-5)
+    bend = (skill.jacobian(s + h * v) - skill.jacobian(s - h * v)) @ v / (2 * h)
+    np.testing.assert_allclose(skill.curvature(s, v), bend, rtol=1e-5, atol=1e-4)
+
+
+def test_velocity_and_acceleration_agree_with_finite_differences_along_the_motion(skill):
+    (s, v, a), h = moving(skill), 1e-4
+    behind, here, ahead = skill.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
+    found = skill.predict_motion(s, v, a)
+    np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.acceleration, (ahead - 2 * here + behind) / h**2, rtol=1e-3, atol=1e-3)
+
+
+def test_the_covariance_can_be_left_out_and_changes_nothing_else(skill):
+    s, v, a = moving(skill)
+    whole, found = skill.predict_motion(s, v, a), skill.predict_motion(s, v, a, covariance=False)
+    assert found.covariance is None
+    for name in ("mean", "velocity", "acceleration", "jacobian", "curvature"):
+        assert np.array_equal(getattr(found, name), getattr(whole, name))
+
+
+def test_shapes_are_those_of_one_query(skill):
+    found, outputs = skill.predict_motion(*moving(skill)), skill.outputs
+    assert [array.shape for array in found[:3]] == [(outputs,)] * 3
+    assert found.covariance.shape == (outputs, outputs)
+    assert found.jacobian.shape == (outputs, skill.inputs.shape[1])
+    assert found.curvature.shape == (outputs,)
+
+
+def test_a_copy_in_another_process_gives_the_same_bits(skill):
+    query = moving(skill)
+    found = skill.predict_motion(*query)
+    again = pickle.loads(pickle.dumps(skill)).predict_motion(*query)
+    assert all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
+
+
+def test_what_one_query_touches_is_contiguous_and_read_only(skill):
+    query = skill._query
+    for array in (query.centres, query.weights, query.weight_rows, query.stretch, query.prior_mean):
+        assert array.flags.c_contiguous
+        assert not array.flags.writeable
+
+
+def test_an_input_at_rest_gives_an_output_at_rest():
+    one = primitive("one length", "dense", False)
+    found = one.predict_motion(one.inputs[3], np.zeros(3), np.zeros(3))
+    np.testing.assert_array_equal(found.velocity, 0)
+    np.testing.assert_array_equal(found.acceleration, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"query": np.zeros(2)}, r"query: shape \(2,\) given, \(3,\) needed"),
+        ({"query": np.zeros((1, 3))}, r"query: shape \(1, 3\) given, \(3,\) needed"),
+        ({"velocity": np.zeros(4)}, r"velocity: shape \(4,\) given, \(3,\) needed"),
+        ({"acceleration": [[0.0]]}, r"acceleration: shape \(1, 1\) given, \(3,\) needed"),
+        ({"query": [0, np.inf, 0]}, r"query\[1\] is inf, and every number must be finite"),
+        ({"velocity": [0, 0, np.nan]}, r"velocity\[2\] is nan, and every number must be finite"),
+        ({"acceleration": [-np.inf, 0, 0]}, r"acceleration\[0\] is -inf, and every number must be finite"),
+    ],
+)
+def test_what_is_no_motion_is_refused_by_its_name(change, says):
+    rest = {"query": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
+    with pytest.raises(ValueError, match=says):
+        primitive("one length", "dense", False).predict_motion(**(rest | change))
+
+
+def test_numbers_too_large_to_square_are_still_finite():
+    one = primitive("one length", "dense", False)
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(one.mean([[1e200, 0, 0]]), [one.prior_mean])

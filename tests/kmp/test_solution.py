@@ -1,0 +1,109 @@
+"""What every solution must be, whichever way it was found."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from kmp import KMP, GaussianKernel, Gaussians
+from kmp.dense import Dense
+from kmp.low_rank import LowRank
+from kmp.low_rank.conditioned import Conditioned
+from kmp.solution import Solution, mean_at
+
+S = np.random.default_rng(0).normal(size=(40, 2))
+REFERENCE = Gaussians(np.sin(S), np.tile(0.01 * np.eye(2), (40, 1, 1)))
+VIA = S[:3] + 0.01, REFERENCE.take(slice(0, 3))
+MANY = S[:38] + 0.01, REFERENCE.take(slice(0, 38))
+MEMBERS = [name for name in vars(Solution) if not name.startswith("_")]
+
+
+def fitted(representation, via=None):
+    one = KMP.fit(S, REFERENCE, kernel=GaussianKernel(0.05), lambda_mean=1.0, representation=representation)
+    return one.adapt(*via, tolerance=0.1) if via else one
+
+
+SOLUTIONS = {
+    "dense": (fitted("dense"), Dense),
+    "dense adapted": (fitted("dense", VIA), Dense),
+    "low rank": (fitted("low_rank"), LowRank),
+    "conditioned": (fitted("low_rank", VIA), Conditioned),
+    "low rank, fitted anew": (fitted("low_rank", MANY), LowRank),
+}
+
+
+@pytest.fixture(params=SOLUTIONS)
+def primitive(request):
+    return SOLUTIONS[request.param][0]
+
+
+def test_each_is_the_solution_that_is_meant():
+    assert {type(primitive._solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
+    assert all(type(primitive._solution) is kind for primitive, kind in SOLUTIONS.values())
+
+
+@pytest.mark.parametrize("kind", [Dense, LowRank, Conditioned])
+def test_a_method_takes_what_the_protocol_says(kind):
+    for name in MEMBERS:
+        wanted = vars(Solution)[name]
+        if inspect.isfunction(wanted):
+            given = inspect.signature(getattr(kind, name)).parameters
+            assert list(given) == list(inspect.signature(wanted).parameters), name
+
+
+def test_all_that_the_protocol_names_is_there(primitive):
+    assert [name for name in MEMBERS if not hasattr(primitive._solution, name)] == []
+
+
+def test_counts_and_shapes_agree(primitive):
+    solution = primitive._solution
+    assert len(solution.database) == len(primitive.inputs) == len(primitive.reference)
+    assert primitive._query.covariance_scale == len(solution.database) / primitive.lambda_covariance
+    assert solution.weights.shape == (len(solution.centres), 2)
+    rows = primitive.kernel(S[:5], solution.centres)
+    assert mean_at(solution, S[:5]).shape == (5, 2)
+    together = solution.posterior_covariance(rows)
+    for n in range(5):
+        np.testing.assert_allclose(solution.posterior_covariance_one(rows[n]), together[n], atol=1e-9)
+
+
+def test_solving_again_gives_the_solution_itself(primitive):
+    assert primitive._solution.solved() is primitive._solution
+
+
+def test_an_adapted_solution_is_adapted_from_its_base(primitive):
+    changes = fitted("dense", VIA)._changes
+    again, base = primitive._solution.adapted(changes).solved(), primitive.base._solution.adapted(changes).solved()
+    assert np.array_equal(mean_at(again, S), mean_at(base, S))
+
+
+def test_weights_that_are_given_are_kept_and_the_solution_is_left_as_it_was(primitive):
+    solution, ones = primitive._solution, np.ones_like(primitive.weights)
+    other = solution.with_weights(ones)
+    assert np.array_equal(other.weights, ones)
+    assert not np.array_equal(solution.weights, ones)
+
+
+def test_each_is_stored_with_what_its_base_needs(primitive):
+    assert set(primitive._solution.to_arrays()) == set(primitive.base._solution.to_arrays())
+    assert primitive.representation == primitive.base.representation
+    again = KMP.from_arrays(primitive.to_arrays())
+    assert type(again._solution) is type(primitive._solution)
+    assert np.array_equal(again.mean(S), primitive.mean(S))
+
+
+@pytest.mark.parametrize("name", ["information", "features"])
+def test_an_array_of_the_low_rank_solution_that_lacks_is_named(name):
+    arrays = fitted("low_rank").to_arrays()
+    del arrays[name]
+    with pytest.raises(ValueError, match=f"The primitive's arrays lack {name}. Needed are .*pivots"):
+        KMP.from_arrays(arrays)
+
+
+def test_pivots_that_rounding_does_not_tell_apart_are_refused():
+    arrays = fitted("low_rank").to_arrays()
+    pivots = arrays["pivots"].copy()
+    pivots[-1] = pivots[0]
+    says = rf"pivots: {len(pivots)} given, and rounding tells only {len(pivots) - 1} apart"
+    with pytest.raises(ValueError, match=says):
+        KMP.from_arrays(arrays | {"pivots": pivots})
