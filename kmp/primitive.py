@@ -246,17 +246,17 @@ class KMP(Immutable):
 
     @property
     def kernel(self) -> Kernel:
-        """k."""
+        """The kernel k."""
         return self._solution.hyperparameters.kernel
 
     @property
     def lambda_mean(self) -> float:
-        """lambda of equation (9)."""
+        """lambda of equation (9) [1 / (unit of the outputs)^2]."""
         return self._solution.hyperparameters.lambda_mean
 
     @property
     def lambda_covariance(self) -> float:
-        """lambda of the covariance."""
+        """lambda of the covariance [1 / (unit of the outputs)^2]."""
         return self._solution.hyperparameters.lambda_covariance
 
     @property
@@ -291,7 +291,7 @@ class KMP(Immutable):
 
     @property
     def outputs(self) -> int:
-        """O."""
+        """O, the number of outputs."""
         return self._solution.hyperparameters.outputs
 
     @property
