@@ -105,7 +105,7 @@ class Client:
         """What `<cell>/status` carries."""
         return self.ask("status")
 
-    def add(self, points: Iterable[requests.ViaPoint], *, tolerance: float = 0.05) -> dict[str, Any]:
+    def add(self, points: Iterable[requests.ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> dict[str, Any]:
         """Teaches via-points; returns once they are in force."""
         return self.ask("via_points", requests.Add(tuple(points), tolerance))
 

@@ -1,6 +1,6 @@
 """Settings of one cell: a TOML file, validated whole before anything starts.
 
-Units stand in the names, defaults are safe.
+Units stand in the names or beside them, defaults are safe.
 """
 
 from __future__ import annotations
@@ -203,9 +203,7 @@ class Settings(Section, frozen=True):
                 raise ValueError(f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted")
 
     def _widest(self) -> dict[str, PerJoint]:
-        """The widest limits that are accepted: the shipped arm's own, and what is safe for any
-        other is its owner's to say.
-        """
+        """Bounds of the limits: the defaults for the shipped arm, none for others."""
         if not self.arm.urdf:
             return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
         n = len(self.joints.names)
@@ -217,9 +215,14 @@ class Settings(Section, frozen=True):
         return 1.0 / self.rate_hz
 
 
+def urdf_path(settings: Settings) -> Path:
+    """Where the arm's URDF is."""
+    return Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM
+
+
 def robot_description(settings: Settings) -> str:
     """The text of the arm's URDF. Raises SettingsError."""
-    path = Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM
+    path = urdf_path(settings)
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -50,7 +50,6 @@ class Urdf:
         parents = {joint.parent for joint in self.joints}
         self.root = next(joint.parent for joint in self.joints if joint.parent not in self._above)
         self.leaves = tuple(joint.child for joint in self.joints if joint.child not in parents)
-        self.links = (self.root, *(joint.child for joint in self.joints))
 
     def chain(self, tip: str) -> tuple[Joint, ...]:
         """The joints from the root to link `tip`, in order. Raises UrdfError."""

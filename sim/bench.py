@@ -23,6 +23,8 @@ from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION
 from sim.script import HandMotions, HandScript
 from sim.world import BOARD_FROM_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
 
+SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
+STILL_S = 0.25  # of rest is settled
 BRAKE_AFTER_S = 0.020  # without a command
 TAIL_S = 0.5  # watched after the script's end
 STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
@@ -164,12 +166,16 @@ class Bench:
         """For how long the tool has stayed within 5 mm [s]."""
         return self._still * self.period_s
 
+    def settled(self, waited_s: float) -> bool:
+        """Whether the arm, given so long, has come to rest where the hands want it."""
+        return waited_s >= SETTLE_S[1] or (waited_s >= SETTLE_S[0] and self.still_s >= STILL_S)
+
     def observe(self) -> Observation:
         """What the last step left."""
         return self._observation
 
     def step(self, position: Floats | None = None, velocity: Floats | None = None) -> Observation:
-        """The bench one period later, after a command of seven joints [rad, rad/s], or none."""
+        """The bench one period later, after a command of its joints [rad, rad/s], or none."""
         self._follow(position, velocity)
         self.world.step()
         self.tick += 1

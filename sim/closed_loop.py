@@ -14,7 +14,6 @@ from service.contract.messages import BASE, JointState, PoseStamped, Quaternion,
 from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Tick
 from sim.bench import Bench
-from sim.network import SETTLE_S, STILL_S
 
 HANDS_HZ = 100  # also of the joint states
 START_NS = 1_000_000_000_000  # stamps begin there: 0 would mean that there is none
@@ -36,8 +35,7 @@ def joints_event(
 
 def begin_when_settled(bench: Bench) -> None:
     """Lets the script begin once, when the arm has come to rest where the hands want it."""
-    waited_s = bench.tick * bench.period_s
-    if bench.waiting and waited_s >= SETTLE_S[0] and (waited_s >= SETTLE_S[1] or bench.still_s >= STILL_S):
+    if bench.waiting and bench.settled(bench.tick * bench.period_s):
         bench.begin()
 
 

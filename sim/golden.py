@@ -19,10 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract import cdr
+from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, run
-from service.core.frame import Event, Frame, Tick, differences
+from service.core.frame import Event, Frame, Tick, differences, order
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError, decoded
 from service.learning.via_points import adapted
@@ -55,8 +56,8 @@ class Session:
     def __init__(self, bench: Bench, skill: Skill) -> None:
         self._bench = bench
         self._adopted = {
-            self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=0.05),
-            self._tick(RETEACH_S): adapted(skill, MOVED.via_points(), tolerance=0.05),
+            self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=TOLERANCE_M),
+            self._tick(RETEACH_S): adapted(skill, MOVED.via_points(), tolerance=TOLERANCE_M),
         }
         self._orders = {self._tick(HOLD_S[0]): "hold", self._tick(HOLD_S[1]): "resume"}
         self.loop = ClosedLoop(bench, direct=self._direct, spoil=self._spoil)
@@ -72,7 +73,7 @@ class Session:
             if k in self._adopted:
                 events.append(Event("skill", self._adopted[k].file, self._adopted[k]))
             if k in self._orders:
-                events.append(Event(self._orders[k], cdr.encode_string("{}"), None))
+                events.append(order(self._orders[k]))
             if k % 1777 == 1776:
                 jump += 3
             yield Tick(k + jump, tuple(events))
@@ -110,7 +111,7 @@ def record(
 ) -> list[Frame]:
     """The frames of the core run on ticks, which are recorded and shown to `follow`."""
     frames: list[Frame] = []
-    controller = Controller(settings, skill)
+    controller = Controller(settings, skill, urdf=robot_description(settings))
     with Recorder(path, settings=settings, skill=skill.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:

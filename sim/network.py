@@ -23,9 +23,7 @@ from sim.bench import Bench, Observation, TaskEvent, TaskEvents
 from sim.scene import Scene
 from sim.script import Array
 
-SETTLE_S = (0.5, 2.5)  # at least and at most, from the first command to the script's begin
 STOP_S = 0.5  # between the last hands and the end
-STILL_S = 0.25  # of rest is settled
 
 
 class BenchError(RuntimeError):
@@ -221,7 +219,7 @@ def _play(
                 )
         elif not running:
             waited = now_s - ready_s
-            if waited >= SETTLE_S[1] or (waited >= SETTLE_S[0] and bench.still_s >= STILL_S):
+            if bench.settled(waited):
                 bench.begin()
                 commands.restart()
                 running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent

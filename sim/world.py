@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pybullet
 
-from service.config import WAM, Settings, Table
+from service.config import Settings, Table, urdf_path
 from sim.scene import HAND_ORIENTATION, Scene
 
 Floats = tuple[float, ...]
@@ -50,7 +50,7 @@ class World:
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._id)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self._id)
         self.arm: int = pybullet.loadURDF(
-            settings.arm.urdf or str(WAM),
+            str(urdf_path(settings)),
             useFixedBase=True,
             flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
             physicsClientId=self._id,

@@ -11,7 +11,6 @@ import numpy as np
 from wam import JOINT_NAMES
 
 from service.config import Settings
-from service.contract import cdr
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick
 from sim.closed_loop import hand_event, joints_event
@@ -29,11 +28,6 @@ def hand(side: str, position: tuple[float, float, float], stamp_ns: int) -> Even
 def arm(joints: tuple[float, ...], stamp_ns: int, velocities: tuple[float, ...] = (0.0,) * 7) -> Event:
     """The arm's sample as an event."""
     return joints_event(JOINT_NAMES, joints, velocities, stamp_ns)
-
-
-def order(kind: str) -> Event:
-    """A hold, resume or reset."""
-    return Event(kind, cdr.encode_string("{}"), None)
 
 
 def ticks_of(

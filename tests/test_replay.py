@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import ASSUMED, ticks_of
+from wam import URDF
 
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, run
@@ -43,7 +44,7 @@ def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked
 
 def test_the_golden_session_replays_from_a_state_in_its_middle() -> None:
     result = replay(GOLDEN, after=6000)
-    assert result.close
+    assert result.within_tolerance
     assert 3000 < result.ticks < 5000
 
 
@@ -62,7 +63,7 @@ def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short session, with states, recorded in process."""
     path = tmp_path_factory.mktemp("recorded") / "short.mcap"
     taught = adapted(skill, Scene().via_points(), tolerance=0.05)
-    controller = Controller(ASSUMED, taught)
+    controller = Controller(ASSUMED, taught, urdf=URDF)
     with Recorder(path, settings=ASSUMED, skill=taught.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
@@ -92,7 +93,7 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
             recorder.write(tick, frame, time_ns=step.tick * 2_000_000)
     result = replay(path)
     assert not result.exact
-    assert result.close
+    assert result.within_tolerance
     assert "first difference at tick 600: joints by 1e-09" in result.text()
     assert command(str(path)).returncode == 0
     exact = command(str(path), "--exact")

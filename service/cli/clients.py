@@ -16,7 +16,7 @@ from service.contract.channels import ENDPOINT
 
 
 def via_points(args: argparse.Namespace) -> int:
-    """0 once the daemon has carried it out."""
+    """Exit code 0 once the daemon has carried it out."""
     request: Any = {"op": args.action}
     if args.action == "remove":
         request["names"] = args.names
@@ -43,7 +43,7 @@ def _add(args: argparse.Namespace) -> Any:
 
 
 def status(args: argparse.Namespace) -> int:
-    """0 if a daemon answers."""
+    """Exit code 0 if a daemon answers."""
     now = ask(args, "status")
     if args.json:
         print(json.dumps(now, indent=2))
@@ -75,7 +75,7 @@ def status(args: argparse.Namespace) -> int:
 
 
 def hold(args: argparse.Namespace) -> int:
-    """0 once the arm is told to stop, resume or reset."""
+    """Exit code 0 once the arm is told to stop, resume or reset."""
     print(f"{args.command} in force since tick {ask(args, args.command)['tick']}")
     return 0
 

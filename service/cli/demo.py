@@ -31,7 +31,7 @@ class DemoError(ExplainedError):
 
 
 def demo(args: argparse.Namespace) -> int:
-    """0 only if the task succeeded."""
+    """Exit code 0 only if the task succeeded."""
     report = run(args.out, scene=args.scene, say=lambda line: print(line, file=sys.stderr, flush=True))
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] else 1

@@ -176,7 +176,10 @@ def parser() -> argparse.ArgumentParser:
         help="within the radius the tool moves with this hand",
     )
     a.add_argument(
-        "--tolerance", type=float, metavar="M", help="points learned nearer than this give way (default: 0.05 m)"
+        "--tolerance",
+        type=float,
+        metavar="M",
+        help="points learned nearer than this give way (default: {TOLERANCE_M} m)",
     )
     a.add_argument("--file", metavar="FILE", help="a request as JSON instead; - is standard input")
     _reach(a)

@@ -17,7 +17,7 @@ from service.recorder.replay import replay as replayed
 
 
 def play(args: argparse.Namespace) -> int:
-    """0 once all hands are published."""
+    """Exit code 0 once all hands are published."""
     if not 0.01 <= args.speed <= 100:
         raise UsageError(f"--speed {args.speed}: 0.01 to 100 accepted")
     try:
@@ -52,7 +52,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def replay(args: argparse.Namespace) -> int:
-    """0 if every frame is identical, or close enough where that is allowed."""
+    """Exit code 0 if every frame is identical, or close enough where that is allowed."""
 
     def progress(ticks: int) -> None:
         print(f"\r{ticks} ticks", end="", file=sys.stderr, flush=True)
@@ -61,11 +61,11 @@ def replay(args: argparse.Namespace) -> int:
     if sys.stderr.isatty():
         print("\r", end="", file=sys.stderr)
     print(result.text())
-    return 0 if result.exact or (result.close and not args.exact) else 1
+    return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
 
 
 def learn(args: argparse.Namespace) -> int:
-    """0 once the skill is written."""
+    """Exit code 0 once the skill is written."""
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(path)

@@ -26,7 +26,7 @@ from service.recorder.sinks import Viewer, ViewerError
 
 
 def view(args: argparse.Namespace) -> int:
-    """0 once the viewer is open, or the picture written."""
+    """The viewer's exit code once it is closed; 0 once a picture is written."""
     if args.file == "live":
         url = ask(args, "status")["scribe"].get("live")
         if not url:

@@ -59,7 +59,7 @@ def _put_doubles(out: bytearray, values: tuple[float, ...]) -> None:
 
 def encode_pose(message: PoseStamped) -> bytes:
     """CDR bytes of a PoseStamped."""
-    out = _header(message.stamp_ns, message.frame)
+    out = _header(message.stamp_ns, message.frame_id)
     _align(out, 8)
     out += _POSE.pack(*message.position, *message.orientation)
     return bytes(out)
@@ -67,7 +67,7 @@ def encode_pose(message: PoseStamped) -> bytes:
 
 def encode_pose_with_covariance(message: PoseWithCovarianceStamped) -> bytes:
     """CDR bytes of a PoseWithCovarianceStamped."""
-    out = _header(message.stamp_ns, message.frame)
+    out = _header(message.stamp_ns, message.frame_id)
     _align(out, 8)
     out += _POSE.pack(*message.position, *message.orientation)
     out += _COVARIANCE.pack(*message.covariance)
@@ -76,7 +76,7 @@ def encode_pose_with_covariance(message: PoseWithCovarianceStamped) -> bytes:
 
 def encode_joints(message: JointState) -> bytes:
     """CDR bytes of a JointState."""
-    out = _header(message.stamp_ns, message.frame)
+    out = _header(message.stamp_ns, message.frame_id)
     _align(out, 4)
     out += _LENGTH.pack(len(message.names))
     for name in message.names:

@@ -2,7 +2,9 @@
 loop, or is recorded.
 
 Subscribers, publishers, queryables, the kinds of events, the topics of a recording, staleness and
-the README's table are all derived from it: a new channel is one more line here.
+the README's table are all derived from it. A new channel is one more line here and, if it enters
+the loop, a case in `core.controller`; if the loop sends on it, a function in `core.outputs`; if its
+message is new, a codec in `cdr` and a definition in `ros2msg`.
 """
 
 from __future__ import annotations
@@ -46,6 +48,13 @@ FRAME, TIMING, STATE = (
 )
 
 
+class EventKind(NamedTuple):
+    """What enters the loop: its number in recordings, for good, and how they keep it."""
+
+    number: int
+    codec: Codec
+
+
 class Channel(NamedTuple):
     """One line of the table."""
 
@@ -55,20 +64,25 @@ class Channel(NamedTuple):
     about: str
     rate: str = "on demand"  # in words
     every: int = 0  # ticks from one message to the next; 0: not sent by the loop
-    event: Codec | None = None  # how a recording keeps what enters the loop here; None: nothing does
+    event: EventKind | None = None  # None: nothing enters the loop here
     stale_after: tuple[str, str] | None = None  # section and name of the setting after which the source is silent
     queryable: bool = False
     recorded: bool = True
 
+    @property
+    def kept_as(self) -> Codec:
+        """How a recording keeps what passes here."""
+        return self.event.codec if self.event else self.codec
 
-_HAND: Any = {"rate": "30 - 500 Hz", "event": POSE, "stale_after": ("hands", "stale_ms")}
+
+_HAND: Any = {"rate": "30 - 500 Hz", "stale_after": ("hands", "stale_ms")}
 
 CHANNELS = (
     Channel("hands/left", POSE, "in", "the user's left hand in the tracker's frame (`base` unless configured)",
-            **_HAND),
-    Channel("hands/right", POSE, "in", "the user's right hand", **_HAND),
+            event=EventKind(0, POSE), **_HAND),
+    Channel("hands/right", POSE, "in", "the user's right hand", event=EventKind(1, POSE), **_HAND),
     Channel("joints/state", JOINTS, "in", "the arm's joints as measured",
-            rate="100 - 1000 Hz", event=JOINTS, stale_after=("arm", "silent_ms")),
+            rate="100 - 1000 Hz", event=EventKind(2, JOINTS), stale_after=("arm", "silent_ms")),
     Channel("joints/command", JOINTS, "out", "position [rad] and velocity [rad/s]; silent until the arm is ready",
             rate="every tick", every=1),
     Channel("tool/target", POSE_WITH_COVARIANCE, "out", "what the skill predicts from both hands, and how sure it is",
@@ -81,10 +95,11 @@ CHANNELS = (
             queryable=True, recorded=False),
     Channel("skill", _request(requests.SkillRequest), "request",
             "load a skill from the skill folder; via-points stay with the skill they were taught to",
-            event=SKILL, queryable=True),
-    Channel("hold", _request(requests.Nothing), "request", "stop and stay", event=STRING, queryable=True),
-    Channel("resume", _request(requests.Nothing), "request", "end an operator's hold", event=STRING, queryable=True),
-    Channel("reset", _request(requests.Nothing), "request", "end a fault", event=STRING, queryable=True),
+            event=EventKind(3, SKILL), queryable=True),
+    Channel("hold", _request(requests.Nothing), "request", "stop and stay", event=EventKind(4, STRING), queryable=True),
+    Channel("resume", _request(requests.Nothing), "request", "end an operator's hold",
+            event=EventKind(5, STRING), queryable=True),
+    Channel("reset", _request(requests.Nothing), "request", "end a fault", event=EventKind(6, STRING), queryable=True),
     Channel("tick", TICK, "recording", "index and event kinds", rate="every tick", every=1),
     Channel("frame", FRAME, "recording", "all that the tick decided", rate="every tick", every=1),
     Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="every tick", every=1),
@@ -97,7 +112,8 @@ CHANNELS = (
     Channel("/robot_description", STRING, "recording", "the arm's URDF", rate="once"),
 )  # fmt: skip
 BY_KEY = {channel.key: channel for channel in CHANNELS}
-EVENT_KINDS = tuple(channel.key for channel in CHANNELS if channel.event is not None)  # a recording numbers them so
+EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if channel.event is not None}
+EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
 def key(cell: str, suffix: str) -> str:

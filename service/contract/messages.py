@@ -20,7 +20,7 @@ class PoseStamped(NamedTuple):
     """`geometry_msgs/msg/PoseStamped`: position [m], quaternion x y z w."""
 
     stamp_ns: int
-    frame: str
+    frame_id: str
     position: Vector3
     orientation: Quaternion
 
@@ -29,7 +29,7 @@ class PoseWithCovarianceStamped(NamedTuple):
     """`geometry_msgs/msg/PoseWithCovarianceStamped`; covariance is 6 x 6 row-major [m², rad²]."""
 
     stamp_ns: int
-    frame: str
+    frame_id: str
     position: Vector3
     orientation: Quaternion
     covariance: tuple[float, ...]
@@ -45,7 +45,7 @@ class JointState(NamedTuple):
     position: tuple[float, ...]
     velocity: tuple[float, ...]
     effort: tuple[float, ...] = ()
-    frame: str = ""
+    frame_id: str = ""
 
 
 class Transform(NamedTuple):

@@ -57,7 +57,7 @@ class Cause(enum.IntEnum):
     INCOMPLETE = 5
 
 
-JOINTS = 0  # in a shape: one for each joint of the arm
+PER_JOINT = 0  # in a shape: one for each joint of the arm
 
 
 class Field(NamedTuple):
@@ -89,9 +89,9 @@ FRAME = (
     Field("setpoint_acceleration", "float64", (3,)),
     Field("tool", "float64", (3,)),  # where the commanded joints put the tool [m]
     Field("orientation", "float64", (4,)),  # of the target, quaternion x y z w
-    Field("joints", "float64", (JOINTS,)),  # the command [rad]
-    Field("joint_velocities", "float64", (JOINTS,)),
-    Field("joint_accelerations", "float64", (JOINTS,)),
+    Field("joints", "float64", (PER_JOINT,)),  # the command [rad]
+    Field("joint_velocities", "float64", (PER_JOINT,)),
+    Field("joint_accelerations", "float64", (PER_JOINT,)),
     Field("hand_ages", "int32", (2,)),  # ticks since the newest sample; -1: none yet
     Field("rejected", "uint32", (len(Cause),)),
     Field("mode", "uint8"),
@@ -108,10 +108,10 @@ STATE = (
     Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
     Field("filters", "float64", (2, 3, 3)),  # position, velocity, acceleration; by axis
     Field("filter_covariances", "float64", (2, 3, 3)),
-    Field("measured", "float64", (JOINTS,)),
-    Field("measured_velocities", "float64", (JOINTS,)),
+    Field("measured", "float64", (PER_JOINT,)),
+    Field("measured_velocities", "float64", (PER_JOINT,)),
     Field("setpoint", "float64", (3, 3)),  # position, velocity, acceleration; by axis
-    Field("joints", "float64", (3, JOINTS)),  # position, velocity, acceleration; by joint
+    Field("joints", "float64", (3, PER_JOINT)),  # position, velocity, acceleration; by joint
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
     Field("rejected", "uint32", (len(Cause),)),
     Field("mode", "uint8"),

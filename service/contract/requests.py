@@ -12,6 +12,7 @@ import msgspec
 from service.contract.explain import ExplainedError, explained
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
+TOLERANCE_M = 0.05  # a reference point nearer to a via-point gives way, unless said otherwise
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
 Point = tuple[Metre, Metre, Metre]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)]
@@ -45,7 +46,7 @@ class Add(_Operation, frozen=True, tag="add"):
     """
 
     points: Annotated[tuple[ViaPoint, ...], msgspec.Meta(min_length=1, max_length=100)]
-    tolerance: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.05
+    tolerance: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_M
 
 
 class Remove(_Operation, frozen=True, tag="remove"):
@@ -75,7 +76,7 @@ class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The empty request of hold, resume and reset."""
 
 
-class AdoptedViaPoint(ViaPoint, frozen=True, kw_only=True):
+class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
     """A via-point in force, and how far the skill misses it [m]."""
 
     missed_by_m: float
@@ -85,7 +86,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     """The answer to a request: the tick from which it holds, and the via-points in force."""
 
     tick: int
-    points: tuple[AdoptedViaPoint, ...] | None = None
+    points: tuple[ViaPointInForce, ...] | None = None
 
 
 class RequestError(ExplainedError, ValueError):

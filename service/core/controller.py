@@ -1,6 +1,7 @@
 """The core: each tick's inbox in, a frame out.
 
-Deterministic: no clock, no input or output, and all it remembers is one flat state.
+Deterministic: no clock, no input or output, and all it remembers is one flat state and
+the skill in force.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from service.config import Settings, robot_description
+from service.config import Settings
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.arm import Arm
 from service.core.frame import Frame, Lap, Record, Tick, Vector, blank, frame_layout, frozen, no_lap, state_layout
-from service.core.intake import Intake, rotation
+from service.core.intake import Intake
 from service.core.limiter import Limiter
+from service.core.rotation import rotation
 from service.core.skill import Prediction, Skill
 from service.core.smoother import Smoother
 from service.core.workspace import Target, clamp
@@ -44,20 +46,18 @@ class Controller:
     """Five stages in a row: intake, skill, smoother, arm, limiter.
 
     `Controller(settings, skill, state)` goes on bit for bit from where another controller's `state`
-    was taken. `urdf` is the text of the arm's description where it is not to be read from where the
-    settings say.
+    was taken. `urdf` is the text of
+    the arm's description.
     """
 
-    def __init__(
-        self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str | None = None
-    ) -> None:
+    def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
         self._settings = settings
         self._skill = skill
         self._state = (start_state(settings, skill) if state is None else state).copy()
         self._layout = frame_layout(len(settings.joints.names))
         self._intake = Intake(settings)
         self._smoother = Smoother(settings.tool, settings.period_s)
-        self._arm = Arm(settings, robot_description(settings) if urdf is None else urdf)
+        self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
 
@@ -122,6 +122,8 @@ class Controller:
                 case "reset":
                     if state["mode"] == Mode.FAULT:
                         state["mode"], state["arm_ready"] = Mode.HOLD, 0
+                case _:
+                    raise ValueError(f"tick {tick.index}: nothing is done with an event of kind {event.kind!r}")
 
     def _adopt(self, skill: Skill) -> None:
         self._skill = skill

@@ -6,7 +6,7 @@ Frame, State and Timing are NumPy structured scalars laid out as `service.contra
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.contract import cdr, records
-from service.contract.channels import Channel, sent_by_the_loop
-from service.contract.messages import BASE, PoseStamped, PoseWithCovarianceStamped
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
@@ -37,6 +35,11 @@ class Event:
     kind: str
     payload: bytes
     value: Any
+
+
+def order(kind: str) -> Event:
+    """A hold, resume or reset as an event."""
+    return Event(kind, cdr.encode_string("{}"), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,45 +104,3 @@ def differences(a: Record, b: Record) -> dict[str, float]:
         for field in a.dtype.names or ()
         if a[field].tobytes() != b[field].tobytes()
     }
-
-
-def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Iterator[tuple[Channel, bytes]]:
-    """What goes out with a frame, and on which channels; `joints` are the names of the commanded
-    ones.
-
-    Live and in a recording alike. Nothing is commanded before the arm is ready, and nothing aimed
-    at without both hands.
-    """
-    for channel in sent_by_the_loop(int(frame["tick"])):
-        payload = _OUTPUTS[channel.key](frame, stamp_ns, joints)
-        if payload is not None:
-            yield channel, payload
-
-
-def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
-    if not frame["commanded"]:
-        return None
-    return cdr.encode_command(stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist())
-
-
-def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
-    if not frame["covariance"].any():
-        return None
-    covariance = [0.0] * 36
-    for i, row in enumerate(frame["covariance"].tolist()):
-        covariance[6 * i : 6 * i + 3] = row
-    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
-    message = PoseWithCovarianceStamped(stamp_ns, BASE, position, orientation, tuple(covariance))
-    return cdr.encode_pose_with_covariance(message)
-
-
-def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
-    message = PoseStamped(stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["orientation"].tolist()))
-    return cdr.encode_pose(message)
-
-
-_OUTPUTS: dict[str, Callable[[Frame, int, tuple[str, ...]], bytes | None]] = {
-    "joints/command": _command,
-    "tool/target": _target,
-    "tool/setpoint": _setpoint,
-}

@@ -14,6 +14,7 @@ from service.contract.channels import BY_KEY
 from service.contract.messages import JointState, PoseStamped, WireError, finite, in_order
 from service.contract.records import SIDES, Cause
 from service.core.frame import Record, Vector
+from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
@@ -30,18 +31,6 @@ def _stale_ticks(key: str, settings: Settings) -> int:
     return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
 
 
-def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
-    """The rotation matrix (3, 3) of a quaternion x y z w, normalised first."""
-    x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 class Intake:
     """Hand and arm samples into the state: a constant-acceleration Kalman filter for each hand, the
     newest sample of the arm.
@@ -53,6 +42,7 @@ class Intake:
         self._stale_ticks = tuple(_stale_ticks(f"hands/{side}", settings) for side in SIDES)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._names = settings.joints.names
+        self._farthest_joint = max(2 * math.pi, *(abs(x) + 1.0 for x in settings.joints.lower + settings.joints.upper))
         self._scale = UNIT_M[hands.unit]
         self._origin = np.array(hands.base_from_tracker[:3])
         self._axes = rotation(hands.base_from_tracker[3:])
@@ -147,7 +137,7 @@ class Intake:
             return
         if not (finite(position) and finite(velocity)):
             cause: Cause | None = Cause.NOT_FINITE
-        elif max(map(abs, position)) > 2 * math.pi or max(map(abs, velocity)) > 100:
+        elif max(map(abs, position)) > self._farthest_joint or max(map(abs, velocity)) > 100:
             cause = Cause.OUT_OF_RANGE
         else:
             cause = self._why_not_newer(sample.stamp_ns, int(state["arm_stamp_ns"]), fresh=self.is_arm_heard(state))

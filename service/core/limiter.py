@@ -18,7 +18,7 @@ import ruckig
 from service.config import JointSettings
 from service.core.frame import Vector
 
-DECIMALS = 9  # [rad] of the positions: replay's seam
+DECIMALS = 9  # [rad] of the positions: rounded so that a replay on another kind of CPU agrees
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kmp import KMP
-from service.contract.requests import ViaPoint
+from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Vector
 
 
@@ -43,7 +43,7 @@ class Skill:
     learned_from: str  # hash of the demonstrations
     components: int = 0  # of the mixture that it was learned with
     via_points: tuple[ViaPoint, ...] = ()
-    tolerance: float = 0.05  # [m] a reference point nearer to a via-point gives way
+    tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
     file: bytes = field(default=b"", repr=False)  # all of the above, as it is stored and recorded
 
     def predict(

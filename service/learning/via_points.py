@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from kmp import Gaussians, ViaPointMissed
-from service.contract.requests import AdoptedViaPoint, ViaPoint
+from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError, with_file
@@ -30,17 +30,17 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
         inputs, outputs, deviations = neighbourhoods(via_points)
         desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ViaPointMissed)  # `adopted` tells by how much
+            warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
             primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
 
 
-def adopted(skill: Skill) -> tuple[AdoptedViaPoint, ...]:
+def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
     """The via-points in force, each with the distance by which the skill misses it [m]."""
     return tuple(
-        AdoptedViaPoint(
+        ViaPointInForce(
             **msgspec.structs.asdict(point),
             missed_by_m=math.dist(point.tool, skill.primitive.mean([[*point.left, *point.right]])[0]),
         )
@@ -48,7 +48,7 @@ def adopted(skill: Skill) -> tuple[AdoptedViaPoint, ...]:
     )
 
 
-def count(via_points: Sequence[ViaPoint]) -> int:
+def points_made_of(via_points: Sequence[ViaPoint]) -> int:
     """How many points `neighbourhoods` makes of via-points."""
     return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)
 

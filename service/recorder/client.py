@@ -26,7 +26,7 @@ import msgspec
 from service import child
 from service.config import Settings
 from service.core.frame import Record, Tick
-from service.recorder.protocol import HAS_STATE, HEAD, LARGEST_MESSAGE, LONGEST_NOTE, NOTE, Task, pack
+from service.recorder.protocol import LARGEST_MESSAGE, Task, pack, pack_note
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
@@ -35,7 +35,7 @@ RESTART_S = 1.0
 
 
 class Scribe:
-    """A scribe process and the way to tell it.
+    """Starts the scribe process, and sends it ticks and notes.
 
     `send` is for the loop, `start`, `supervise`, `status` and `close` for one other thread, `note`
     and `keep` for any.
@@ -122,14 +122,9 @@ class Scribe:
             return
         say_all = self._say_all
         self._since_state += 1
-        message = pack(
-            tick,
-            frame,
-            timing,
-            state=state() if say_all or self._since_state >= self._settings.rate_hz else None,
-            lost=self._gap,
-            with_skill=say_all,
-        )
+        with_state = say_all or self._since_state >= self._settings.rate_hz
+        after = state() if with_state else None
+        message = pack(tick, frame, timing, state=after, lost=self._gap, with_skill=say_all)
         try:
             skills = [event.payload for event in tick.inbox if event.kind == "skill"]
             if say_all:
@@ -148,7 +143,7 @@ class Scribe:
         self._gap = 0
         if say_all:
             self._say_all = False
-        if message[1] & HAS_STATE:
+        if with_state:
             self._since_state = 0
 
     def note(self, key: str, text: str, time_ns: int) -> None:
@@ -158,7 +153,7 @@ class Scribe:
         target = self._socket
         if target is not None:
             with contextlib.suppress(OSError):
-                target.send(HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode())
+                target.send(pack_note(key, text, time_ns))
 
     def supervise(self) -> None:
         """Hears what the process has to say, and starts it anew if it died, with new files.

@@ -73,7 +73,7 @@ def read_demonstration(path: str | Path) -> Demonstration:
         if len(stamps) < 2:
             raise RecordingError(f"{path}: {len(poses)} poses on {name} with {len(stamps)} different stamps, 2 needed")
         tracks.append((stamps, np.array([poses[i].position + poses[i].orientation for i in first])))
-    frames = {name: poses[0].frame for name, poses in rows.items()}
+    frames = {name: poses[0].frame_id for name, poses in rows.items()}
     if len(set(frames.values())) > 1:
         raise RecordingError(
             f"{path}: poses in different frames: {', '.join(f'{name} in {frame!r}' for name, frame in frames.items())}"

@@ -26,9 +26,9 @@ import msgspec
 import numpy as np
 
 from service import child
-from service.config import WAM
+from service.config import urdf_path
 from service.core.frame import Record, state_layout
-from service.recorder.protocol import HEAD, LARGEST_MESSAGE, NOTE, Task, unpack
+from service.recorder.protocol import LARGEST_MESSAGE, Task, unpack, unpack_note
 from service.recorder.recording import Recorder
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ DRAW_QUEUED = 5000  # ticks
 POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
 
 
-class Drawing:
+class DrawingThread:
     """The viewer on a thread of its own: where it falls behind or hangs, on a full disk say, the
     recording does not.
     """
@@ -89,14 +89,14 @@ class ScribeProcess:
         self._joints = len(task.settings.joints.names)
         self._recorder: Recorder | None = None
         self._record_to = task.recording
-        self._drawing: Drawing | None = None
+        self._drawing: DrawingThread | None = None
         self._said_dropped = 0
         if task.rrd is not None or task.live_port is not None:
             from service.recorder.sinks import Viewer  # half a second that a scribe without viewer need not spend
 
             rrd = None if task.rrd is None else Path(task.rrd)
-            urdf = Path(task.settings.arm.urdf or WAM)
-            self._drawing = Drawing(Viewer(urdf=urdf, rrd=rrd, live_port=task.live_port, settings=task.settings))
+            urdf = urdf_path(task.settings)
+            self._drawing = DrawingThread(Viewer(urdf=urdf, rrd=rrd, live_port=task.live_port, settings=task.settings))
         if skill is not None:
             self._begin(skill, None if task.state is None else np.frombuffer(task.state, state_layout(self._joints))[0])
         self._report()
@@ -135,9 +135,8 @@ class ScribeProcess:
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
         """Writes and draws one message."""
-        if message[0] == NOTE:
-            key, text = json.loads(message[HEAD.size :])
-            self._note(key, text, HEAD.unpack_from(message)[4])
+        if (note := unpack_note(message)) is not None:
+            self._note(*note)
             return
         told = unpack(message, skills, joints=self._joints)
         time_ns = int(told.timing["time_ns"])

@@ -4,6 +4,7 @@ started with.
 
 from __future__ import annotations
 
+import json
 import struct
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ import msgspec
 import numpy as np
 
 from service.config import Settings
-from service.contract.channels import EVENT_KINDS
+from service.contract.channels import EVENT_KINDS, EVENT_NUMBERS
 from service.core.frame import TIMING, Event, Record, Tick, frame_layout, state_layout
 
 LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
@@ -20,10 +21,9 @@ LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
 _TICK, NOTE = 1, 2
 HEAD = struct.Struct("<BBHIq")  # type, what follows, number of events, ticks lost before, index
 _EVENT = struct.Struct("<BI")  # kind, bytes
-HAS_STATE, _HAS_SKILL = 1, 2
+_HAS_STATE, _HAS_SKILL = 1, 2
 _ELSEWHERE = 0xFFFFFFFF  # the bytes are in a file in memory that comes along
-_KINDS = {kind: number for number, kind in enumerate(EVENT_KINDS)}
-_SKILL = _KINDS["skill"]
+_SKILL = EVENT_NUMBERS["skill"]
 
 
 class Told(NamedTuple):
@@ -41,13 +41,13 @@ def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, los
     """One message about a tick; the bytes of skills are not in it."""
     head, bodies = [b""], []
     for event in tick.inbox:
-        kind = _KINDS[event.kind]
+        kind = EVENT_NUMBERS[event.kind]
         if kind == _SKILL:
             head.append(_EVENT.pack(kind, _ELSEWHERE))
         else:
             head.append(_EVENT.pack(kind, len(event.payload)))
             bodies.append(event.payload)
-    follows = (HAS_STATE if state is not None else 0) | (_HAS_SKILL if with_skill else 0)
+    follows = (_HAS_STATE if state is not None else 0) | (_HAS_SKILL if with_skill else 0)
     head[0] = HEAD.pack(_TICK, follows, len(tick.inbox), lost, tick.index)
     bodies += (frame.tobytes(), timing.tobytes())
     if state is not None:
@@ -70,9 +70,22 @@ def unpack(message: bytes, skills: list[bytes], *, joints: int) -> Told:
     frame: Record = np.frombuffer(message, of_frame, 1, at)[0]
     timing: Record = np.frombuffer(message, TIMING, 1, at + of_frame.itemsize)[0]
     at += of_frame.itemsize + TIMING.itemsize
-    state: Record | None = np.frombuffer(message, of_state, 1, at)[0] if follows & HAS_STATE else None
+    state: Record | None = np.frombuffer(message, of_state, 1, at)[0] if follows & _HAS_STATE else None
     skill = next(files) if follows & _HAS_SKILL else None
     return Told(Tick(index, tuple(inbox)), frame, timing, state, skill, lost)
+
+
+def pack_note(key: str, text: str, time_ns: int) -> bytes:
+    """One message with a text for the recording, under `<cell>/<key>`."""
+    return HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode()
+
+
+def unpack_note(message: bytes) -> tuple[str, str, int] | None:
+    """Key, text and time [ns] of a message with a text; None for one about a tick."""
+    if message[0] != NOTE:
+        return None
+    key, text = json.loads(message[HEAD.size :])
+    return key, text, HEAD.unpack_from(message)[4]
 
 
 class Task(msgspec.Struct, frozen=True):

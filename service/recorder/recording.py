@@ -20,7 +20,8 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import BASE, Transform, Vector3, WireError
 from service.contract.records import SIDES
-from service.core.frame import TIMING, Record, Tick, decode, encode, frame_layout, outgoing, state_layout
+from service.core.frame import TIMING, Record, Tick, decode, encode, frame_layout, state_layout
+from service.core.outputs import outgoing
 from service.recorder.mcap_file import McapFile, Messages, RecordingError, ends_early, existing, machine
 from service.urdf import Urdf
 
@@ -77,7 +78,7 @@ class Recorder:
     def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
         """One message on a channel: as the channel has it, or as its events are kept."""
         channel = channels.BY_KEY[key]
-        kind = (channel.event or channel.codec).type
+        kind = channel.kept_as.type
         self._file.put(self._topics[key], kind, data, time_ns, self._sequence, qos=qos)
 
     def write(
@@ -100,7 +101,7 @@ class Recorder:
         if not self._begun:
             self._begin(time_ns)
         put, self._sequence = self._put, tick.index
-        kinds = [channels.EVENT_KINDS.index(event.kind) for event in tick.inbox]
+        kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
         put("tick", cdr.encode_tick(tick.index, kinds, lost), time_ns)
         for event in tick.inbox:
             if event.kind == "skill":
@@ -167,7 +168,7 @@ class Recorder:
 
 
 _RECORDS = ("frame", "timing", "state")
-_REPLAYED = {*channels.EVENT_KINDS, *_RECORDS, "tick", "skill_in_force"}
+_REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
 def _point(position: Any) -> Vector3:
@@ -289,6 +290,6 @@ def _finished(step: dict[str, Any], *, outputs: bool) -> Step:
 
 
 def _kind(number: int) -> str:
-    if number >= len(channels.EVENT_KINDS):
+    if number not in channels.EVENT_KINDS:
         raise WireError(f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known")
     return channels.EVENT_KINDS[number]

@@ -43,7 +43,7 @@ class Replay:
         return self.ticks > 0 and self.identical == self.ticks and not self.truncated
 
     @property
-    def close(self) -> bool:
+    def within_tolerance(self) -> bool:
         """Whether no position differs by more than 10 µm or 10 µrad."""
         return self.ticks > 0 and all(self.largest.get(name, 0.0) <= TOLERANCE for name in POSITIONS)
 
@@ -149,7 +149,7 @@ class _Segment:
             progress,
         )
         skill = skills.in_force(start)
-        self.controller = Controller(recording.settings, skill, start.state, urdf=recording.urdf or None)
+        self.controller = Controller(recording.settings, skill, start.state, urdf=recording.urdf)
         self._step = start
         self.end: Step | None = None  # the step behind the gap
 

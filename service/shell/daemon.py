@@ -20,13 +20,14 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from service.client import endpoints, open_session
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import Attachment, WireError
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
 from service.core.controller import Controller, run
-from service.core.frame import TIMING, Event, Frame, Tick, blank, frame_layout, outgoing
+from service.core.frame import TIMING, Event, Frame, Tick, blank, frame_layout, order
+from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
@@ -52,7 +53,7 @@ class Daemon:
         self._scribe = scribe
         self._stop = threading.Event()
         self._ended = threading.Event()
-        self._controller = Controller(settings, skill)
+        self._controller = Controller(settings, skill, urdf=robot_description(settings))
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
@@ -134,12 +135,12 @@ class Daemon:
                 event for channel, subscriber in self._subscribers if (event := self._receive(channel, subscriber))
             ]
             while self._requests.inbox:
-                if (event := self._requests.inbox.popleft().taken(index)) is not None:
+                if (event := self._requests.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + STOP_TIMEOUT_S
-                    inbox.append(Event("hold", cdr.encode_string("{}"), None))
+                    inbox.append(order("hold"))
                 elif not self._frame["joint_velocities"].any() or time.monotonic() > stop_by:
                     return
             yield Tick(index, tuple(inbox))

@@ -15,11 +15,12 @@ import numpy as np
 import zenoh
 
 from service.config import Settings
-from service.contract import cdr, channels
+from service.contract import channels
 from service.contract.requests import (
     Add,
     Clear,
     List,
+    Nothing,
     Remove,
     Reply,
     RequestError,
@@ -28,11 +29,11 @@ from service.contract.requests import (
     ViaPoint,
     encode_json,
 )
-from service.core.frame import Event
+from service.core.frame import Event, order
 from service.core.skill import Skill
 from service.core.workspace import is_reachable
 from service.learning.skill_file import SkillError
-from service.learning.via_points import adopted, count
+from service.learning.via_points import in_force, points_made_of
 from service.shell.clock import run_beside_real_time
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
@@ -55,7 +56,7 @@ class Pending:
         self._claim = threading.Lock()
         self._taken = threading.Event()
 
-    def taken(self, tick: int) -> Event | None:
+    def claimed(self, tick: int) -> Event | None:
         """The event, consumed by this tick, or None where it was given up. Called by the loop."""
         if not self._claim.acquire(blocking=False):
             return None
@@ -76,7 +77,9 @@ class Pending:
 
 
 class Requests:
-    """The queryables of one cell. Holding never waits behind teaching: each has its own thread."""
+    """The queryables of one cell. Two threads: one for what is answered at once, one for what the
+    workshop computes, so that `hold` never waits behind teaching.
+    """
 
     def __init__(
         self,
@@ -172,10 +175,12 @@ class Requests:
             case SkillRequest(name):
                 return self._load(name)
             case List():
-                return Reply(self._status().tick, adopted(self._skill))
+                return Reply(self._status().tick, in_force(self._skill))
             case Add() | Remove() | Clear():
                 return self._teach(request)
-        return Reply(self._through_the_loop(Event(suffix, cdr.encode_string("{}"), None)))
+            case Nothing():
+                return Reply(self._through_the_loop(order(suffix)))
+        raise RequestError(f"nothing is done with a request on {suffix}")
 
     def _through_the_loop(self, event: Event) -> int:
         pending = Pending(event)
@@ -191,7 +196,7 @@ class Requests:
         finally:
             draft.unlink(missing_ok=True)
         self._skill = skill
-        return Reply(tick, adopted(skill))
+        return Reply(tick, in_force(skill))
 
     def _load(self, name: str) -> Reply:
         path = self._skills / (name if name.endswith(".npz") else f"{name}.npz")
@@ -227,7 +232,7 @@ class Requests:
     def _check(self, added: Sequence[ViaPoint]) -> None:
         """Raises RequestError for names given twice and for via-points that no target may reach."""
         names = [point.name for point in added]
-        total = count(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
+        total = points_made_of(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
         if total > MOST_POINTS:
             raise RequestError(
                 f"$.points: {total} via-points in all, 13 for each with a radius; at most {MOST_POINTS} accepted"

@@ -47,12 +47,8 @@ class SavedViaPoints:
             raise SkillError(f"{self.path} does not hold via-points ({error})") from None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
-    def write(self, skill: Skill) -> None:
-        """Puts the via-points of this skill into the file. Raises SkillError."""
-        self.draft(skill).replace(self.path)
-
     def draft(self, skill: Skill) -> Path:
-        """A new file beside, whole and on disk, that is to replace the old one.
+        """A synced temporary file of the via-points of this skill, to be renamed over the old one.
 
         Raises SkillError.
         """

@@ -38,9 +38,9 @@ class Workshop:
         self._busy = threading.Lock()
         self._child: child.Child | None = None
 
-    def load(self, path: Path, via_points: Sequence[ViaPoint] | None = None, *, tolerance: float = 0.05) -> Skill:
-        """The skill in a file, adapted to via-points where some are given. Raises SkillError."""
-        return self._ask("load", path, via_points, tolerance)
+    def load(self, path: Path) -> Skill:
+        """The skill in a file. Raises SkillError."""
+        return self._ask("load", path, None, 0.0)
 
     def adapt(self, skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
         """The skill that goes through these via-points and no others. Raises SkillError."""

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from service.contract.requests import TOLERANCE_M
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.via_points import adapted
-from sim.experiments.rehearsal import TOLERANCE_M, demonstrated
+from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
 from sim.scene import GRASP_DISTANCE, Scene

@@ -10,8 +10,9 @@ from pathlib import Path
 import msgspec
 
 from service.client import Client, open_session
+from service.contract.requests import TOLERANCE_M
 from service.launch import launched, played
-from sim.experiments.rehearsal import NOISE_M, TOLERANCE_M, TREMOR_M
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M
 from sim.experiments.scenes import OFFSET_M, Drawn
 from sim.network import RunReport
 

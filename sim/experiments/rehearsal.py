@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.cli.usage import SHIPPED_SKILL, recordings
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick
@@ -25,7 +25,6 @@ from sim.scene import Scene
 from sim.script import Array, HandScript
 from sim.teach import demonstrations
 
-TOLERANCE_M = 0.05
 TREMOR_M, NOISE_M = 0.0015, 0.0005  # of the hands and of the tracker, each axis
 
 
@@ -88,7 +87,7 @@ def rehearse(
             look(bench)
 
         loop = ClosedLoop(bench, more=more)
-        run(Controller(settings, skill_for(bench)), loop.ticks(), [loop.follow, tap])
+        run(Controller(settings, skill_for(bench), urdf=robot_description(settings)), loop.ticks(), [loop.follow, tap])
         result = Rehearsed(bench.events(), held * settings.period_s)
     if keep:
         result.frames, result.time_s, result.hands, result.tool = (

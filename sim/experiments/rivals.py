@@ -19,11 +19,11 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
+from service.contract.requests import TOLERANCE_M
 from service.core.skill import Prediction, Skill
 from service.learning.demonstration import Demonstration
 from service.learning.via_points import adapted, neighbourhoods
 from sim.bench import Bench
-from sim.experiments.rehearsal import TOLERANCE_M
 from sim.experiments.results import Array, ExperimentError
 from sim.scene import Scene
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from wam import JOINT_NAMES
 
 from service.contract import cdr, channels, messages, requests
-from service.contract.channels import EVENT_KINDS
+from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
@@ -71,7 +71,7 @@ def test_joint_states_are_the_bytes_of_another_implementation(
     stamp_ns: int, frame: str, names: list[str], data: st.DataObject
 ) -> None:
     values = [data.draw(st.lists(finite, max_size=9)) for _ in range(3)]
-    message = messages.JointState(stamp_ns, tuple(names), *map(tuple, values), frame=frame)
+    message = messages.JointState(stamp_ns, tuple(names), *map(tuple, values), frame_id=frame)
     encoded = cdr.encode_joints(message)
     assert encoded == _bytes(
         channels.JOINTS.type, _header(stamp_ns, frame), names, *(np.array(value, np.float64) for value in values)
@@ -230,6 +230,11 @@ def test_the_error_of_a_request_names_the_place_in_it(data: bytes, kind: Any, er
         requests.decode_request(data, kind)
 
 
+def test_events_keep_the_numbers_that_recordings_know_them_by() -> None:
+    kinds = ["hands/left", "hands/right", "joints/state", "skill", "hold", "resume", "reset"]
+    assert dict(enumerate(kinds)) == channels.EVENT_KINDS
+
+
 def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
     keys = [channel.key for channel in channels.CHANNELS]
     assert len(set(keys)) == len(keys)
@@ -237,14 +242,14 @@ def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
         channel.codec.encoding == "json" or schema(channel.codec.type, joints=7) for channel in channels.CHANNELS
     )
     assert {channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded} < set(
-        EVENT_KINDS
+        EVENT_NUMBERS
     )
     assert channels.key("hall/bench", "hands/left") == "hall/bench/hands/left"
 
 
 @given(st.binary(max_size=64), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1))
 def test_what_only_recordings_hold_comes_back_too(data: bytes, index: int, lost: int) -> None:
-    kinds = bytes(value % len(EVENT_KINDS) for value in data)
+    kinds = bytes(value % len(EVENT_NUMBERS) for value in data)
     assert cdr.decode_tick(cdr.encode_tick(index, kinds, lost)) == (index, kinds, lost)
     assert cdr.decode_skill(cdr.encode_skill(data)) == data
     with pytest.raises(messages.WireError, match="a Tick"):

@@ -7,14 +7,15 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, order, resting, ticks_of
-from wam import FRAME
+from in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
+from wam import FRAME, URDF
 
 from service.config import Settings
-from service.contract import records
+from service.contract import channels, records
 from service.contract.records import Flag, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Event, Tick
+from service.core.frame import Event, Tick, order
+from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.via_points import adapted
 from sim.scene import Scene
@@ -62,7 +63,7 @@ def modes(seen: np.ndarray) -> list[tuple[str, str]]:
 
 def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Skill) -> None:
     script = HandScript(Scene(), seed=5)
-    seen = frames(Controller(ASSUMED, taught), ticks_of(script))
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
     limits_hold(seen)
     no_jump(seen)
     assert modes(seen[1:]) == [("follow", "none")]
@@ -75,7 +76,7 @@ def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Ski
 
 def test_the_tool_neither_lags_the_demonstrated_relation_nor_chatters(taught: Skill) -> None:
     script = HandScript(Scene(), seed=6)
-    seen = frames(Controller(ASSUMED, taught), ticks_of(script))
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
     time_s = np.arange(len(seen)) * PERIOD_S - 1.5
     hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
     ideal = taught.primitive.mean(hands)
@@ -95,15 +96,15 @@ def test_the_tool_neither_lags_the_demonstrated_relation_nor_chatters(taught: Sk
 
 def test_it_goes_on_from_its_state_bit_for_bit(taught: Skill) -> None:
     ticks = list(ticks_of(HandScript(Scene(), seed=7)))[:2500]
-    whole = frames(Controller(ASSUMED, taught), ticks)
-    first = Controller(ASSUMED, taught)
+    whole = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
+    first = Controller(ASSUMED, taught, urdf=URDF)
     head = frames(first, ticks[:1234])
-    tail = frames(Controller(ASSUMED, taught, first.state), ticks[1234:])
+    tail = frames(Controller(ASSUMED, taught, first.state, urdf=URDF), ticks[1234:])
     assert np.concatenate([head, tail]).tobytes() == whole.tobytes()
 
 
 def test_the_first_setpoint_is_where_the_tool_is(taught: Skill) -> None:
-    seen = frames(Controller(ASSUMED, taught), resting(0, 300, every=1))
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 300, every=1))
     assert modes(seen) == [("follow", "none")]
     assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.002
 
@@ -115,7 +116,7 @@ def test_a_hand_that_falls_silent_brings_a_hold_within_100_ms_and_comes_back_wit
         Tick(t.index, tuple(e for e in t.inbox if not (e.kind == "hands/left" and t.index in silent)))
         for t in ticks_of(script)
     ]
-    seen = frames(Controller(ASSUMED, taught), ticks)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
     limits_hold(seen)
     no_jump(seen)
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
@@ -125,7 +126,7 @@ def test_a_hand_that_falls_silent_brings_a_hold_within_100_ms_and_comes_back_wit
 
 
 def test_without_hands_it_holds_and_says_so(taught: Skill) -> None:
-    seen = frames(Controller(ASSUMED, taught), [Tick(k, (hand("left", LEFT, k + 1),)) for k in range(100)])
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), [Tick(k, (hand("left", LEFT, k + 1),)) for k in range(100)])
     assert modes(seen) == [("hold", "no_hands")]
     assert seen["hand_ages"][-1].tolist() == [0, -1]
 
@@ -137,7 +138,7 @@ def test_hands_far_from_the_demonstrations_are_not_followed_until_they_are_clear
     ticks = [
         Tick(k, (hand("left", at(k), k + 1), hand("right", RIGHT, k + 1)) if k % 5 == 0 else ()) for k in range(1600)
     ]
-    seen = frames(Controller(ASSUMED, taught), ticks)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
     limits_hold(seen)
     no_jump(seen)
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
@@ -145,14 +146,16 @@ def test_hands_far_from_the_demonstrations_are_not_followed_until_they_are_clear
 
 def test_an_operator_holds_and_resumes(taught: Skill) -> None:
     orders = {300: "hold", 900: "resume"}
-    seen = frames(Controller(ASSUMED, taught), resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ()))
+    seen = frames(
+        Controller(ASSUMED, taught, urdf=URDF), resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ())
+    )
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
     no_jump(seen)
 
 
 def test_nothing_is_commanded_before_the_arm_has_told_where_it_is(taught: Skill) -> None:
     start = (0.1, 0.5, 0.0, 1.9, 0.0, -0.3, 0.2)
-    controller = Controller(Settings(), taught)
+    controller = Controller(Settings(), taught, urdf=URDF)
     before = frames(controller, resting(0, 200))
     assert modes(before) == [("hold", "arm_not_ready")]
     assert not before["commanded"].any()
@@ -177,7 +180,7 @@ def follow(controller: Controller, first: int, count: int, *, offset: float = 0.
 
 
 def test_an_arm_that_does_not_follow_is_a_fault_until_reset(taught: Skill) -> None:
-    controller = Controller(Settings(), taught)
+    controller = Controller(Settings(), taught, urdf=URDF)
     assert modes(follow(controller, 0, 300))[-1] == ("follow", "none")
     seen = follow(controller, 300, 400, offset=0.15)
     assert modes(seen) == [("fault", "arm_error")]
@@ -188,7 +191,7 @@ def test_an_arm_that_does_not_follow_is_a_fault_until_reset(taught: Skill) -> No
 
 
 def test_an_arm_that_falls_silent_while_followed_is_a_fault(taught: Skill) -> None:
-    controller = Controller(Settings(), taught)
+    controller = Controller(Settings(), taught, urdf=URDF)
     follow(controller, 0, 300)
     seen = frames(controller, resting(300, 300))
     assert modes(seen) == [("follow", "none"), ("fault", "arm_silent")]
@@ -196,7 +199,7 @@ def test_an_arm_that_falls_silent_while_followed_is_a_fault(taught: Skill) -> No
 
 
 def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
-    controller = Controller(Settings(), taught)
+    controller = Controller(Settings(), taught, urdf=URDF)
     follow(controller, 0, 300)
     assert modes(follow(controller, 300, 10, speed=2.0))[-1] == ("follow", "none")
     assert modes(follow(controller, 310, 1))[-1] == ("follow", "none")
@@ -204,7 +207,7 @@ def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
 
 
 def test_a_reset_while_the_arm_still_moves_lets_it_come_to_rest_first(taught: Skill) -> None:
-    controller = Controller(Settings(), taught)
+    controller = Controller(Settings(), taught, urdf=URDF)
     out: list[np.ndarray] = []
     joints, was_fault = POSTURE, False
     for tick in list(ticks_of(HandScript(Scene(), seed=11), wait_s=0.5))[:3000]:
@@ -223,14 +226,16 @@ def test_a_reset_while_the_arm_still_moves_lets_it_come_to_rest_first(taught: Sk
 
 
 def test_reset_without_a_fault_changes_nothing(taught: Skill) -> None:
-    plain = frames(Controller(ASSUMED, taught), resting(0, 400))
-    reset = frames(Controller(ASSUMED, taught), resting(0, 400, lambda k: (order("reset"),) if k == 200 else ()))
+    plain = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 400))
+    reset = frames(
+        Controller(ASSUMED, taught, urdf=URDF), resting(0, 400, lambda k: (order("reset"),) if k == 200 else ())
+    )
     assert plain.tobytes() == reset.tobytes()
 
 
 def test_a_new_skill_is_adopted_at_its_tick_and_approached_within_the_limits(skill: Skill, taught: Skill) -> None:
     moved = adapted(skill, Scene(handover=(0.66, -0.22, 0.33), glass=(0.45, 0.30, 0.2)).via_points(), tolerance=0.05)
-    controller = Controller(ASSUMED, taught)
+    controller = Controller(ASSUMED, taught, urdf=URDF)
     seen = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
     assert controller.skill is moved
     assert controller.state["skill"].tobytes() == moved.digest
@@ -251,7 +256,7 @@ def test_jumping_and_noisy_hands_never_make_a_command_outside_the_limits_nor_a_f
                 hand("right", tuple((np.array(RIGHT) + random.normal(0, 0.01, 3)).tolist()), k + 1),
             ]
         ticks.append(Tick(k, tuple(inbox)))
-    seen = frames(Controller(ASSUMED, taught), ticks)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
     limits_hold(seen)
     no_jump(seen)
     assert (seen["mode"] != Mode.FAULT).all()
@@ -263,20 +268,20 @@ def test_missed_ticks_move_the_arm_by_one_period(taught: Skill) -> None:
         Tick(t.index + (40 if t.index > 2000 else 0), t.inbox)
         for t in list(ticks_of(HandScript(Scene(), seed=9)))[:3000]
     ]
-    seen = frames(Controller(ASSUMED, taught), ticks)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
     limits_hold(seen)
     no_jump(seen)
 
 
 def test_ticks_must_grow(taught: Skill) -> None:
-    controller = Controller(ASSUMED, taught)
+    controller = Controller(ASSUMED, taught, urdf=URDF)
     controller.step(Tick(4))
     with pytest.raises(ValueError, match="tick 4 after tick 4"):
         controller.step(Tick(4))
 
 
 def test_frames_cannot_be_changed_and_describe_themselves(taught: Skill) -> None:
-    frame = Controller(ASSUMED, taught).step(Tick(0))
+    frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
     with pytest.raises(ValueError, match="read-only"):
         frame["joints"][0] = 1.0
     assert records.definition(records.FRAME, 7).startswith("int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n")
@@ -285,4 +290,21 @@ def test_frames_cannot_be_changed_and_describe_themselves(taught: Skill) -> None
 def test_the_assumed_arm_starts_at_the_configured_posture(taught: Skill) -> None:
     posture = (*POSTURE[:6], 0.5)
     settings = msgspec.structs.replace(ASSUMED, arm=msgspec.structs.replace(ASSUMED.arm, posture=posture))
-    assert Controller(settings, taught).step(Tick(0))["joints"].tolist() == list(posture)
+    assert Controller(settings, taught, urdf=URDF).step(Tick(0))["joints"].tolist() == list(posture)
+
+
+def test_every_kind_of_event_has_a_case_and_any_other_is_refused(taught: Skill) -> None:
+    controller = Controller(ASSUMED, taught, urdf=URDF)
+    for index, kind in enumerate(channels.EVENT_NUMBERS):
+        values = {"hands": hand("left", LEFT, 1).value, "joints": arm(POSTURE, 1).value, "skill": taught}
+        controller.step(Tick(index, (Event(kind, b"", values.get(kind.split("/")[0])),)))
+    with pytest.raises(ValueError, match="nothing is done with an event of kind 'pedal'"):
+        controller.step(Tick(100, (Event("pedal", b"", None),)))
+
+
+def test_every_output_has_a_function(taught: Skill) -> None:
+    frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
+    assert [channel.key for channel, _ in outgoing(frame, 0, ASSUMED.joints.names)] == [
+        "joints/command",
+        "tool/setpoint",
+    ]

@@ -73,7 +73,7 @@ def cell(request: pytest.FixtureRequest) -> Settings:
 
 
 def test_it_follows_moving_targets_with_every_limit_held(cell: Settings, reach: Skill) -> None:
-    seen = frames(Controller(cell, reach), ticks_of(HandScript(Scene(), seed=3)))
+    seen = frames(Controller(cell, reach, urdf=robot_description(cell)), ticks_of(HandScript(Scene(), seed=3)))
     assert (seen["mode"] == Mode.FOLLOW).all()
     error_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)
     assert np.sqrt(np.mean(error_mm**2)) < 0.05, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
@@ -91,7 +91,7 @@ def test_it_follows_moving_targets_with_every_limit_held(cell: Settings, reach: 
 
 
 def test_its_recording_replays_identically(cell: Settings, reach: Skill, tmp_path: Path) -> None:
-    controller = Controller(cell, reach)
+    controller = Controller(cell, reach, urdf=robot_description(cell))
     with Recorder(tmp_path / "a.mcap", settings=cell, skill=reach.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:

@@ -21,7 +21,7 @@ from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import GATE, learn, mean_orientation
 from service.learning.skill_file import SkillError, decoded, with_file
-from service.learning.via_points import adapted, adopted
+from service.learning.via_points import adapted, in_force
 from sim.scene import Scene
 from sim.script import HandMotions, HandScript
 from sim.teach import demonstrations
@@ -193,13 +193,13 @@ def test_a_prediction_is_rounded_and_its_covariance_is_one(learned: Skill, taugh
 
 
 def test_places_are_met(aimed: Skill) -> None:
-    assert [point.name for point in adopted(aimed)] == ["handover", "glass", "soldering"]
-    assert all(point.missed_by_m < 0.003 for point in adopted(aimed))
+    assert [point.name for point in in_force(aimed)] == ["handover", "glass", "soldering"]
+    assert all(point.missed_by_m < 0.003 for point in in_force(aimed))
 
 
 def test_a_place_without_neighbours_is_met(learned: Skill) -> None:
     place = ViaPoint("there", left=(0.8, -0.2, 0.2), right=(0.95, 0.35, 0.1), tool=(0.5, 0.0, 0.3))
-    (point,) = adopted(adapted(learned, [place], tolerance=0.05))
+    (point,) = in_force(adapted(learned, [place], tolerance=0.05))
     assert point.missed_by_m < 0.0005
 
 

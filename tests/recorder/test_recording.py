@@ -18,7 +18,7 @@ from wam import FRAME, JOINT_NAMES, STATE
 
 from service.config import Settings
 from service.contract import cdr, channels, messages
-from service.contract.channels import EVENT_KINDS
+from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
 from service.core.frame import TIMING, Event, Record, Tick, blank, encode
 from service.learning.demonstration import Demonstration
@@ -117,7 +117,7 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
         assert encode(step.timing) == encode(timing)
         assert (step.state is None) == (tick.index % 100 != 99)
         assert (step.time_ns, step.lost, step.skill) == (at_ns(tick.index), 0, None)
-    assert {kind for step in steps for kind, _ in step.events} == set(EVENT_KINDS)
+    assert {kind for step in steps for kind, _ in step.events} == set(EVENT_NUMBERS)
     assert list(recording.notes("status"))[:2] == [("status", "tick 0", at_ns(0)), ("status", "tick 50", at_ns(50))]
 
 
@@ -283,9 +283,7 @@ def test_the_links_of_the_arm_and_what_matters_around_it_are_one_tree_of_frames(
     assert {root(frame) for frame in parents} == {"base"}
 
 
-@pytest.mark.parametrize(
-    "kind", sorted({(channel.event or channel.codec).type for channel in channels.CHANNELS} - {"JSON"})
-)
+@pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
 def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
     text = schema(kind, joints=7)
     told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))

@@ -70,7 +70,7 @@ class Bench:
         while not self._end.wait(0.0005):
             self._tick += 1
             while self.running and self.requests.inbox:
-                event = self.requests.inbox.popleft().taken(self._tick)
+                event = self.requests.inbox.popleft().claimed(self._tick)
                 self.taken += [event] if event else []
 
     def refusal(self, suffix: str, request: Any) -> str:
@@ -381,5 +381,5 @@ def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_bench: Bench)
 def test_a_pending_event_tells_the_tick_that_took_it() -> None:
     event = Event("hold", b"", None)
     pending = Pending(event)
-    assert pending.taken(42) is event
+    assert pending.claimed(42) is event
     assert pending.wait() == 42

@@ -25,29 +25,29 @@ def saved(tmp_path: Path) -> SavedViaPoints:
 
 def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
     assert saved.read(skill) is None
-    saved.write(adapted(skill, POINTS, tolerance=0.03))
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
     assert saved.read(skill) == (POINTS, 0.03)
-    saved.write(skill)
+    saved.draft(skill).replace(saved.path)
     assert saved.read(skill) == ((), skill.tolerance)
 
 
 def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.write(adapted(skill, POINTS, tolerance=0.03))
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
     assert saved.read(replace(skill, learned_from="other demonstrations")) is None
 
 
 def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
     for count in (1, 2, 3):
-        saved.write(adapted(skill, POINTS[:count], tolerance=0.03))
+        saved.draft(adapted(skill, POINTS[:count], tolerance=0.03)).replace(saved.path)
         assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
         assert len(json.loads(saved.path.read_text())["request"]["points"]) == count
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.write(adapted(skill, POINTS[:1], tolerance=0.03))
+    saved.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(saved.path)
     before = saved.path.read_bytes()
     with pytest.raises(TypeError, match="not JSON serializable"):
-        saved.write(replace(skill, name=3j))  # type: ignore[arg-type]
+        saved.draft(replace(skill, name=3j)).replace(saved.path)  # type: ignore[arg-type]
     assert saved.path.read_bytes() == before
     assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
 

@@ -17,7 +17,7 @@ from tests_paths import RECORDINGS
 from service.contract.requests import ViaPoint
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted, adopted
+from service.learning.via_points import adapted, in_force
 from service.shell.workshop import Workshop
 from sim.scene import Scene
 
@@ -59,10 +59,6 @@ def test_a_skill_is_loaded_as_it_stands_in_its_file(workshop: Workshop, skill: S
     assert_same_bits(workshop.load(SOLDERING), skill)
 
 
-def test_a_skill_is_loaded_with_the_places_taught_to_it(workshop: Workshop, skill: Skill) -> None:
-    assert_same_bits(workshop.load(SOLDERING, PLACES, tolerance=0.04), adapted(skill, PLACES, tolerance=0.04))
-
-
 @pytest.mark.parametrize("count", [3, 1, 0])
 def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     workshop: Workshop, skill: Skill, count: int
@@ -70,7 +66,7 @@ def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     there = workshop.adapt(skill, PLACES[:count], tolerance=0.05)
     assert_same_bits(there, adapted(skill, PLACES[:count], tolerance=0.05))
     assert there.via_points == PLACES[:count]
-    assert adopted(there) == adopted(adapted(skill, PLACES[:count], tolerance=0.05))
+    assert in_force(there) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
 
 
 def test_a_skill_that_came_back_is_adapted_again(workshop: Workshop, skill: Skill) -> None:

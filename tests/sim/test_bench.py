@@ -208,7 +208,7 @@ def test_a_run_on_the_network_reports_events_and_latency_and_leaves_a_hidden_han
     assert report.scene == SCENE
     assert service.joints is not None
     assert service.joints.names == JOINT_NAMES
-    assert {pose.frame for pose in service.hands["left"]} == {"base"}
+    assert {pose.frame_id for pose in service.hands["left"]} == {"base"}
     assert 0 < report.answered <= report.hands
     assert report.commands > report.hands  # one for each hand
     assert 0.0 < report.latency_ms.p50 <= report.latency_ms.p99 <= report.latency_ms.max
