@@ -74,8 +74,8 @@ class Controller:
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
         """The frame of one tick.
 
-        Ticks have growing indices; where some are missing, hands have moved on and the arm by one
-        period.
+        Ticks have growing indices. Over indices that are left out hands are taken to have moved on;
+        the arm moves by one period only.
         """
         state = self._state
         self._take_in(tick)
@@ -132,8 +132,9 @@ class Controller:
         self._state["covariance"] = 0.0
 
     def _predict(self) -> Prediction | None:
-        """The prediction, if both hands are known; how sure it is, is asked anew with each sample
-        of a hand.
+        """The prediction, if both hands are known.
+
+        Its covariance is predicted anew only when a sample of a hand has come.
         """
         state = self._state
         if not (self._intake.is_fresh(state, 0) and self._intake.is_fresh(state, 1)):

@@ -120,8 +120,7 @@ class Limiter:
     def _linear(
         self, q: Vector, dq: Vector, ddq: Vector, wanted: Vector
     ) -> tuple[Vector, Vector, Vector, npt.NDArray[np.bool_]]:
-        """One tick at constant jerk to the acceleration that closes the gap in one period; which
-        joints may take it.
+        """Each joint one tick on at the jerk that reaches the wanted velocity; and which may.
 
         A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
         profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.

@@ -41,8 +41,9 @@ class Demonstration(NamedTuple):
 
 
 def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:
-    """Hands and tool, shifted against each other where that makes their speeds agree better: a tool
-    that lags makes the map no function.
+    """Hands and tool, shifted against each other where that makes their speeds agree better.
+
+    With a tool that lags, one position of the hands would go with two of the tool.
     """
     if len({len(part) for part in demonstration}) > 1:
         counts = ", ".join(

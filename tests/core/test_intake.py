@@ -24,7 +24,7 @@ STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
 
 
-class Bench:
+class Hands:
     """An intake and its state, moved on tick by tick."""
 
     def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
@@ -68,13 +68,13 @@ class Bench:
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
 def test_a_trackers_unit_becomes_metres(unit: str, scale: float) -> None:
-    bench = Bench(HandSettings(unit=unit))  # type: ignore[arg-type]
-    np.testing.assert_allclose(bench.hand(1, (0.5 * scale, -0.1 * scale, 0.2 * scale)), [0.5, -0.1, 0.2])
+    hands = Hands(HandSettings(unit=unit))  # type: ignore[arg-type]
+    np.testing.assert_allclose(hands.hand(1, (0.5 * scale, -0.1 * scale, 0.2 * scale)), [0.5, -0.1, 0.2])
 
 
 def test_a_turned_tracker_is_scaled_then_turned_then_moved() -> None:
-    bench = Bench(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
-    np.testing.assert_allclose(bench.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
+    hands = Hands(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
+    np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
 
 
 def test_a_rotation_turns_as_its_quaternion_does() -> None:
@@ -101,39 +101,39 @@ def test_a_rotation_turns_as_its_quaternion_does() -> None:
 def test_a_useless_hand_sample_is_counted_and_changes_nothing_else(
     position: tuple[float, ...], turn: tuple[float, ...], cause: Cause
 ) -> None:
-    bench = Bench()
-    bench.hand(1)
-    before = bench.state.copy()
-    bench.hand(2, position, turn)
-    assert bench.rejected() == {cause: 1}
+    hands = Hands()
+    hands.hand(1)
+    before = hands.state.copy()
+    hands.hand(2, position, turn)
+    assert hands.rejected() == {cause: 1}
     before["rejected"][cause] += 1
-    assert bench.state.tobytes() == before.tobytes()
+    assert hands.state.tobytes() == before.tobytes()
 
 
 def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
-    bench = Bench()
-    bench.hand(1, turn=(0.0, 0.0, 0.0, -1.0))
-    assert bench.fresh()
+    hands = Hands()
+    hands.hand(1, turn=(0.0, 0.0, 0.0, -1.0))
+    assert hands.fresh()
 
 
 # --- stamps and ages -----------------------------------------------------------------------------
 
 
 def test_repeated_and_older_stamps_are_counted_apart() -> None:
-    bench = Bench()
+    hands = Hands()
     for stamp in (1000, 1000, 999):
-        bench.hand(stamp)
-        bench.advance()
-    assert bench.rejected() == {Cause.REPEATED: 1, Cause.OLDER: 1}
-    assert int(bench.state["hand_ticks"][LEFT]) == 0
+        hands.hand(stamp)
+        hands.advance()
+    assert hands.rejected() == {Cause.REPEATED: 1, Cause.OLDER: 1}
+    assert int(hands.state["hand_ticks"][LEFT]) == 0
 
 
 def test_hands_do_not_share_stamps() -> None:
-    bench = Bench()
-    bench.hand(1000, side=LEFT)
-    bench.hand(1000, side=RIGHT)
-    assert bench.fresh(LEFT)
-    assert bench.fresh(RIGHT)
+    hands = Hands()
+    hands.hand(1000, side=LEFT)
+    hands.hand(1000, side=RIGHT)
+    assert hands.fresh(LEFT)
+    assert hands.fresh(RIGHT)
 
 
 @pytest.mark.parametrize(
@@ -147,80 +147,80 @@ def test_hands_do_not_share_stamps() -> None:
     ],
 )
 def test_a_hand_is_stale_after_exactly_the_configured_time(rate_hz: int, stale_ms: float, ticks: int) -> None:
-    bench = Bench(HandSettings(stale_ms=stale_ms), rate_hz=rate_hz)
-    bench.hand(1)
-    assert bench.fresh()
-    bench.advance(ticks - 1)
-    assert bench.fresh()
-    bench.advance()
-    assert not bench.fresh()
+    hands = Hands(HandSettings(stale_ms=stale_ms), rate_hz=rate_hz)
+    hands.hand(1)
+    assert hands.fresh()
+    hands.advance(ticks - 1)
+    assert hands.fresh()
+    hands.advance()
+    assert not hands.fresh()
 
 
 def test_a_repeated_sample_does_not_keep_a_hand_fresh() -> None:
-    bench = Bench()
+    hands = Hands()
     for _ in range(51):
-        bench.hand(1000)
-        bench.advance()
-    assert not bench.fresh()
-    bench.hand(1000)
-    assert not bench.fresh()
+        hands.hand(1000)
+        hands.advance()
+    assert not hands.fresh()
+    hands.hand(1000)
+    assert not hands.fresh()
 
 
 def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
-    bench = Bench()
-    bench.hand(5_000_000_000)
+    hands = Hands()
+    hands.hand(5_000_000_000)
     for stamp in range(49):
-        bench.advance()
-        bench.hand(stamp + 1)
-    assert bench.rejected() == {Cause.OLDER: 49}
-    bench.advance()
-    np.testing.assert_array_equal(bench.hand(50, (0.6, 0.0, 0.0)), [0.6, 0.0, 0.0])
-    assert bench.fresh()
-    bench.hand(51)
-    assert bench.rejected() == {Cause.OLDER: 49}
+        hands.advance()
+        hands.hand(stamp + 1)
+    assert hands.rejected() == {Cause.OLDER: 49}
+    hands.advance()
+    np.testing.assert_array_equal(hands.hand(50, (0.6, 0.0, 0.0)), [0.6, 0.0, 0.0])
+    assert hands.fresh()
+    hands.hand(51)
+    assert hands.rejected() == {Cause.OLDER: 49}
 
 
 def test_one_stamp_from_the_future_locks_a_hand_out_until_it_is_stale_only() -> None:
-    bench = Bench()
-    bench.hand(1_000)
-    bench.hand(2**62)
+    hands = Hands()
+    hands.hand(1_000)
+    hands.hand(2**62)
     for tick in range(1, 60):
-        bench.advance()
-        bench.hand(1_000 + tick)
-    assert bench.rejected() == {Cause.OLDER: 49}
-    assert bench.fresh()
+        hands.advance()
+        hands.hand(1_000 + tick)
+    assert hands.rejected() == {Cause.OLDER: 49}
+    assert hands.fresh()
 
 
 def test_a_stale_hand_stands_still_and_starts_anew() -> None:
-    bench = Bench()
-    follow(bench, lambda t: np.array([0.5 * t, 0.0, 0.0]), until_s=0.5)
-    bench.advance(50)
-    where = bench.state["filters"][LEFT].copy()
+    hands = Hands()
+    follow(hands, lambda t: np.array([0.5 * t, 0.0, 0.0]), until_s=0.5)
+    hands.advance(50)
+    where = hands.state["filters"][LEFT].copy()
     assert not where[1:].any()
-    bench.advance(100)
-    np.testing.assert_array_equal(bench.state["filters"][LEFT], where)
-    np.testing.assert_array_equal(bench.hand(10**10, (0.1, 0.2, 0.3)), [0.1, 0.2, 0.3])
-    assert not bench.state["filters"][LEFT, 1:].any()
+    hands.advance(100)
+    np.testing.assert_array_equal(hands.state["filters"][LEFT], where)
+    np.testing.assert_array_equal(hands.hand(10**10, (0.1, 0.2, 0.3)), [0.1, 0.2, 0.3])
+    assert not hands.state["filters"][LEFT, 1:].any()
 
 
 # --- the arm -------------------------------------------------------------------------------------
 
 
 def test_joints_are_taken_in_any_order_among_others() -> None:
-    bench = Bench()
+    hands = Hands()
     values = {name: 0.1 * i for i, name in enumerate(JOINT_NAMES)} | {"gripper": 3.0}
     for stamp, names in ((1, tuple(values)), (2, tuple(reversed(values))), (3, tuple(sorted(values)))):
-        bench.arm(stamp, names, tuple(values[name] for name in names), tuple(2 * values[name] for name in names))
-        np.testing.assert_allclose(bench.state["measured"], 0.1 * np.arange(7))
-        np.testing.assert_allclose(bench.state["measured_velocities"], 0.2 * np.arange(7))
-    assert bench.rejected() == {}
+        hands.arm(stamp, names, tuple(values[name] for name in names), tuple(2 * values[name] for name in names))
+        np.testing.assert_allclose(hands.state["measured"], 0.1 * np.arange(7))
+        np.testing.assert_allclose(hands.state["measured_velocities"], 0.2 * np.arange(7))
+    assert hands.rejected() == {}
 
 
 def test_joints_without_velocities_stand_still() -> None:
-    bench = Bench()
-    bench.arm(1, velocity=(1.0,) * 7)
-    bench.arm(2)
-    assert not bench.state["measured_velocities"].any()
+    hands = Hands()
+    hands.arm(1, velocity=(1.0,) * 7)
+    hands.arm(2)
+    assert not hands.state["measured_velocities"].any()
 
 
 @pytest.mark.parametrize(
@@ -239,61 +239,61 @@ def test_joints_without_velocities_stand_still() -> None:
 def test_a_useless_arm_sample_is_counted_and_changes_nothing_else(
     names: tuple[str, ...], position: tuple[float, ...], velocity: tuple[float, ...], cause: Cause
 ) -> None:
-    bench = Bench()
-    bench.arm(1)
-    before = bench.state.copy()
-    bench.arm(2, names, position, velocity)
-    assert bench.rejected() == {cause: 1}
+    hands = Hands()
+    hands.arm(1)
+    before = hands.state.copy()
+    hands.arm(2, names, position, velocity)
+    assert hands.rejected() == {cause: 1}
     before["rejected"][cause] += 1
-    assert bench.state.tobytes() == before.tobytes()
+    assert hands.state.tobytes() == before.tobytes()
 
 
 def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with_any_stamp() -> None:
-    bench = Bench()
-    assert not bench.intake.is_arm_heard(bench.state)
-    bench.arm(1000)
-    bench.advance(49)
-    bench.arm(999)
-    bench.arm(1000)
-    assert bench.rejected() == {Cause.OLDER: 1, Cause.REPEATED: 1}
-    assert bench.intake.is_arm_heard(bench.state)
-    bench.advance()
-    assert not bench.intake.is_arm_heard(bench.state)
-    bench.arm(5)
-    assert bench.intake.is_arm_heard(bench.state)
+    hands = Hands()
+    assert not hands.intake.is_arm_heard(hands.state)
+    hands.arm(1000)
+    hands.advance(49)
+    hands.arm(999)
+    hands.arm(1000)
+    assert hands.rejected() == {Cause.OLDER: 1, Cause.REPEATED: 1}
+    assert hands.intake.is_arm_heard(hands.state)
+    hands.advance()
+    assert not hands.intake.is_arm_heard(hands.state)
+    hands.arm(5)
+    assert hands.intake.is_arm_heard(hands.state)
 
 
 # --- the filter ----------------------------------------------------------------------------------
 
 
 def follow(
-    bench: Bench, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
+    hands: Hands, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
 ) -> Vector:
     """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
     states, taken = [], 0
     for tick in range(round(until_s / PERIOD_S)):
         if tick:
-            bench.advance()
+            hands.advance()
         if tick * PERIOD_S * rate_hz >= taken - 1e-9:
             stamp_s = tick * PERIOD_S
             position = where(stamp_s) + (0.0 if noise is None else noise[taken])
-            bench.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
+            hands.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
             taken += 1
-        states.append(bench.state["filters"][LEFT].copy())
-    assert bench.rejected() == {}
+        states.append(hands.state["filters"][LEFT].copy())
+    assert hands.rejected() == {}
     return np.array(states)
 
 
 def test_the_filter_converges_on_a_constant_velocity() -> None:
     velocity = np.array([0.3, -0.2, 0.1])
-    states = follow(Bench(), lambda t: np.array([0.5, 0.0, 0.2]) + velocity * t, until_s=2.0)
+    states = follow(Hands(), lambda t: np.array([0.5, 0.0, 0.2]) + velocity * t, until_s=2.0)
     np.testing.assert_allclose(states[-1, 1], velocity, atol=1e-4)
     np.testing.assert_allclose(states[-1, 2], 0.0, atol=1e-3)
 
 
 def test_the_filter_converges_on_a_constant_acceleration() -> None:
     acceleration = np.array([0.4, -0.3, 0.2])
-    states = follow(Bench(), lambda t: 0.5 * acceleration * t * t, until_s=2.0)
+    states = follow(Hands(), lambda t: 0.5 * acceleration * t * t, until_s=2.0)
     last = 1.998
     np.testing.assert_allclose(states[-1, 0], 0.5 * acceleration * last**2, atol=1e-5)
     np.testing.assert_allclose(states[-1, 1], acceleration * last, atol=1e-4)
@@ -303,7 +303,7 @@ def test_the_filter_converges_on_a_constant_acceleration() -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100])
 def test_a_hand_moves_in_each_tick_between_its_samples(rate_hz: int) -> None:
     velocity = np.array([0.5, 0.0, 0.0])
-    states = follow(Bench(), lambda t: velocity * t, until_s=2.0, rate_hz=rate_hz)
+    states = follow(Hands(), lambda t: velocity * t, until_s=2.0, rate_hz=rate_hz)
     steps = np.diff(states[500:, 0, 0]) / PERIOD_S
     np.testing.assert_allclose(steps, 0.5, atol=0.01)
 
@@ -311,14 +311,14 @@ def test_a_hand_moves_in_each_tick_between_its_samples(rate_hz: int) -> None:
 def test_the_filter_makes_noise_smaller() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.0005, (600, 3))
     still = np.array([0.5, 0.0, 0.2])
-    states = follow(Bench(), lambda t: still, until_s=6.0, noise=noise)
+    states = follow(Hands(), lambda t: still, until_s=6.0, noise=noise)
     assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.6 * 0.0005
 
 
 def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
-    one, many = Bench(), Bench()
-    for bench in (one, many):
-        follow(bench, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
+    one, many = Hands(), Hands()
+    for hands in (one, many):
+        follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
     for _ in range(20):
         one.advance()
     many.advance(20)
@@ -328,8 +328,8 @@ def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
 
 
 def test_covariances_stay_symmetric_and_positive() -> None:
-    bench = Bench()
-    follow(bench, lambda t: np.array([0.1 * t, 0.0, 0.0]), until_s=4.0, rate_hz=30)
-    covariance = bench.state["filter_covariances"][LEFT]
+    hands = Hands()
+    follow(hands, lambda t: np.array([0.1 * t, 0.0, 0.0]), until_s=4.0, rate_hz=30)
+    covariance = hands.state["filter_covariances"][LEFT]
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
     assert np.linalg.eigvalsh(covariance).min() > 0

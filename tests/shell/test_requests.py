@@ -30,7 +30,7 @@ HANDOVER = PLACES[0]
 CELLS = (f"tests/cell{n}" for n in itertools.count())
 
 
-class Bench:
+class Cell:
     """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
 
     def __init__(self, near: zenoh.Session, far: zenoh.Session, skill: Skill, workshop: Workshop, folder: Path) -> None:
@@ -118,28 +118,28 @@ def workshop() -> Iterator[Workshop]:
 @pytest.fixture
 def opened(
     sessions: tuple[zenoh.Session, zenoh.Session], skill: Skill, tmp_path: Path
-) -> Iterator[Callable[[Workshop], Bench]]:
-    """Opens a bench; closes it."""
+) -> Iterator[Callable[[Workshop], Cell]]:
+    """Opens a cell; closes it."""
     with contextlib.ExitStack() as closing:
-        yield lambda workshop: closing.enter_context(contextlib.closing(Bench(*sessions, skill, workshop, tmp_path)))
+        yield lambda workshop: closing.enter_context(contextlib.closing(Cell(*sessions, skill, workshop, tmp_path)))
 
 
 @pytest.fixture
-def bench(opened: Callable[[Workshop], Bench], workshop: Workshop) -> Bench:
+def cell(opened: Callable[[Workshop], Cell], workshop: Workshop) -> Cell:
     return opened(workshop)
 
 
 @pytest.fixture(scope="module")
-def taught_bench(
+def taught_cell(
     sessions: tuple[zenoh.Session, zenoh.Session],
     workshop: Workshop,
     skill: Skill,
     tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Bench]:
-    """A bench with three places taught, for requests that change nothing."""
-    with contextlib.closing(Bench(*sessions, skill, workshop, tmp_path_factory.mktemp("cell"))) as bench:
-        bench.client.add(PLACES)
-        yield bench
+) -> Iterator[Cell]:
+    """A cell with three places taught, for requests that change nothing."""
+    with contextlib.closing(Cell(*sessions, skill, workshop, tmp_path_factory.mktemp("cell"))) as cell:
+        cell.client.add(PLACES)
+        yield cell
 
 
 def point(**change: Any) -> dict[str, Any]:
@@ -153,61 +153,61 @@ def add(*points: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
-def test_a_plain_request_is_answered_with_the_tick_that_took_it(bench: Bench, suffix: str) -> None:
-    first, second = bench.client.ask(suffix), bench.client.ask(suffix, {})
+def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suffix: str) -> None:
+    first, second = cell.client.ask(suffix), cell.client.ask(suffix, {})
     assert 0 < first["tick"] < second["tick"]
-    assert bench.kinds() == [suffix, suffix]
+    assert cell.kinds() == [suffix, suffix]
 
 
-def test_an_empty_payload_is_an_empty_request(bench: Bench) -> None:
-    (reply,) = bench.session.get(channels.key(bench.settings.cell, "hold"), timeout=10.0)
+def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
+    (reply,) = cell.session.get(channels.key(cell.settings.cell, "hold"), timeout=10.0)
     assert reply.ok is not None
-    assert bench.kinds() == ["hold"]
+    assert cell.kinds() == ["hold"]
 
 
-def test_places_are_added_listed_replaced_removed_and_cleared(bench: Bench) -> None:
-    assert bench.client.ask("via_points", {"op": "list"})["points"] == []
-    reply = bench.client.add(PLACES)
+def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> None:
+    assert cell.client.ask("via_points", {"op": "list"})["points"] == []
+    reply = cell.client.add(PLACES)
     assert [taught["name"] for taught in reply["points"]] == ["handover", "glass", "soldering"]
     assert all(taught["missed_by_m"] < 0.003 for taught in reply["points"])
-    assert bench.client.ask("via_points", {"op": "list"})["points"] == reply["points"]
+    assert cell.client.ask("via_points", {"op": "list"})["points"] == reply["points"]
 
-    moved = bench.client.ask("via_points", add(point(name="glass", tool=[0.5, 0.1, 0.3])))
+    moved = cell.client.ask("via_points", add(point(name="glass", tool=[0.5, 0.1, 0.3])))
     assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
     assert len(moved["points"]) == 3
 
     assert [
-        taught["name"] for taught in bench.client.ask("via_points", {"op": "remove", "names": ["glass"]})["points"]
+        taught["name"] for taught in cell.client.ask("via_points", {"op": "remove", "names": ["glass"]})["points"]
     ] == ["handover", "soldering"]
-    assert bench.client.ask("via_points", {"op": "clear"})["points"] == []
-    assert bench.kinds() == ["skill"] * 4
-    assert bench.taken[0].value.via_points == PLACES
+    assert cell.client.ask("via_points", {"op": "clear"})["points"] == []
+    assert cell.kinds() == ["skill"] * 4
+    assert cell.taken[0].value.via_points == PLACES
 
 
-def test_what_the_loop_adopts_is_what_a_recording_keeps(bench: Bench, skill: Skill) -> None:
-    bench.client.add(PLACES, tolerance=0.04)
-    (event,) = bench.taken
-    assert event.payload == bench.kept[0] == adapted(skill, PLACES, tolerance=0.04).file
+def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Skill) -> None:
+    cell.client.add(PLACES, tolerance=0.04)
+    (event,) = cell.taken
+    assert event.payload == cell.kept[0] == adapted(skill, PLACES, tolerance=0.04).file
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
 def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
-    bench: Bench, skill: Skill, name: str
+    cell: Cell, skill: Skill, name: str
 ) -> None:
-    bench.client.add(PLACES)
-    assert len(bench.client.ask("skill", {"name": name})["points"]) == len(PLACES)
+    cell.client.add(PLACES)
+    assert len(cell.client.ask("skill", {"name": name})["points"]) == len(PLACES)
     other = with_file(replace(skill, learned_from="other demonstrations"))
-    (bench.folder / "other.npz").write_bytes(other.file)
-    assert bench.client.ask("skill", {"name": "other"})["points"] == []
-    assert bench.taken[-1].value.digest == other.digest
-    assert bench.names() == []
+    (cell.folder / "other.npz").write_bytes(other.file)
+    assert cell.client.ask("skill", {"name": "other"})["points"] == []
+    assert cell.taken[-1].value.digest == other.digest
+    assert cell.names() == []
 
 
-def test_what_is_taught_is_in_force_again_after_a_restart(bench: Bench, skill: Skill) -> None:
-    bench.client.add(PLACES[:2], tolerance=0.04)
-    assert SavedViaPoints(bench.settings).read(skill) == (PLACES[:2], 0.04)
-    bench.client.ask("via_points", {"op": "clear"})
-    restored = SavedViaPoints(bench.settings).read(skill)
+def test_what_is_taught_is_in_force_again_after_a_restart(cell: Cell, skill: Skill) -> None:
+    cell.client.add(PLACES[:2], tolerance=0.04)
+    assert SavedViaPoints(cell.settings).read(skill) == (PLACES[:2], 0.04)
+    cell.client.ask("via_points", {"op": "clear"})
+    restored = SavedViaPoints(cell.settings).read(skill)
     assert restored is not None
     assert restored[0] == ()
 
@@ -225,58 +225,58 @@ class SlowWorkshop(Workshop):
         return adapted(skill, places, tolerance=tolerance)
 
 
-def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[Workshop], Bench]) -> None:
+def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[Workshop], Cell]) -> None:
     slow = SlowWorkshop()
-    bench = opened(slow)
+    cell = opened(slow)
     with ThreadPoolExecutor(1) as pool:
-        teaching = pool.submit(bench.client.add, PLACES)
+        teaching = pool.submit(cell.client.add, PLACES)
         assert slow.begun.wait(10)
-        held = bench.client.ask("hold")
-        assert bench.kinds() == ["hold"]
-        assert bench.client.ask("status")["cell"] == bench.settings.cell
+        held = cell.client.ask("hold")
+        assert cell.kinds() == ["hold"]
+        assert cell.client.ask("status")["cell"] == cell.settings.cell
         slow.let.set()
         taught = teaching.result(20)
-    assert bench.kinds() == ["hold", "skill"]
+    assert cell.kinds() == ["hold", "skill"]
     assert held["tick"] < taught["tick"]
 
 
-def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Workshop], Bench]) -> None:
+def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Workshop], Cell]) -> None:
     slow = SlowWorkshop()
-    bench = opened(slow)
+    cell = opened(slow)
     with ThreadPoolExecutor(2) as pool:
-        teaching = pool.submit(bench.client.add, PLACES)
+        teaching = pool.submit(cell.client.add, PLACES)
         assert slow.begun.wait(10)
-        closing = pool.submit(bench.close)
+        closing = pool.submit(cell.close)
         slow.let.set()
         assert teaching.result(20)["points"]
         closing.result(20)
 
 
-def test_a_loop_that_does_not_take_a_request_is_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
-    bench.running = False
+    cell.running = False
     with pytest.raises(RefusedError, match="the control loop did not take the request: it is ending or stalled"):
-        bench.client.ask("hold")
+        cell.client.ask("hold")
 
 
-def test_a_skill_that_was_given_up_is_not_adopted_later(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
-    bench.running = False
+    cell.running = False
     with pytest.raises(RefusedError):
-        bench.client.add(PLACES)
+        cell.client.add(PLACES)
     monkeypatch.undo()
-    bench.running = True
-    bench.client.ask("hold")  # taken after whatever else waits
-    assert bench.kinds() == ["hold"]
-    assert bench.names() == []
+    cell.running = True
+    cell.client.ask("hold")  # taken after whatever else waits
+    assert cell.kinds() == ["hold"]
+    assert cell.names() == []
 
 
-def test_places_that_cannot_be_saved_are_not_taught(bench: Bench) -> None:
-    (bench.folder / "state").write_text("a file where a folder is needed")
+def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
+    (cell.folder / "state").write_text("a file where a folder is needed")
     with pytest.raises(RefusedError, match="via-points"):
-        bench.client.add(PLACES)
-    assert bench.kinds() == []
-    assert bench.names() == []
+        cell.client.add(PLACES)
+    assert cell.kinds() == []
+    assert cell.names() == []
 
 
 @pytest.mark.parametrize(
@@ -331,9 +331,9 @@ def test_places_that_cannot_be_saved_are_not_taught(bench: Bench) -> None:
     ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
 )
 def test_a_request_for_places_is_refused_whole_and_with_a_reason(
-    taught_bench: Bench, request_: Any, message: str
+    taught_cell: Cell, request_: Any, message: str
 ) -> None:
-    assert taught_bench.refusal("via_points", request_).startswith(message)
+    assert taught_cell.refusal("via_points", request_).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -352,9 +352,9 @@ def test_a_request_for_places_is_refused_whole_and_with_a_reason(
     ],
 )
 def test_a_request_for_a_skill_is_refused_whole_and_with_a_reason(
-    taught_bench: Bench, request_: Any, message: str
+    taught_cell: Cell, request_: Any, message: str
 ) -> None:
-    assert taught_bench.refusal("skill", request_).startswith(message)
+    assert taught_cell.refusal("skill", request_).startswith(message)
 
 
 @pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
@@ -367,15 +367,15 @@ def test_a_request_for_a_skill_is_refused_whole_and_with_a_reason(
     ],
 )
 def test_a_plain_request_with_something_in_it_is_refused(
-    taught_bench: Bench, suffix: str, request_: Any, message: str
+    taught_cell: Cell, suffix: str, request_: Any, message: str
 ) -> None:
-    assert taught_bench.refusal(suffix, request_).startswith(message)
+    assert taught_cell.refusal(suffix, request_).startswith(message)
 
 
-def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_bench: Bench) -> None:
-    (taught_bench.folder / "broken.npz").write_bytes(b"nothing")
-    assert "broken.npz: not a skill" in taught_bench.refusal("skill", {"name": "broken"})
-    (taught_bench.folder / "broken.npz").unlink()
+def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
+    (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
+    assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
+    (taught_cell.folder / "broken.npz").unlink()
 
 
 def test_a_pending_event_tells_the_tick_that_took_it() -> None:

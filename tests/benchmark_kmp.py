@@ -1,6 +1,6 @@
 """Speed of the primitive, as ratios to NumPy's own primitives measured in the same run.
 
-    OPENBLAS_NUM_THREADS=1 python -m pytest tests/bench_kmp.py --benchmark-only
+    OPENBLAS_NUM_THREADS=1 python -m pytest tests/benchmark_kmp.py --benchmark-only
 
 A limit in milliseconds means little on a machine that is busy or old, so each is a multiple of what
 NumPy or LAPACK needs there and then for the work that cannot be avoided. The multiples leave a
