@@ -49,8 +49,7 @@ class HandSettings(Section, frozen=True):
 
     unit: Literal["m", "cm", "mm"] = "m"
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
-    noise_std_m: Positive = 0.0005  # of one sample, each axis
-    jerk_density: Positive = 0.03  # [m²/s⁵] of the constant-acceleration Kalman filter
+    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.05)] = 0.002  # each axis; a start, it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 
@@ -62,7 +61,9 @@ class ToolSettings(Section, frozen=True):
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
-    bandwidth: Positive = 20.0  # [rad/s] of the critically damped tracker
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = (
+        2.8e-9  # [s⁶] against the squared error: smoothness
+    )
 
 
 class ArmSettings(Section, frozen=True):

@@ -13,7 +13,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 SIDES = ("left", "right")
-STAGES = ("intake", "skill", "smoother", "arm", "limiter")
+STAGES = ("intake", "skill", "setpoint", "arm", "limiter")
 
 
 class Mode(enum.IntEnum):
@@ -36,6 +36,7 @@ class Reason(enum.IntEnum):
     ARM_ERROR = 6
     ARM_SILENT = 7
     TOOL_SPEED = 8  # measured
+    SETPOINT = 9  # passed a bound of its own, which cannot be
 
 
 class Flag(enum.IntFlag):
@@ -105,12 +106,18 @@ STATE = (
     Field("hand_ticks", "int64", (2,)),  # tick of the newest sample; -1: none yet
     Field("arm_stamp_ns", "int64"),
     Field("arm_tick", "int64"),
+    Field("hull_ticks", "int64"),  # in the newest span
     Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
-    Field("filters", "float64", (2, 3, 3)),  # position, velocity, acceleration; by axis
-    Field("filter_covariances", "float64", (2, 3, 3)),
+    Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
+    Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`
+    Field("covariances", "float64", (2, 3, 3, 3)),
+    Field("modes", "float64", (2, 3)),
+    Field("noise", "float64", (2, 4)),
+    Field("past", "float64", (2, 3, 3)),
     Field("measured", "float64", (PER_JOINT,)),
     Field("measured_velocities", "float64", (PER_JOINT,)),
     Field("setpoint", "float64", (3, 3)),  # position, velocity, acceleration; by axis
+    Field("hull", "float64", (7, 2, 3)),  # least and greatest target of the last spans of time
     Field("joints", "float64", (3, PER_JOINT)),  # position, velocity, acceleration; by joint
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
     Field("rejected", "uint32", (len(Cause),)),

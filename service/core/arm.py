@@ -16,6 +16,7 @@ import pinocchio as pin
 from scipy.linalg.lapack import dposv
 
 from service.config import Settings
+from service.core.compiled import compiled
 from service.core.frame import Vector
 from service.core.limiter import MARGIN, approach_gain
 
@@ -36,6 +37,11 @@ SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 t
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
 FAR_SPEED = 0.15  # [m/s]
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
+SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
+TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
+# Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
+PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
+GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
 DECIMALS = 9  # [rad/s] of the result: rounded so that a replay on another kind of CPU agrees
 
 
@@ -49,6 +55,21 @@ class Solution(NamedTuple):
     velocity: Vector
     speed_limited: bool
     near_limit: bool
+
+
+class Kinematics(NamedTuple):
+    """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
+
+    The Jacobian (6, J) of the tool, linear rows first; the tasks (5, J): tool velocity, and turning
+    of its axis weighed by DIRECTION_LEVER; their damping [m²].
+    """
+
+    joints: Vector
+    position: Vector
+    rotation: Vector
+    jacobian: Vector
+    tasks: Vector
+    damping: float
 
 
 class Arm:
@@ -70,6 +91,7 @@ class Arm:
         self._data = self._model.createData()
         self._braking = CLOSING_BRAKES * settings.tool.max_acceleration
         self._closing_speed = min(settings.tool.max_speed, CLOSING_SPEED)
+        self._far_damping = FAR_DAMPING
         self._period = settings.period_s
         self._ahead = 1.0 / (1.0 + POSITION_GAIN * settings.period_s)  # the error decays as it will be, not as it is
         limits = settings.joints
@@ -77,6 +99,12 @@ class Arm:
         self._velocity = np.array(limits.velocity)
         self._gain = approach_gain(limits)
         self._posture = np.array(settings.arm.posture)
+        acceleration = np.array(limits.acceleration)
+        self._scale = (acceleration / acceleration.max()) ** SPARING
+        self._limits = (
+            PLANNED_SHARE[:, None] * np.array([limits.velocity, limits.acceleration, limits.jerk]) / self._scale
+        )
+        self._most = TOOL_SHARE * settings.tool.max_speed
 
     def pose(self, q: Vector) -> tuple[Vector, Vector]:
         """Position (3,) [m] and rotation (3, 3) of the tool in frame base, at joints q (J,)."""
@@ -91,29 +119,52 @@ class Arm:
         linear: Vector = self._jacobian(q)[:3] @ dq
         return linear
 
-    def step(self, q: Vector, position: Vector, velocity: Vector, direction: Vector) -> Solution:
+    def at(self, q: Vector) -> Kinematics:
+        """The arm at joints q (J,) [rad]."""
+        q = np.minimum(np.maximum(q, -1e3), 1e3)
+        jacobian = self._jacobian(q)
+        placement = pin.updateFramePlacement(self._model, self._data, self._tool)
+        rotation = placement.rotation.copy()
+        across = DIRECTION_LEVER * rotation[:, :2].T  # turning about the tool's x and y moves its direction
+        tasks = np.concatenate((jacobian[:3], across @ jacobian[3:]))
+        return Kinematics(q, placement.translation.copy(), rotation, jacobian, tasks, _damping(jacobian[:3]))
+
+    def costs(self, here: Kinematics) -> Vector:
+        """What a tool velocity, acceleration and jerk cost of each joint's limit:
+
+        (3, 3, J), 1 for all of it.
+
+        By order of the derivative, then by axis. The tool's direction is kept.
+        """
+        out = np.empty((3, *here.jacobian[:3].shape))
+        _joint_costs(here.tasks * self._scale, here.damping, self._limits, out)
+        return out
+
+    def step(
+        self, q: Vector, position: Vector, velocity: Vector, direction: Vector, here: Kinematics | None = None
+    ) -> Solution:
         """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
         `velocity` (3,) [m/s].
 
         The tool's +z turns to `direction` (3,), at any angle about it. Position goes before
-        direction, both before the posture. Never raises nor returns NaN for finite arguments.
+        direction, both before the posture. `here` is the arm at q, where that is known. Never
+        raises nor returns NaN for finite arguments.
         """
-        q = np.minimum(np.maximum(q, -1e3), 1e3)
-        jacobian = self._jacobian(q)
-        placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        rotation = placement.rotation
+        here = self.at(q) if here is None else here
+        q = here.joints
         linear = np.minimum(np.maximum(velocity, -10.0), 10.0)
-        error = np.minimum(np.maximum(position - placement.translation, -10.0), 10.0) - self._period * linear
+        error = np.minimum(np.maximum(position - here.position, -10.0), 10.0) - self._period * linear
         closing = self._approach(error)
-        linear += self._ahead * closing
-        across = DIRECTION_LEVER * rotation[:, :2].T  # turning about the tool's x and y moves its direction
-        tasks = np.concatenate((jacobian[:3], across @ jacobian[3:]))
-        wanted = np.concatenate((linear, across @ _turn(rotation[:, 2], direction)))
+        _add_closing(linear, self._ahead * closing, self._most)
+        across = DIRECTION_LEVER * here.rotation[:, :2].T
+        wanted = np.concatenate((linear, across @ _turn(here.rotation[:, 2], direction)))
         posture = np.minimum(np.maximum(POSTURE_GAIN * (self._posture - q), -POSTURE_SPEED), POSTURE_SPEED)
         fastest = self._gain * np.maximum(self._upper - q, 0.0)
         slowest = self._gain * np.minimum(self._lower - q, 0.0)
-        damping = _damping(jacobian[:3]) + FAR_DAMPING * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
-        result = _least_squares(tasks, wanted, posture, damping, (slowest, fastest))
+        damping = here.damping + self._far_damping * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
+        scale = self._scale
+        bounds = (slowest / scale, fastest / scale)
+        result = scale * _least_squares(here.tasks * scale, wanted, posture / scale, damping, bounds)
         excess = float((np.abs(result) / self._velocity).max())
         if excess > 1.0:
             result /= excess
@@ -219,3 +270,70 @@ def _solve(tasks: Vector, wanted: Vector, posture: Vector, damping: float) -> Ve
     _, weights, _ = dposv(square, wanted - tasks @ posture)
     x: Vector = posture + tasks.T @ weights
     return x
+
+
+def slow_down(gap: Vector, velocity: Vector) -> float:
+    """Share of its speed for a setpoint that is `gap` (3,) [m] ahead of the tool; 1 where it comes
+    back.
+    """
+    if float(gap @ velocity) <= 0.0:
+        return 1.0
+    return 1.0 / (1.0 + max(0.0, math.hypot(*gap) - GAP_FREE) / GAP_SLOW)
+
+
+@compiled
+def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
+    """Adds to a forward speed (3,) [m/s] as much of a closing speed as keeps the sum at most
+    `most`.
+    """
+    ff = fc = cc = 0.0
+    for i in range(3):
+        ff += forward[i] * forward[i]
+        fc += forward[i] * closing[i]
+        cc += closing[i] * closing[i]
+    if ff > most * most:
+        shrink = most / math.sqrt(ff)
+        for i in range(3):
+            forward[i] *= shrink
+        ff *= shrink * shrink
+        fc *= shrink
+    share = 1.0
+    if ff + 2.0 * fc + cc > most * most:
+        share = (-fc + math.sqrt(max(fc * fc + cc * (most * most - ff), 0.0))) / cc
+    for i in range(3):
+        forward[i] += min(max(share, 0.0), 1.0) * closing[i]
+
+
+@compiled
+def _joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> None:
+    """Joint speeds per tool velocity, by damped least squares, as shares of limits (3, J):
+
+    (3, 3, J).
+    """
+    joints = tasks.shape[1]
+    root, right = np.empty((5, 5)), np.zeros((5, 3))
+    for i in range(5):
+        for j in range(i + 1):
+            total = damping if i == j else 0.0
+            for k in range(joints):
+                total += tasks[i, k] * tasks[j, k]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = math.sqrt(max(total, 1e-12)) if i == j else total / root[j, j]
+    for axis in range(3):
+        right[axis, axis] = 1.0
+        for i in range(5):
+            for k in range(i):
+                right[i, axis] -= root[i, k] * right[k, axis]
+            right[i, axis] /= root[i, i]
+        for i in range(4, -1, -1):
+            for k in range(i + 1, 5):
+                right[i, axis] -= root[k, i] * right[k, axis]
+            right[i, axis] /= root[i, i]
+    for joint in range(joints):
+        for axis in range(3):
+            speed = 0.0
+            for i in range(5):
+                speed += tasks[i, joint] * right[i, axis]
+            for order in range(3):
+                out[order, axis, joint] = speed / limits[order, joint]

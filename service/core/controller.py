@@ -14,13 +14,13 @@ import numpy as np
 
 from service.config import Settings
 from service.contract.records import SIDES, Flag, Mode, Reason
-from service.core.arm import Arm
+from service.core.arm import Arm, Kinematics, slow_down
 from service.core.frame import Frame, Lap, Record, Tick, Vector, blank, frame_layout, frozen, no_lap, state_layout
 from service.core.intake import Intake
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
+from service.core.setpoint import SetpointGenerator
 from service.core.skill import Prediction, Skill
-from service.core.smoother import Smoother
 from service.core.workspace import Target, clamp
 
 TOO_FAST_S = (
@@ -33,9 +33,7 @@ Tap: TypeAlias = Callable[[Tick, Frame], None]
 def start_state(settings: Settings, skill: Skill) -> Record:
     """The state before the first tick."""
     state = blank(state_layout(len(settings.joints.names)))
-    state["tick"] = -1
-    state["hand_ticks"] = -1
-    state["arm_tick"] = -1
+    Intake(settings).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
     state["skill"] = np.frombuffer(skill.digest, np.uint8)
@@ -43,7 +41,7 @@ def start_state(settings: Settings, skill: Skill) -> Record:
 
 
 class Controller:
-    """Five stages in a row: intake, skill, smoother, arm, limiter.
+    """Five stages in a row: intake, skill, setpoint, arm, limiter.
 
     `Controller(settings, skill, state)` goes on bit for bit from where another controller's `state`
     was taken. `urdf` is the text of
@@ -56,7 +54,7 @@ class Controller:
         self._state = (start_state(settings, skill) if state is None else state).copy()
         self._layout = frame_layout(len(settings.joints.names))
         self._intake = Intake(settings)
-        self._smoother = Smoother(settings.tool, settings.period_s)
+        self._setpoint = SetpointGenerator(settings)
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
@@ -86,21 +84,22 @@ class Controller:
         self._decide(prediction)
         flags = Flag(0)
         joints, velocities, accelerations = state["joints"]
-        if state["mode"] == Mode.FOLLOW and target is not None:
-            state["setpoint"], slowed = self._smoother.step(
-                state["setpoint"], target.position, target.velocity, target.acceleration
-            )
-            lap("smoother")
-            wanted = self._arm.step(joints, state["setpoint"][0], state["setpoint"][1], self._direction)
+        following = state["mode"] == Mode.FOLLOW and target is not None
+        if following and target is not None:
+            here = self._arm.at(joints)
+            met = self._lead(target, here)
+            lap("setpoint")
+            setpoint = state["setpoint"]
+            wanted = self._arm.step(joints, setpoint[0], setpoint[1], self._direction, here)
             lap("arm")
             limited = self._limiter.step(joints, velocities, accelerations, wanted.velocity)
             flags |= Flag.TARGET_CLAMPED * target.clamped
-            flags |= Flag.SPEED_LIMITED * (slowed or wanted.speed_limited or limited.limited)
+            flags |= Flag.SPEED_LIMITED * (met or wanted.speed_limited or limited.limited)
             flags |= Flag.NEAR_JOINT_LIMIT * wanted.near_limit
             state["joints"] = limited[:3]
         else:
             state["joints"] = self._limiter.stop(joints, velocities, accelerations)[:3]
-            state["setpoint"] = self._at_rest()
+            self._setpoint.begin(state, self._at_rest())
         lap("limiter")
         return self._frame(prediction, target, flags)
 
@@ -139,7 +138,7 @@ class Controller:
         state = self._state
         if not (self._intake.is_fresh(state, 0) and self._intake.is_fresh(state, 1)):
             return None
-        hands, known = state["filters"], state["covariance"]
+        hands, known = state["hands"], state["covariance"]
         is_new = bool((state["hand_ticks"] == state["tick"]).any()) or not known.any()
         prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], covariance=None if is_new else known)
         state["covariance"] = prediction.covariance
@@ -164,7 +163,7 @@ class Controller:
         if arm.source == "assumed":
             if not state["arm_ready"]:
                 state["arm_ready"] = 1
-                state["setpoint"] = self._at_rest()
+                self._setpoint.begin(state, self._at_rest())
             return None
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:
@@ -172,7 +171,7 @@ class Controller:
                 state["arm_ready"], state["slow_tick"] = 1, state["tick"]
                 state["joints"] = 0.0
                 state["joints"][0] = state["measured"]
-                state["setpoint"] = self._at_rest()
+                self._setpoint.begin(state, self._at_rest())
             return None
         if not heard:
             if state["mode"] == Mode.FOLLOW or self._is_moving():
@@ -204,6 +203,17 @@ class Controller:
         """The target where it may be, with the motion that stays there."""
         return clamp(*prediction[:3], box=self._skill.workspace, reach=self._settings.reach)
 
+    def _lead(self, target: Target, here: Kinematics) -> bool:
+        """Moves the setpoint on; whether a limit was met. One that passes a bound is a fault."""
+        state, box = self._state, self._skill.workspace
+        before = state["setpoint"].copy()
+        slow = slow_down(before[0] - here.position, before[1])
+        met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
+        if self._setpoint.why_wrong(state, before, box):
+            state["mode"], state["reason"] = Mode.FAULT, Reason.SETPOINT
+            state["setpoint"] = before
+        return bool(met)
+
     def _is_moving(self) -> bool:
         """Whether the commanded joints have not come to rest."""
         return bool(self._state["joints"][1:].any())
@@ -218,7 +228,7 @@ class Controller:
         seen = state["hand_ticks"]
         frame["tick"] = state["tick"]
         frame["hand_stamp_ns"] = state["hand_stamps_ns"][seen == seen.max()].max()
-        frame["hands"], frame["hand_velocities"] = state["filters"][:, 0], state["filters"][:, 1]
+        frame["hands"], frame["hand_velocities"] = state["hands"][:, 0], state["hands"][:, 1]
         frame["hand_ages"] = np.where(seen < 0, -1, state["tick"] - seen)
         frame["setpoint"], frame["setpoint_velocity"], frame["setpoint_acceleration"] = state["setpoint"]
         if prediction is None or target is None:

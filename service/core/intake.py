@@ -4,7 +4,6 @@ the tick.
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
@@ -14,12 +13,11 @@ from service.contract.channels import BY_KEY
 from service.contract.messages import JointState, PoseStamped, WireError, finite, in_order
 from service.contract.records import SIDES, Cause
 from service.core.frame import Record, Vector
+from service.core.hand_estimator import HandEstimator
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
-JUMP_M = 0.1  # from where a hand was expected: the filter starts anew there, and does not take it for a motion
-START_DEVIATIONS = (0.3, 1.0)  # [m/s], [m/s²] of a hand of which one sample is known
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -46,20 +44,12 @@ class Intake:
         self._scale = UNIT_M[hands.unit]
         self._origin = np.array(hands.base_from_tracker[:3])
         self._axes = rotation(hands.base_from_tracker[3:])
-        self._noise = hands.noise_std_m**2
-        self._jerk_density = hands.jerk_density
-        self._motion = functools.lru_cache(maxsize=64)(self._motion_over)
+        self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
-    def _motion_over(self, ticks: int) -> tuple[Vector, Vector]:
-        """Transition and process noise (3, 3) of position, velocity and acceleration over some
-        ticks (white jerk).
-        """
-        t = ticks * self._period_s
-        transition = np.array([[1, t, t * t / 2], [0, 1, t], [0, 0, 1]])
-        noise = self._jerk_density * np.array(
-            [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
-        )
-        return transition, noise
+    def begin(self, state: Record) -> None:
+        """Sets in a state of zeros what no sample has told yet."""
+        state["tick"] = state["hand_ticks"] = state["arm_tick"] = -1
+        self._estimator.begin(state)
 
     def is_fresh(self, state: Record, side: int) -> bool:
         """Whether a hand has been seen, and lately enough."""
@@ -73,20 +63,12 @@ class Intake:
 
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
-        transition, noise = self._motion(ticks)
         state["tick"] += ticks
-        means, covariances = state["filters"], state["filter_covariances"]
-        fresh = (self.is_fresh(state, 0), self.is_fresh(state, 1))
-        if all(fresh):
-            means[:] = transition @ means
-            covariances[:] = transition @ covariances @ transition.T + noise
-            return
         for side in (0, 1):
-            if fresh[side]:
-                means[side] = transition @ means[side]
-                covariances[side] = transition @ covariances[side] @ transition.T + noise
+            if self.is_fresh(state, side):
+                self._estimator.advance(state, side, ticks)
             else:
-                means[side, 1:] = 0.0
+                self._estimator.rest(state, side)
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
@@ -104,14 +86,9 @@ class Intake:
         if cause is not None:
             state["rejected"][cause] += 1
             return
-        mean, covariance = state["filters"][side], state["filter_covariances"][side]
-        if self.is_fresh(state, side) and math.dist(position, mean[0]) < JUMP_M:
-            gain = covariance[:, 0] / (covariance[0, 0] + self._noise)
-            mean += gain[:, None] * (position - mean[0])
-            covariance -= gain[:, None] * covariance[0]
-        else:
-            mean[:] = (position, np.zeros(3), np.zeros(3))
-            covariance[:] = np.diag((self._noise, START_DEVIATIONS[0] ** 2, START_DEVIATIONS[1] ** 2))
+        since = int(state["tick"]) - int(state["hand_ticks"][side])
+        fresh = self.is_fresh(state, side)
+        self._estimator.take(state, side, position, interval_s=since * self._period_s, fresh=fresh)
         state["hand_stamps_ns"][side] = sample.stamp_ns
         state["hand_ticks"][side] = state["tick"]
 

@@ -25,6 +25,7 @@ from service.core.outputs import outgoing
 from service.recorder.mcap_file import McapFile, Messages, RecordingError, ends_early, existing, machine
 from service.urdf import Urdf
 
+FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
 _LATCHED = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
     "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
@@ -58,7 +59,7 @@ class Recorder:
         }
         self._file = McapFile(Path(path), joints=len(settings.joints.names))
         self.path = self._file.path
-        about = {"format": "1", "cell": settings.cell, **(machine() if metadata is None else metadata)}
+        about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
         writer = self._file.writer
         writer.add_metadata("thirdhand", about)
         writer.add_attachment(time_ns, time_ns, "settings.json", "application/json", msgspec.json.encode(settings))
@@ -219,9 +220,9 @@ class Recording:
             raise RecordingError(
                 f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
             )
-        if about.get("format") != "1":
+        if about.get("format") != FORMAT:
             raise RecordingError(
-                f"{path} has format {about.get('format')}, 1 is understood: was it made by a newer version?"
+                f"{path} has format {about.get('format')}, {FORMAT} is understood: was it made by another version?"
             )
         try:
             settings = msgspec.json.decode(parts["settings.json"], type=Settings)

@@ -18,6 +18,7 @@ from sim.experiments.results import ExperimentError, Options, Results, pyplot
 ABOUT = {
     "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
     "statistics": "100 random scenes, side by side with GMR, a Gaussian process, ProMP and the paper's own numbers",
+    "motion": "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
     "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
@@ -50,6 +51,12 @@ def parser() -> argparse.ArgumentParser:
         help="recorded letters to use besides the shipped model's: X.npz with demo00, demo01, ...",
     )
     p.add_argument(
+        "--hands",
+        metavar="DIR",
+        type=Path,
+        help="recorded hands for `motion`: .npz files with time_s, left and right [m]",
+    )
+    p.add_argument(
         "--workers",
         metavar="N",
         type=int,
@@ -71,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
-    options = Options(letters=args.letters, workers=args.workers, share=args.share)
+    options = Options(letters=args.letters, hands=args.hands, workers=args.workers, share=args.share)
     try:
         pyplot()  # what is missing is said now, not after an hour
         for name in ABOUT if args.name == "all" else [args.name]:

@@ -46,6 +46,7 @@ class Options:
     """What the command line says for all experiments."""
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
+    hands: Path | None = None  # a folder of recorded hands, for `motion`
     workers: int = 1  # processes
     share: float = 1.0  # of the full size, for a quick look
 

@@ -74,24 +74,24 @@ def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Ski
         assert np.linalg.norm(rest["tool"] - at, axis=1).min() < 0.03
 
 
-def test_the_tool_neither_lags_the_demonstrated_relation_nor_chatters(taught: Skill) -> None:
+def test_the_tool_follows_the_demonstrated_relation_and_passes_on_little_tremor(taught: Skill) -> None:
+    """Half a millimetre of tremor at 8 to 10 Hz, and as much noise; a setpoint that can stop lags
+    by v / 2a.
+    """
     script = HandScript(Scene(), seed=6)
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
     time_s = np.arange(len(seen)) * PERIOD_S - 1.5
     hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
     ideal = taught.primitive.mean(hands)
     inner = slice(750, -100)
-    ideal_v, ideal_a = (
-        np.gradient(ideal, PERIOD_S, axis=0),
-        np.gradient(np.gradient(ideal, PERIOD_S, axis=0), PERIOD_S, axis=0),
-    )
-    tool_v = np.gradient(seen["tool"], PERIOD_S, axis=0)
-    tool_a = np.gradient(tool_v, PERIOD_S, axis=0)
-    speed, ideal_speed = np.linalg.norm(tool_v, axis=1), np.linalg.norm(ideal_v, axis=1)
+    error = np.linalg.norm(seen["tool"][inner] - ideal[inner], axis=1)
+    assert np.sqrt(np.mean(error**2)) < 0.014
+    speed, ideal_speed = (np.linalg.norm(np.gradient(x, PERIOD_S, axis=0), axis=1) for x in (seen["tool"], ideal))
     score = [float(ideal_speed[inner] @ np.roll(speed, -shift)[inner]) for shift in range(-40, 41)]
-    lag_s = (int(np.argmax(score)) - 40) * PERIOD_S
-    assert lag_s <= 0.010
-    assert np.sqrt(np.mean(tool_a[inner] ** 2)) <= 3 * np.sqrt(np.mean(ideal_a[inner] ** 2))
+    assert (int(np.argmax(score)) - 40) * PERIOD_S <= 0.075
+    shaken = seen["tool"][-150:]
+    assert np.sqrt(np.mean(np.sum((shaken - shaken.mean(axis=0)) ** 2, axis=1))) < 0.002
+    assert speed.max() <= ASSUMED.tool.max_speed + 1e-6
 
 
 def test_it_goes_on_from_its_state_bit_for_bit(taught: Skill) -> None:

@@ -30,7 +30,7 @@ class Hands:
     def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
         self.intake = Intake(Settings(hands=hands or HandSettings(), rate_hz=rate_hz))
         self.state: Record = blank(STATE)
-        self.state["tick"] = self.state["hand_ticks"] = self.state["arm_tick"] = -1
+        self.intake.begin(self.state)
         self.advance()
 
     def advance(self, ticks: int = 1) -> None:
@@ -45,7 +45,7 @@ class Hands:
     ) -> Vector:
         """The filtered position (3,) [m] after one more sample."""
         self.intake.take_hand(self.state, side, PoseStamped(stamp_ns, "base", position, turn))  # type: ignore[arg-type]
-        return np.array(self.state["filters"][side, 0])
+        return np.array(self.state["hands"][side, 0])
 
     def arm(
         self,
@@ -61,6 +61,24 @@ class Hands:
 
     def rejected(self) -> dict[Cause, int]:
         return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}
+
+
+def follow(
+    hands: Hands, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
+) -> Vector:
+    """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
+    states, taken = [], 0
+    for tick in range(round(until_s / PERIOD_S)):
+        if tick:
+            hands.advance()
+        if tick * PERIOD_S * rate_hz >= taken - 1e-9:
+            stamp_s = tick * PERIOD_S
+            position = where(stamp_s) + (0.0 if noise is None else noise[taken])
+            hands.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
+            taken += 1
+        states.append(hands.state["hands"][LEFT].copy())
+    assert hands.rejected() == {}
+    return np.array(states)
 
 
 # --- what a tracker says -------------------------------------------------------------------------
@@ -195,12 +213,12 @@ def test_a_stale_hand_stands_still_and_starts_anew() -> None:
     hands = Hands()
     follow(hands, lambda t: np.array([0.5 * t, 0.0, 0.0]), until_s=0.5)
     hands.advance(50)
-    where = hands.state["filters"][LEFT].copy()
+    where = hands.state["hands"][LEFT].copy()
     assert not where[1:].any()
     hands.advance(100)
-    np.testing.assert_array_equal(hands.state["filters"][LEFT], where)
-    np.testing.assert_array_equal(hands.hand(10**10, (0.1, 0.2, 0.3)), [0.1, 0.2, 0.3])
-    assert not hands.state["filters"][LEFT, 1:].any()
+    np.testing.assert_array_equal(hands.state["hands"][LEFT], where)
+    np.testing.assert_allclose(hands.hand(10**10, (0.1, 0.2, 0.3)), [0.1, 0.2, 0.3], rtol=1e-14)
+    assert not hands.state["hands"][LEFT, 1:].any()
 
 
 # --- the arm -------------------------------------------------------------------------------------
@@ -261,75 +279,3 @@ def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with
     assert not hands.intake.is_arm_heard(hands.state)
     hands.arm(5)
     assert hands.intake.is_arm_heard(hands.state)
-
-
-# --- the filter ----------------------------------------------------------------------------------
-
-
-def follow(
-    hands: Hands, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
-) -> Vector:
-    """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
-    states, taken = [], 0
-    for tick in range(round(until_s / PERIOD_S)):
-        if tick:
-            hands.advance()
-        if tick * PERIOD_S * rate_hz >= taken - 1e-9:
-            stamp_s = tick * PERIOD_S
-            position = where(stamp_s) + (0.0 if noise is None else noise[taken])
-            hands.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
-            taken += 1
-        states.append(hands.state["filters"][LEFT].copy())
-    assert hands.rejected() == {}
-    return np.array(states)
-
-
-def test_the_filter_converges_on_a_constant_velocity() -> None:
-    velocity = np.array([0.3, -0.2, 0.1])
-    states = follow(Hands(), lambda t: np.array([0.5, 0.0, 0.2]) + velocity * t, until_s=2.0)
-    np.testing.assert_allclose(states[-1, 1], velocity, atol=1e-4)
-    np.testing.assert_allclose(states[-1, 2], 0.0, atol=1e-3)
-
-
-def test_the_filter_converges_on_a_constant_acceleration() -> None:
-    acceleration = np.array([0.4, -0.3, 0.2])
-    states = follow(Hands(), lambda t: 0.5 * acceleration * t * t, until_s=2.0)
-    last = 1.998
-    np.testing.assert_allclose(states[-1, 0], 0.5 * acceleration * last**2, atol=1e-5)
-    np.testing.assert_allclose(states[-1, 1], acceleration * last, atol=1e-4)
-    np.testing.assert_allclose(states[-1, 2], acceleration, atol=1e-3)
-
-
-@pytest.mark.parametrize("rate_hz", [30, 100])
-def test_a_hand_moves_in_each_tick_between_its_samples(rate_hz: int) -> None:
-    velocity = np.array([0.5, 0.0, 0.0])
-    states = follow(Hands(), lambda t: velocity * t, until_s=2.0, rate_hz=rate_hz)
-    steps = np.diff(states[500:, 0, 0]) / PERIOD_S
-    np.testing.assert_allclose(steps, 0.5, atol=0.01)
-
-
-def test_the_filter_makes_noise_smaller() -> None:
-    noise = np.random.default_rng(1).normal(0.0, 0.0005, (600, 3))
-    still = np.array([0.5, 0.0, 0.2])
-    states = follow(Hands(), lambda t: still, until_s=6.0, noise=noise)
-    assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.6 * 0.0005
-
-
-def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
-    one, many = Hands(), Hands()
-    for hands in (one, many):
-        follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
-    for _ in range(20):
-        one.advance()
-    many.advance(20)
-    assert one.state["tick"] == many.state["tick"]
-    np.testing.assert_allclose(many.state["filters"], one.state["filters"], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(many.state["filter_covariances"], one.state["filter_covariances"], rtol=1e-9, atol=1e-15)
-
-
-def test_covariances_stay_symmetric_and_positive() -> None:
-    hands = Hands()
-    follow(hands, lambda t: np.array([0.1 * t, 0.0, 0.0]), until_s=4.0, rate_hz=30)
-    covariance = hands.state["filter_covariances"][LEFT]
-    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
-    assert np.linalg.eigvalsh(covariance).min() > 0

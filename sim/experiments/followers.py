@@ -1,0 +1,228 @@
+"""What follows moving hands in `motion`: the service's own core, and what it competes with, at the
+same limits.
+
+All go through the same skill, inverse kinematics and joint limiter; only what lies between differs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
+
+from service.config import Settings, robot_description
+from service.contract.records import SIDES, Flag
+from service.core.arm import Arm
+from service.core.controller import Controller, run
+from service.core.frame import Frame, Tick, Vector
+from service.core.limiter import Limiter
+from service.core.rotation import rotation
+from service.core.skill import Skill
+from sim.closed_loop import START_NS, hand_event
+from sim.experiments.moving_hands import PERIOD_S, Moving
+from sim.experiments.results import Array
+
+SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it
+
+
+class Followed(NamedTuple):
+    """The tool's path (N, 3) [m], its greatest speed [m/s], and the share of ticks with a limit
+    met.
+    """
+
+    tool: Array
+    top_speed: float
+    limited: float
+    estimate: Array | None = None  # (N, 2, 3) of the hands
+    target: Array | None = None
+    setpoint: Array | None = None
+
+
+Follower: TypeAlias = Callable[[Moving], Followed]
+
+
+def ours(skill: Skill, settings: Settings) -> Follower:
+    """The service's core, tick by tick; it never holds for being far from the demonstrations."""
+    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
+    skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
+
+    def follow(hands: Moving) -> Followed:
+        frames: list[Frame] = []
+        controller = Controller(settings, skill, urdf=urdf)
+        run(controller, _ticks(hands), [lambda tick, frame: frames.append(frame)])
+        seen = np.array(frames[SETTLE_TICKS:])
+        speed = np.linalg.norm(np.diff(seen["tool"], axis=0), axis=1) / PERIOD_S
+        limited = float(np.mean(seen["flags"] & Flag.SPEED_LIMITED > 0))
+        return Followed(seen["tool"], float(speed.max()), limited, seen["hands"], seen["target"], seen["setpoint"])
+
+    return follow
+
+
+def _ticks(hands: Moving) -> Iterator[Tick]:
+    """Hands that rest at their start, and then what the tracker says at each tick."""
+    at = np.ceil(hands.stamps / PERIOD_S - 1e-9).astype(int) + SETTLE_TICKS
+    next_sample = 0
+    for k in range(SETTLE_TICKS + len(hands.truth)):
+        inbox = []
+        positions = []
+        if k < SETTLE_TICKS and k % 5 == 0:
+            positions = [hands.truth[0]]
+        while next_sample < len(at) and at[next_sample] <= k:
+            positions = [hands.samples[next_sample]]
+            next_sample += 1
+        for position in positions:
+            for side, part in zip(SIDES, (position[:3], position[3:]), strict=True):
+                x, y, z = part.tolist()
+                inbox.append(hand_event(side, (x, y, z), START_NS + k))
+        yield Tick(k, tuple(inbox))
+
+
+class _Eager(Arm):
+    """The inverse kinematics without what slows a tool that is far from its target: rivals plan no
+    stop.
+    """
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        super().__init__(settings, urdf)
+        self._closing_speed = settings.tool.max_speed
+        self._braking = settings.tool.max_acceleration / 2
+        self._far_damping = 0.0
+
+
+class _Chain:
+    """Inverse kinematics and joint limiter behind a rival's setpoints."""
+
+    def __init__(self, skill: Skill, settings: Settings) -> None:
+        self.skill, self.settings = skill, settings
+        self.arm = _Eager(settings, robot_description(settings))
+        self.limiter = Limiter(settings.joints, settings.period_s)
+        self.direction = rotation(tuple(skill.orientation))[:, 2]
+
+    def targets(self, samples: Array) -> Array:
+        """What the skill makes of samples (M, 6): (M, 3) [m], inside its workspace."""
+        return np.clip(self.skill.primitive.mean(samples), *self.skill.workspace)
+
+    def start(self, position: Vector) -> tuple[Vector, Vector, Vector]:
+        """The joints at rest with the tool at a position."""
+        q, dq, ddq = np.array(self.settings.arm.posture), np.zeros(7), np.zeros(7)
+        for _ in range(2000):
+            wanted = self.arm.step(q, position, np.zeros(3), self.direction)
+            q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
+        return q, 0 * dq, 0 * ddq
+
+    def follow(self, setpoints: Array) -> Followed:
+        """The tool led by setpoints (N, 2, 3): position and velocity."""
+        q, dq, ddq = self.start(setpoints[0, 0])
+        tool, limited = np.empty((len(setpoints), 3)), 0
+        for k, (position, velocity) in enumerate(setpoints):
+            wanted = self.arm.step(q, position, velocity, self.direction)
+            q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
+            tool[k] = self.arm.pose(q)[0]
+            limited += wanted.speed_limited
+        return _followed(tool, limited)
+
+
+def _followed(tool: Array, limited: int) -> Followed:
+    speed = np.linalg.norm(np.diff(tool, axis=0), axis=1) / PERIOD_S
+    return Followed(tool, float(speed.max()), limited / len(tool))
+
+
+def _newest(hands: Moving) -> Array:
+    """Which sample is the newest at each tick (N,)."""
+    at = np.ceil(hands.stamps / PERIOD_S - 1e-9)
+    return np.maximum(np.searchsorted(at, np.arange(len(hands.truth)), side="right") - 1, 0)
+
+
+def one_euro(hands: Moving, least_hz: float, beta: float) -> Array:
+    """The samples through a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
+    speed.
+    """
+    out, x, speed = np.empty_like(hands.samples), hands.samples[0].copy(), np.zeros(6)
+    out[0] = x
+    for k in range(1, len(out)):
+        interval = hands.stamps[k] - hands.stamps[k - 1]
+        speed += _share(1.0, interval) * ((hands.samples[k] - hands.samples[k - 1]) / interval - speed)
+        for hand in (slice(0, 3), slice(3, 6)):
+            cut_hz = least_hz + beta * float(np.linalg.norm(speed[hand]))
+            x[hand] += _share(cut_hz, interval) * (hands.samples[k, hand] - x[hand])
+        out[k] = x
+    return out
+
+
+def _share(cut_hz: float, interval_s: float) -> float:
+    return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cut_hz * interval_s))
+
+
+def chase(skill: Skill, settings: Settings, *, least_hz: float, beta: float) -> Follower:
+    """A One-Euro filter, then Ruckig to the newest target, which it takes to be at rest."""
+    tool = settings.tool
+    axis_speed = tool.max_speed / math.sqrt(3)
+
+    def follow(hands: Moving) -> Followed:
+        chain = _Chain(skill, settings)
+        targets = chain.targets(one_euro(hands, least_hz, beta))[_newest(hands)]
+        limits = [axis_speed] * 3, [tool.max_acceleration] * 3, [tool.max_jerk] * 3
+        return chain.follow(_by_ruckig(targets, limits)[:, :2])
+
+    return follow
+
+
+def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
+    """MoveIt Servo's way: inverse kinematics of the newest target, then a Butterworth filter and
+    Ruckig on the joints.
+
+    The filter is the first-order one of its plug-in, with its coefficient.
+    """
+    joints = settings.joints
+    limits = list(joints.velocity), list(joints.acceleration), list(joints.jerk)
+
+    def follow(hands: Moving) -> Followed:
+        chain = _Chain(skill, settings)
+        targets = chain.targets(hands.samples)[_newest(hands)]
+        q = chain.start(targets[0])[0]
+        before, low, wanted, limited = q, q.copy(), np.empty((len(targets), len(q))), 0
+        for k, target in enumerate(targets):
+            solution = chain.arm.step(q, target, np.zeros(3), chain.direction)
+            limited += solution.speed_limited
+            q = q + PERIOD_S * solution.velocity
+            low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)
+            before, wanted[k] = q, low
+        moved = _by_ruckig(wanted, limits)[:, 0]
+        return _followed(np.array([chain.arm.pose(q)[0] for q in moved]), limited)
+
+    return follow
+
+
+def unsmoothed(skill: Skill, settings: Settings) -> Follower:
+    """The newest sample's target straight to the inverse kinematics."""
+
+    def follow(hands: Moving) -> Followed:
+        chain = _Chain(skill, settings)
+        targets = chain.targets(hands.samples)[_newest(hands)]
+        return chain.follow(np.stack([targets, np.zeros_like(targets)], axis=1))
+
+    return follow
+
+
+def _by_ruckig(wanted: Array, limits: tuple[list[float], list[float], list[float]]) -> Array:
+    """States (N, 3, D) of a time-optimal chase of positions (N, D), each taken to be at rest."""
+    size = wanted.shape[1]
+    solver, question, profile = Ruckig(size, PERIOD_S), InputParameter(size), Trajectory(size)
+    question.synchronization = Synchronization.No
+    question.max_velocity, question.max_acceleration, question.max_jerk = limits
+    question.target_velocity = question.target_acceleration = [0.0] * size
+    state, out, since = np.stack([wanted[0], np.zeros(size), np.zeros(size)]), np.empty((len(wanted), 3, size)), 0
+    for k, position in enumerate(wanted):
+        if k == 0 or (position != wanted[k - 1]).any():
+            question.current_position, question.current_velocity, question.current_acceleration = state.tolist()
+            question.target_position = position.tolist()
+            solver.calculate(question, profile)
+            since = k
+        state = np.array(profile.at_time((k - since + 1) * PERIOD_S))
+        out[k] = state
+    return out

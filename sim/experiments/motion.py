@@ -1,0 +1,272 @@
+"""How the tool follows hands that move as people's do: error, lag, smoothness, and stops, beside
+what it competes with.
+
+Errors are the tool's distance from what the skill makes of the truth at the same instant, lag
+included.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from service.config import Settings
+from service.core.skill import Skill
+from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
+from sim.experiments.linear_floor import Floor, best_linear
+from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, reaches, recorded, stops
+from sim.experiments.rehearsal import shipped
+from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
+
+PEOPLE, SECONDS, STOPS, REACHES = 3, 20.0, 24, 1
+SETTLED_MM = 5.0
+WEIGHTS = (6e-10, 1e-8, 4e-8)  # of jerk, besides the default: the trade-off
+CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
+SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
+FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+
+
+@dataclass(frozen=True)
+class Figures:
+    """One sequence with one follower.
+
+    Overshoot and settling are those of sudden stops, the rest of all others.
+    """
+
+    follower: str
+    group: str
+    name: str
+    error_rms_mm: float
+    error_p95_mm: float
+    lag_ms: float
+    acceleration_ratio: float  # root mean square, to the truth's
+    jerk_ratio: float
+    limited: float  # share of ticks with a limit met
+    top_speed: float  # [m/s] of the tool
+    overshoot_mm: float
+    settled_ms: float
+
+
+def followers(skill: Skill, share: float) -> dict[str, Follower]:
+    """All that is compared; for a quick look one of each kind."""
+    settings = Settings()
+    found = {"ours": ours(skill, settings)}
+    first = None if share == 1 else 1
+    for weight in WEIGHTS[:first]:
+        tool = msgspec.structs.replace(settings.tool, jerk_weight=weight)
+        found[f"ours, jerk weight {weight:g}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
+    for least_hz, beta in CHASES[:first]:
+        found[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
+    for coefficient in SERVOS[:first]:
+        found[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
+    found["no smoothing"] = unsmoothed(skill, settings)
+    return found
+
+
+def sequences(options: Options, middle: Array) -> list[Moving]:
+    """The hands that are followed: recorded where a folder is given, modelled otherwise."""
+    share = options.share
+    count, seconds = max(1, round(PEOPLE * share)), max(6.0, SECONDS * share)
+    people = recorded(options.hands, middle) if options.hands else modelled(middle, count=count, seconds=seconds)
+    if share < 1:  # a quick look
+        people = [one for one in people if one.group in FLOOR_GROUPS]
+    count = max(4, round(STOPS * share))
+    return [
+        *people,
+        *reaches(count=REACHES),
+        *stops(middle, count=count),
+        *stops(middle, count=count, rate_hz=30, noise=0.002, group="sudden stops, 30 Hz, 2 mm"),
+    ]
+
+
+_known: dict[str, Any] = {}
+
+
+def prepare(share: float) -> None:
+    """Loads the skill and what follows, once in a process."""
+    skill = shipped()
+    _known.update(skill=skill, followers=followers(skill, share))
+
+
+def measure(task: tuple[str, Moving]) -> Figures:
+    """The figures of one sequence with one follower."""
+    name, hands = task
+    target = np.clip(_known["skill"].primitive.mean(hands.truth), *_known["skill"].workspace)
+    return figures(name, hands, target, _known["followers"][name](hands))
+
+
+def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
+    """Figures of a path against the truth's target (N, 3) [m]."""
+    off_mm = 1000 * np.linalg.norm(seen.tool - target, axis=1)
+    wanted_acceleration, acceleration = (_derived(x, 2) for x in (target, seen.tool))
+    overshoot = settled = math.nan
+    if not math.isnan(hands.stop_s):
+        begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
+        way = _derived(target, 1)[begin]
+        past = (seen.tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
+        overshoot = max(0.0, 1000 * float(past.max()))
+        late = np.flatnonzero(1000 * np.linalg.norm(seen.tool[end:] - target[-1], axis=1) > SETTLED_MM)
+        settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
+    return Figures(
+        name,
+        hands.group,
+        hands.name,
+        error_rms_mm=float(np.sqrt(np.mean(off_mm**2))),
+        error_p95_mm=float(np.percentile(off_mm, 95)),
+        lag_ms=_lag_ms(target, seen.tool),
+        acceleration_ratio=_rms(acceleration) / _rms(wanted_acceleration),
+        jerk_ratio=_rms(_derived(acceleration, 1)) / _rms(_derived(wanted_acceleration, 1)),
+        limited=seen.limited,
+        top_speed=seen.top_speed,
+        overshoot_mm=overshoot,
+        settled_ms=settled,
+    )
+
+
+def _derived(x: Array, times: int) -> Array:
+    for _ in range(times):
+        x = np.gradient(x, PERIOD_S, axis=0)
+    return x
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
+
+
+def _lag_ms(target: Array, tool: Array) -> float:
+    """The maximum of the cross-correlation of speeds."""
+    a, b = (np.linalg.norm(_derived(x, 1), axis=1) for x in (target, tool))
+    a, b = a - a.mean(), b - b.mean()
+    inner = a[60 : len(a) - 160]
+    score = [float(inner @ b[60 + k : len(b) - 160 + k]) for k in range(-30, 101)]
+    return 1000 * PERIOD_S * (int(np.argmax(score)) - 30)
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """Follows all hands with all followers; returns the numbers for its JSON."""
+    prepare(options.share)
+    hands = sequences(options, _known["skill"].primitive.inputs.mean(axis=0))
+    tasks = [(name, one) for name in _known["followers"] for one in hands]
+    found: list[Figures] = []
+    if options.workers == 1:
+        found = [measure(task) for task in tasks]
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(
+            options.workers, mp_context=context, initializer=prepare, initargs=(options.share,)
+        ) as pool:
+            found = list(pool.map(measure, tasks, chunksize=8))
+    table = {name: _summary([one for one in found if one.follower == name]) for name in _known["followers"]}
+    for name, groups in table.items():
+        results.say(f"{name}: {_line(groups)}")
+    floors = {
+        group: best_linear([one for one in hands if one.group == group], _known["skill"], rate_hz=rate_hz)
+        for group, rate_hz in FLOOR_GROUPS.items()
+    }
+    _draw(results, table, floors)
+    _record(results, hands[1], _known["followers"]["ours"](hands[1]))
+    return {
+        "hands": "recorded" if options.hands else "modelled",
+        "by_follower": table,
+        "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
+        "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
+    }
+
+
+def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
+    """Means over the sequences of each group; of stops the worst too."""
+    out: dict[str, dict[str, float]] = {}
+    for group in dict.fromkeys(one.group for one in rows):
+        of = [one for one in rows if one.group == group]
+        top = max(one.top_speed for one in of)
+        if math.isnan(of[0].overshoot_mm):
+            names = ("error_rms_mm", "error_p95_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
+            out[group] = {name: float(np.mean([getattr(one, name) for one in of])) for name in names}
+        else:
+            overshoot, settled = [one.overshoot_mm for one in of], [one.settled_ms for one in of]
+            out[group] = {
+                "overshoot_mean_mm": float(np.mean(overshoot)),
+                "overshoot_worst_mm": max(overshoot),
+                "settled_worst_ms": max(settled),
+            }
+        out[group]["top_speed"] = top
+    return out
+
+
+def _line(groups: dict[str, dict[str, float]]) -> str:
+    """The summary of one follower as a line."""
+    parts = []
+    for group, f in groups.items():
+        if "lag_ms" in f:
+            parts.append(
+                f"{group} {f['error_rms_mm']:.1f} mm, {f['lag_ms']:.0f} ms, "
+                f"acceleration {f['acceleration_ratio']:.2f}, jerk {f['jerk_ratio']:.1f}"
+            )
+        else:
+            overshoot = f"{f['overshoot_mean_mm']:.1f} / {f['overshoot_worst_mm']:.1f} mm"
+            parts.append(f"{group} {overshoot}, {f['settled_worst_ms']:.0f} ms")
+    return "; ".join(parts)
+
+
+def _draw(results: Results, table: dict[str, dict[str, dict[str, float]]], floors: dict[str, list[Floor]]) -> None:
+    """Error against jerk, for every follower and the best linear filters."""
+    plt = pyplot()
+    figure, axes = plt.subplots(1, len(floors), figsize=(10, 4.2), layout="constrained")
+    styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
+    for panel, (group, floor) in zip(axes, floors.items(), strict=True):
+        for family, (colour, marker) in styles.items():
+            rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
+            points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
+            label = {"ours": "ours, by weight of jerk", "chase": "One-Euro, then chase by Ruckig"}.get(family, family)
+            panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
+            if family == "ours":
+                chosen = rows["ours"]
+                panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
+        panel.plot(
+            [row.jerk_ratio for row in floor],
+            [row.error_rms_mm for row in floor],
+            "k--",
+            lw=1,
+            label="best linear filter, without limits and arm",
+        )
+        panel.set(xscale="log", xlabel="jerk, times the truth's", ylabel="error, rms [mm]", ylim=(0, None))
+        panel.set_title({"clean": "clean, 100 Hz", "recorded": "as a camera sees them, 30 Hz"}[group])
+    axes[0].legend(frameon=False, fontsize=8)
+    results.figure(figure)
+
+
+def _record(results: Results, hands: Moving, seen: Followed) -> None:
+    """One sequence in Rerun: truth, raw samples and estimate of each hand, target, setpoint and
+    tool.
+    """
+    stream = results.recording()
+    assert seen.estimate is not None
+    times = np.arange(len(hands.truth)) * PERIOD_S
+    at = np.minimum(np.round(hands.stamps / PERIOD_S).astype(int), len(times) - 1)
+
+    def points(path: str, when: Any, positions: Any, colour: str, radius: float) -> None:
+        stream.log(path, rr.Points3D.from_fields(colors=[rgb(colour)], radii=[radius]), static=True)
+        index = [rr.TimeColumn("time", duration=when)]
+        stream.send_columns(path, index, rr.Points3D.columns(positions=positions))
+
+    for side, (name, colour) in enumerate((("left", LEFT), ("right", RIGHT))):
+        part = slice(3 * side, 3 * side + 3)
+        points(f"/{name}/truth", times, hands.truth[:, part], REFERENCE, 0.006)
+        points(f"/{name}/raw", times[at], hands.samples[:, part], OTHER, 0.004)
+        points(f"/{name}/estimate", times, seen.estimate[:, side], colour, 0.008)
+    for name, path, colour in (
+        ("target", seen.target, ADAPTED),
+        ("setpoint", seen.setpoint, REFERENCE),
+        ("tool", seen.tool, TOOL),
+    ):
+        assert path is not None
+        points(f"/{name}", times, path, colour, 0.008)
+        stream.log(f"/{name}/way", rr.LineStrips3D([path], colors=[rgb(colour)], radii=[0.0007]), static=True)
+    stream.disconnect()

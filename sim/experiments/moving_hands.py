@@ -1,0 +1,171 @@
+"""Hands in motion, for `motion`: recorded ones, ones modelled after them, sudden stops, and the
+bench's reaches.
+
+Recordings are `.npz` files with `time_s` (T,), `left` and `right` (T, 3) [m]. What they hold is
+brought into the skill's region; their truth is the recording without what is too fast for a wrist.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+
+from sim.experiments.results import Array, ExperimentError
+from sim.scene import Scene
+from sim.script import HandScript
+
+PERIOD_S = 0.002
+NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # below this rate a tracker is a camera, whose noise asks for more
+CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # base from a camera's x right, y down
+MOST_SPEED = 1.0  # [m/s] 99th percentile of a hand: faster motion is made smaller
+STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
+
+
+@dataclass(frozen=True)
+class Moving:
+    """One sequence: the truth at 500 Hz (N, 6), and what a tracker says: stamps (M,) [s], samples
+    (M, 6), both hands [m].
+    """
+
+    name: str
+    group: str
+    truth: Array
+    stamps: Array
+    samples: Array
+    stop_s: float = math.nan  # when a sudden stop begins
+
+
+def recorded(folder: Path, middle: Array) -> list[Moving]:
+    """Each recording of a folder, clean, as it is, and seen at 30 Hz. Raises ExperimentError."""
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise ExperimentError(f"no recorded hands in {folder}: .npz files with time_s, left and right needed")
+    return [sequence for number, path in enumerate(files) for sequence in _of_file(path, middle, number)]
+
+
+def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            t, left, right = (np.asarray(data[name], np.float64) for name in ("time_s", "left", "right"))
+    except (KeyError, ValueError, OSError) as error:
+        raise ExperimentError(f"{path}: not a recording of hands: {error}") from None
+    t = t - t[0]
+    rate = 1 / float(np.mean(np.diff(t)))
+    noisy = rate < NOISY_HZ
+    axes = CAMERA_AXES if noisy else np.eye(3)
+    hands = np.hstack([left @ axes.T, right @ axes.T])
+    hands = hands - np.median(hands, axis=0)
+    truth = _smooth(hands, rate, NOISY_CUT_HZ if noisy else CUT_HZ)
+    speed = np.linalg.norm(np.gradient(truth.reshape(-1, 2, 3), 1 / rate, axis=0), axis=2).max(axis=1)
+    scale = min(1.0, MOST_SPEED / float(np.percentile(speed, 99)), 0.3 / float(np.abs(truth).max()))
+    spline = CubicSpline(t, middle + scale * truth)
+    fine = spline(np.arange(0.0, t[-1], PERIOD_S))
+    name = path.stem
+    random = np.random.default_rng(number)
+
+    def seen(group: str, rate_hz: float, noise: float) -> Moving:
+        stamps = np.arange(0.0, t[-1] - PERIOD_S, 1 / rate_hz)
+        return Moving(name, group, fine, stamps, spline(stamps) + noise * random.standard_normal((len(stamps), 6)))
+
+    return [
+        seen("clean", 100, 0.0005),
+        Moving(name, "recorded", fine, t, middle + scale * hands),
+        seen("30 Hz, 2 mm", 30, 0.002),
+    ]
+
+
+def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
+    sos = butter(4, cut_hz, fs=rate_hz, output="sos")
+    return np.asarray(sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * rate_hz / cut_hz))))
+
+
+def modelled(middle: Array, *, count: int, seconds: float) -> list[Moving]:
+    """People modelled after the recordings, each seen by the trackers of `recorded`'s groups."""
+    out = []
+    for number in range(count):
+        truth = _person(number, middle, seconds)
+        times = np.arange(len(truth)) * PERIOD_S
+        spline = CubicSpline(times, truth)
+        for group, rate_hz, noise, spoilt in (
+            ("clean", 100, 0.0005, False),
+            ("recorded", 30, 0.002, True),
+            ("30 Hz, 2 mm", 30, 0.002, False),
+            ("60 - 240 Hz, 0.3 - 5 mm", (60, 120, 240)[number % 3], (0.001, 0.0003, 0.005)[number % 3], True),
+        ):
+            random = np.random.default_rng([number, rate_hz])
+            stamps = np.arange(0.0, times[-1], 1 / rate_hz)
+            samples = spline(stamps) + noise * random.standard_normal((len(stamps), 6))
+            if spoilt:
+                stamps, samples = _spoilt(stamps, samples, rate_hz, random)
+            out.append(Moving(f"person {number + 1}", group, truth, stamps, samples))
+    return out
+
+
+def _person(seed: int, middle: Array, seconds: float) -> Array:
+    """Overlapping reaches with rests and turns back, and sway: (N, 6)."""
+    random = np.random.default_rng(seed)
+    t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
+    x = np.zeros((len(t), 6))
+    for hand in (0, 3):
+        at, here, before = 0.5, np.zeros(3), np.zeros(3)
+        while at < seconds - 1.5:
+            goal = before if random.random() < 0.2 else random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.6)
+            before, way, here = here, goal - here, goal
+            lasts = random.uniform(0.4, 0.8) + 3.5 * float(np.linalg.norm(way))
+            u = np.clip((t - at) / lasts, 0.0, 1.0)
+            x[:, hand : hand + 3] += way * (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
+            at += lasts * random.uniform(0.7, 1.0) + (random.exponential(0.6) if random.random() < 0.5 else 0.0)
+    sway = sosfiltfilt(butter(2, 1.2, fs=1 / PERIOD_S, output="sos"), random.standard_normal((len(t), 6)), axis=0)
+    return np.asarray(middle + x + 0.004 * sway / sway.std(axis=0))
+
+
+def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Generator) -> tuple[Array, Array]:
+    """With outliers of some centimetres, and dropouts of 30 to 90 ms."""
+    samples, keep = samples.copy(), np.ones(len(stamps), bool)
+    for hand in (0, 3):
+        hit = random.random(len(stamps)) < 0.002
+        samples[hit, hand : hand + 3] += 0.05 * random.standard_normal((int(hit.sum()), 3))
+    for at in np.flatnonzero(random.random(len(stamps)) < 0.03 / rate_hz):
+        keep[at : at + int(random.uniform(0.03, 0.09) * rate_hz)] = False
+    return stamps[keep], samples[keep]
+
+
+def stops(
+    middle: Array, *, count: int, rate_hz: float = 100, noise: float = 0.0005, group: str = "sudden stops"
+) -> list[Moving]:
+    """One hand moves evenly at 0.31 m/s, stops within 80 ms, and rests."""
+    out = []
+    for number in range(count):
+        random = np.random.default_rng([number, 7])
+        way = np.zeros(6)
+        way[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (1.0, 1.0, 0.5)
+        way /= np.linalg.norm(way)
+        t = np.arange(round(2.1 / PERIOD_S)) * PERIOD_S
+        stop_s = 1.15 + 0.15 * random.random()
+        up, down = np.clip((t - 0.5) / 0.3, 0.0, 1.0), np.clip((t - stop_s) / STOP_S, 0.0, 1.0)
+        gone = np.cumsum(STOP_SPEED * up**2 * (3 - 2 * up) * (1 - down**2 * (3 - 2 * down))) * PERIOD_S
+        end = middle + random.uniform(-0.05, 0.05, 6) * (1.0, 1.0, 0.5, 1.0, 1.0, 0.3)
+        truth = end + way * (gone - gone[-1])[:, None]
+        stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
+        samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
+        samples += noise * random.standard_normal(samples.shape)
+        out.append(Moving(f"stop {number + 1}", group, truth, stamps, samples, stop_s))
+    return out
+
+
+def reaches(*, count: int) -> list[Moving]:
+    """The bench's minimum-jerk hands, with its tremor and noise."""
+    out = []
+    for seed in range(1, count + 1):
+        script = HandScript(Scene(), seed=seed)
+        times = np.arange(round(script.duration_s / PERIOD_S)) * PERIOD_S
+        truth = np.array([np.concatenate([hand.position for hand in script.truth(t)]) for t in times])
+        stamps = np.arange(0.0, script.duration_s - 0.01, 0.01)
+        samples = np.array([np.concatenate([pose[:3] for pose in script.sample(t)]) for t in stamps])
+        out.append(Moving(f"scene {seed}", "minimum jerk", truth, stamps, samples))
+    return out

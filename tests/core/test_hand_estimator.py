@@ -1,0 +1,137 @@
+"""The hand estimator: right between samples, whatever the tracker's noise, told or not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from test_intake import LEFT, PERIOD_S, Hands, follow
+
+from service.config import HandSettings
+from service.core import hand_estimator
+from service.core.frame import Vector
+from service.core.hand_estimator import JUMP_M, LEAST_NOISE, MODES, MOST_NOISE, model
+
+
+def reach(t: float) -> Vector:
+    """A minimum-jerk reach of 30 cm in a second, which begins at 1 s."""
+    u = min(max(t - 1.0, 0.0), 1.0)
+    return np.array([0.5, 0.0, 0.2]) + u**3 * (10 - 15 * u + 6 * u * u) * np.array([0.2, -0.2, 0.1])
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+def test_a_reach_is_known_to_a_millimetre_between_the_samples_too(rate_hz: int) -> None:
+    states = follow(Hands(), reach, until_s=3.0, rate_hz=rate_hz)
+    truth = np.array([reach(k * PERIOD_S) for k in range(len(states))])
+    error = np.linalg.norm(states[100:, 0] - truth[100:], axis=1)
+    assert np.sqrt(np.mean(error**2)) < (0.0015 if rate_hz < 100 else 0.0005)
+    velocity = np.gradient(truth, PERIOD_S, axis=0)
+    assert np.abs(states[100:, 1] - velocity[100:]).max() < (0.25 if rate_hz < 100 else 0.1)
+
+
+def test_a_hand_moves_in_each_tick_between_its_samples() -> None:
+    states = follow(Hands(), reach, until_s=3.0, rate_hz=30)
+    steps = np.linalg.norm(np.diff(states[:, 0], axis=0), axis=1)
+    moving = steps[round(1.2 / PERIOD_S) : round(1.8 / PERIOD_S)]
+    assert (moving > 0).all()
+
+
+@pytest.mark.parametrize("noise_m", [0.0005, 0.002, 0.005])
+def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
+    noise = np.random.default_rng(1).normal(0.0, noise_m, (600, 3))
+    still = np.array([0.5, 0.0, 0.2])
+    hands = Hands()
+    states = follow(hands, lambda t: still, until_s=6.0, noise=noise)
+    assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.65 * noise_m
+    found = math.sqrt(hands.state["noise"][LEFT, 0])
+    assert max(noise_m, LEAST_NOISE) * 0.7 < found < max(noise_m, LEAST_NOISE) * 1.4
+
+
+def test_what_is_said_of_the_noise_makes_no_difference_after_a_second_and_a_half() -> None:
+    noise = np.random.default_rng(2).normal(0.0, 0.002, (400, 3))
+    told = [
+        follow(Hands(HandSettings(noise_std_m=said)), reach, until_s=3.0, noise=noise) for said in (0.0002, 0.002, 0.02)
+    ]
+    for other in told[1:]:
+        assert np.linalg.norm(other[750:, 0] - told[0][750:, 0], axis=1).max() < 0.0005
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+def test_hands_that_alternate_come_to_rest_between_their_places(rate_hz: int) -> None:
+    """Two sources of one hand, 9 cm apart, in turn."""
+    side, places = {"at": 0}, (np.array([0.5, -0.045, 0.2]), np.array([0.5, 0.045, 0.2]))
+
+    def where(t: float) -> Vector:
+        side["at"] = 1 - side["at"]
+        return places[side["at"]]
+
+    states = follow(Hands(), where, until_s=6.0, rate_hz=rate_hz)
+    assert np.abs(states[1500:, 0, 1]).max() < 0.06
+    assert np.abs(states[1500:, 1]).max() < 3.0
+
+
+def test_a_jump_is_no_motion() -> None:
+    hands = Hands()
+    follow(hands, lambda t: np.array([0.5, 0.0, 0.2]), until_s=1.0)
+    hands.hand(10**10, (0.5 + 2 * JUMP_M, 0.0, 0.2))
+    np.testing.assert_allclose(hands.state["hands"][LEFT, 0], [0.5 + 2 * JUMP_M, 0.0, 0.2])
+    assert not hands.state["hands"][LEFT, 1:].any()
+
+
+def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
+    one, many = Hands(), Hands()
+    for hands in (one, many):
+        follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
+    for _ in range(20):
+        one.advance()
+    many.advance(20)
+    assert one.state["tick"] == many.state["tick"]
+    np.testing.assert_allclose(many.state["hands"], one.state["hands"], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(many.state["covariances"], one.state["covariances"], rtol=1e-9, atol=1e-15)
+
+
+def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() -> None:
+    hands = Hands()
+    random = np.random.default_rng(3)
+    for tick in range(3000):
+        hands.advance()
+        if tick % 7 == 0:
+            at = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
+            hands.hand(tick + 1, tuple(at.tolist()))
+    state = hands.state
+    for covariance in state["covariances"][LEFT]:
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+    assert state["modes"][LEFT].sum() == pytest.approx(1.0)
+    assert (state["modes"][LEFT] > 0).all()
+    assert LEAST_NOISE**2 <= state["noise"][LEFT, 0] <= MOST_NOISE**2
+    assert np.isfinite(state["hands"]).all()
+
+
+def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
+    once, noise = model(0.002)
+    transition, total = np.eye(3), np.zeros((3, 3))
+    for _ in range(25):
+        transition, total = once @ transition, once @ total @ once.T + noise
+    found, found_noise = model(0.05)
+    np.testing.assert_allclose(found, transition, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found_noise, total, rtol=1e-9, atol=1e-15)
+
+
+def test_compiled_and_plain_functions_agree() -> None:
+    random = np.random.default_rng(4)
+    root = random.normal(size=(MODES, 3, 3))
+    means, covariances = random.normal(size=(MODES, 3, 3)), root @ root.transpose(0, 2, 1)
+    modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
+    transition, noise = model(0.002)
+    results = []
+    for plain in (False, True):
+        parts = [means.copy(), covariances.copy(), modes.copy()]
+        for name, more in (("_advance", (transition, noise)), ("_update", (0.01, position, 0.03))):
+            function = getattr(hand_estimator, name)
+            arrays = parts[:2] if name == "_advance" else parts
+            (function.py_func if plain else function)(*arrays, *more)
+        results.append(parts)
+    for compiled, plain in zip(*results, strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-12)

@@ -1,0 +1,299 @@
+"""The setpoint: bounds that hold whatever the target does, planned stops, and smoothness."""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+import ruckig
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+from wam import STATE
+
+from service.config import Settings, ToolSettings
+from service.contract.messages import PoseStamped
+from service.core.frame import Vector, blank
+from service.core.intake import Intake
+from service.core.setpoint import (
+    HULL_MARGIN,
+    SetpointGenerator,
+    _stop,
+    speed_to_come,
+    stop_distance,
+    tracker_gains,
+)
+from service.core.workspace import Target
+
+PERIOD_S = 0.002
+TOOL = ToolSettings()
+BOX = np.array([[0.2, -0.6, 0.05], [1.0, 0.6, 0.8]])
+MIDDLE = np.array([0.6, 0.0, 0.4])
+FREE = np.zeros((3, 3, 7))  # no joint limits
+WAY_TICKS = round(2.0 / PERIOD_S)  # to come from anywhere to where the targets have gone
+properties = example_settings(max_examples=60, deadline=None, derandomize=True)
+inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
+moving = st.tuples(*(st.floats(-20.0, 20.0),) * 3)
+wild = st.tuples(*(st.floats(-1e4, 1e4),) * 3)
+
+
+def at_rest(position: Vector | tuple[float, ...]) -> Vector:
+    """A motion (3, 3) that stands still at a position."""
+    return np.array([position, (0.0,) * 3, (0.0,) * 3])
+
+
+def driven(
+    targets: list[Vector],
+    *,
+    start: Vector | None = None,
+    tool: ToolSettings = TOOL,
+    costs: Vector = FREE,
+    slow: float = 1.0,
+) -> tuple[Vector, Vector]:
+    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said."""
+    generator, state = SetpointGenerator(Settings(tool=tool)), blank(STATE)
+    generator.begin(state, at_rest(targets[0][0]) if start is None else start)
+    out, said = [state["setpoint"].copy()], []
+    for target in targets:
+        before = state["setpoint"].copy()
+        said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
+        assert generator.why_wrong(state, before, BOX) == ""
+        out.append(state["setpoint"].copy())
+    return np.array(out), np.array(said)
+
+
+def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings = TOOL) -> None:
+    """Speed, acceleration, jerk, workspace, and the box around the last targets."""
+    assert np.isfinite(states).all()
+    assert np.linalg.norm(states[:, 1], axis=1).max() <= tool.max_speed + 1e-9
+    assert np.abs(states[:, 2]).max() <= tool.max_acceleration + 1e-9
+    assert np.abs(np.diff(states[:, 2], axis=0)).max() <= (tool.max_jerk + 1e-6) * PERIOD_S
+    np.testing.assert_allclose(
+        np.diff(states[:, 0], axis=0), 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1]), atol=2e-7
+    )
+    assert (states[:, 0] >= BOX[0] - 1e-9).all()
+    assert (states[:, 0] <= BOX[1] + 1e-9).all()
+    positions = np.array([states[0, 0], *(target[0] for target in targets)])
+    for k in range(0, len(targets), 7):
+        last = positions[max(0, k + 1 - WAY_TICKS) : k + 2]
+        assert (states[k + 1, 0] >= last.min(axis=0) - HULL_MARGIN - 1e-9).all()
+        assert (states[k + 1, 0] <= last.max(axis=0) + HULL_MARGIN + 1e-9).all()
+
+
+# --- bounds ------------------------------------------------------------
+
+
+@properties
+@given(st.lists(st.tuples(inside, moving, wild), min_size=1, max_size=25), st.integers(1, 120))
+def test_every_bound_holds_whatever_is_asked(told: list[tuple[tuple[float, ...], ...]], ticks: int) -> None:
+    targets = [np.array(target) for target in told for _ in range(ticks)]
+    states, _ = driven(targets)
+    assert_bounds_hold(states, targets)
+
+
+@properties
+@given(st.lists(inside, min_size=2, max_size=6), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_targets_that_alternate_or_tremble_make_no_setpoint_run_away(
+    places: list[tuple[float, ...]], ticks: int, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    targets = []
+    for place in itertools.islice(itertools.cycle(places), 1500 // ticks):
+        for _ in range(ticks):
+            position = np.clip(np.array(place) + random.normal(0.0, 0.005, 3), *BOX)
+            targets.append(np.array([position, random.normal(0.0, 2.0, 3), random.normal(0.0, 50.0, 3)]))
+    states, _ = driven(targets)
+    assert_bounds_hold(states, targets)
+
+
+@pytest.mark.parametrize("rate_hz", [30, 60, 100, 250, 500])
+@pytest.mark.parametrize("apart_m", [0.02, 0.09, 0.3])
+def test_what_alternates_is_followed_no_farther_than_it_goes(rate_hz: int, apart_m: float) -> None:
+    every = 500 // rate_hz
+    way = np.array([0.0, apart_m, 0.0])
+    positions = [MIDDLE + way * (k // every % 2) for k in range(3000)]
+    velocity = [way / PERIOD_S / every * (-1.0) ** (k // every) for k in range(3000)]
+    targets = [np.array([p, v, (0.0,) * 3]) for p, v in zip(positions, velocity, strict=True)]
+    states, _ = driven(targets)
+    assert_bounds_hold(states, targets)
+    swing = states[1500:, 0, 1]
+    assert swing.min() >= -HULL_MARGIN - 1e-9
+    assert swing.max() <= apart_m + HULL_MARGIN + 1e-9
+
+
+def test_it_does_not_swing_by_itself() -> None:
+    jolt = [np.array([MIDDLE, (3.0, -2.0, 1.0), (50.0, 0.0, -50.0)])] * 30
+    states, _ = driven([*jolt, *[at_rest(MIDDLE)] * 2000])
+    assert np.abs(states[-200:, 0] - MIDDLE).max() < 1e-5
+    assert np.abs(states[-200:, 1]).max() < 1e-4
+
+
+def test_a_setpoint_from_outside_the_workspace_only_comes_nearer() -> None:
+    start = at_rest((0.05, 0.9, 0.02))
+    targets = [at_rest(MIDDLE)] * 1500
+    states, _ = driven(targets, start=start)
+    off = np.maximum(BOX[0] - states[:, 0], 0.0) + np.maximum(states[:, 0] - BOX[1], 0.0)
+    assert (np.diff(off, axis=0) <= 1e-9).all()
+    np.testing.assert_allclose(states[-1, 0], MIDDLE, atol=1e-4)
+
+
+def test_a_state_beyond_every_limit_is_braked() -> None:
+    fast = np.array([MIDDLE, (2.0, -2.0, 0.0), (3.0, 0.0, -3.0)])
+    states, said = driven([at_rest(MIDDLE)] * 2500, start=fast)
+    assert said[0]
+    assert np.linalg.norm(states[400:, 1], axis=1).max() <= TOOL.max_speed + 1e-9
+    np.testing.assert_allclose(states[-1, 0], MIDDLE, atol=1e-3)
+
+
+def test_lowered_limits_are_kept() -> None:
+    tool = ToolSettings(max_speed=0.2, max_acceleration=1.0, max_jerk=20.0)
+    targets = [at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + 0.2)] * 2000
+    states, _ = driven(targets, tool=tool)
+    assert_bounds_hold(states, targets[:1], tool)
+    np.testing.assert_allclose(states[-1, 0], MIDDLE + 0.2, atol=1e-3)
+
+
+def test_joints_that_cannot_follow_slow_it_down_on_its_way() -> None:
+    costs = np.zeros((3, 3, 7))
+    costs[0, 1, 2] = 1 / 0.1  # a joint that moves the tool along y by 0.1 m/s at most
+    way = np.array([0.1, 0.3, 0.0])
+    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 3000, costs=costs)
+    assert np.abs(states[:, 1, 1]).max() <= 0.1 + 1e-3
+    along = way / np.linalg.norm(way)
+    aside = (states[:, 0] - MIDDLE) - np.outer((states[:, 0] - MIDDLE) @ along, along)
+    assert np.linalg.norm(aside, axis=1).max() < 0.002
+    np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-3)
+
+
+def test_a_setpoint_that_passed_a_bound_is_found() -> None:
+    generator, state = SetpointGenerator(Settings()), blank(STATE)
+    generator.begin(state, at_rest(MIDDLE))
+    before = state["setpoint"].copy()
+    for what, row, value in (("speed", 1, 0.9), ("acceleration", 2, 4.1), ("jerk", 2, 1.0), ("position", 0, 9.0)):
+        state["setpoint"] = before
+        state["setpoint"][row, 0] = value
+        assert generator.why_wrong(state, before, BOX) == what
+    state["setpoint"][0, 0] = np.nan
+    assert generator.why_wrong(state, before, BOX) == "not finite"
+
+
+# --- stops ------------------------------------------------------------
+
+
+@properties
+@given(st.floats(-0.8, 0.8), st.floats(-4.0, 4.0), st.floats(0.5, 4.0), st.floats(20.0, 200.0))
+def test_the_fastest_stop_of_an_axis_is_that_of_another_implementation(
+    velocity: float, acceleration: float, hardest: float, sharpest: float
+) -> None:
+    acceleration = max(-hardest, min(hardest, acceleration))
+    profile = ruckig_stop(velocity, acceleration, hardest, sharpest)
+    out = np.empty(5)
+    _stop(velocity, acceleration, hardest, sharpest, PERIOD_S, out)
+    position, speed, change = (value[0] for value in profile.at_time(min(PERIOD_S, profile.duration)))
+    np.testing.assert_allclose(out[:3], [speed, change, position], atol=1e-7)
+    extrema = profile.position_extrema[0]
+    np.testing.assert_allclose(out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0)], atol=1e-7)
+
+
+def ruckig_stop(velocity: float, acceleration: float, hardest: float, sharpest: float) -> ruckig.Trajectory:
+    """Ruckig's stop of one axis from 0."""
+    question, profile = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    question.control_interface = ruckig.ControlInterface.Velocity
+    question.current_velocity, question.current_acceleration = [velocity], [acceleration]
+    question.target_velocity = [0.0]
+    question.max_velocity, question.max_acceleration, question.max_jerk = [9.0], [hardest], [sharpest]
+    ruckig.Ruckig(1).calculate(question, profile)
+    return profile
+
+
+@properties
+@given(st.floats(0.01, 0.8), st.floats(0.0, 4.0))
+def test_the_way_of_a_stop_is_that_of_the_fastest_one(speed: float, acceleration: float) -> None:
+    profile = ruckig_stop(speed, acceleration, 4.0, 200.0)
+    assert stop_distance(speed, acceleration, 4.0, 200.0) == pytest.approx(profile.position_extrema[0].max, abs=1e-7)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)])
+@pytest.mark.parametrize("distance_m", [0.01, 0.1, 0.3])
+def test_a_jump_is_approached_without_overshoot(direction: tuple[float, ...], distance_m: float) -> None:
+    way = distance_m * np.array(direction) / np.linalg.norm(direction)
+    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 2000)
+    assert ((states[:, 0] - MIDDLE) @ way / distance_m).max() <= distance_m + 0.0025
+    np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
+
+
+def test_a_target_that_stops_at_once_is_overshot_by_millimetres() -> None:
+    velocity = np.array([0.3, -0.4, 0.0])
+    run = [np.array([MIDDLE + velocity * (k * PERIOD_S - 0.4), velocity, (0.0,) * 3]) for k in range(200)]
+    states, _ = driven([*run, *[at_rest(MIDDLE)] * 500])
+    assert ((states[:, 0] - MIDDLE) @ velocity / 0.5).max() < 0.02
+    assert np.linalg.norm(states[300:, 0] - MIDDLE, axis=1).max() < 0.02
+
+
+# --- quiet motion ------------------------------------------------------------
+
+
+def test_a_target_that_moves_steadily_is_followed_close() -> None:
+    velocity = np.array([0.1, -0.05, 0.03])
+    targets = [np.array([MIDDLE + velocity * k * PERIOD_S, velocity, (0.0,) * 3]) for k in range(1200)]
+    states, _ = driven(targets)
+    assert np.linalg.norm(states[-1, 0] - targets[-1][0]) < 0.012
+    assert np.abs(states[-200:, 2]).max() < 1e-3
+
+
+def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:
+    states, said = driven([at_rest(MIDDLE)] * 100)
+    np.testing.assert_array_equal(states, np.broadcast_to(states[0], states.shape))
+    assert not said.any()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_reach_that_a_noisy_tracker_sees_is_followed_smoothly(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    settings = Settings()
+    intake, generator, state = Intake(settings), SetpointGenerator(settings), blank(STATE)
+    intake.begin(state)
+    generator.begin(state, at_rest(MIDDLE))
+    setpoints, truth = [], []
+    for tick in range(1500):
+        intake.advance(state, 1)
+        u = min(max((tick * PERIOD_S - 0.5) / 1.5, 0.0), 1.0)
+        here = MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * np.array([0.2, -0.15, 0.1])
+        if tick % 5 == 0:
+            seen = (here + random.normal(0.0, 0.0005, 3)).tolist()
+            intake.take_hand(state, 0, PoseStamped(1 + tick, "base", tuple(seen), (0.0, 0.0, 0.0, 1.0)))
+        generator.step(state, Target(*state["hands"][0], clamped=False), BOX, FREE, 1.0)
+        setpoints.append(state["setpoint"].copy())
+        truth.append(here)
+    moved, asked = np.array(setpoints), np.array(truth)
+    assert np.sqrt(np.mean(np.sum((moved[:, 0] - asked) ** 2, axis=1))) < 0.008
+    needed = np.sqrt(np.mean(np.sum(np.gradient(np.gradient(asked, PERIOD_S, axis=0), PERIOD_S, axis=0) ** 2, axis=1)))
+    assert np.sqrt(np.mean(np.sum(moved[:, 2] ** 2, axis=1))) < 4 * needed
+
+
+def test_more_weight_on_jerk_makes_gains_smaller() -> None:
+    soft, hard = tracker_gains(1e-8), tracker_gains(1e-9)
+    assert (np.abs(soft[[0, 3, 4]]) < np.abs(hard[[0, 3, 4]])).all()
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"jerk_weight": 0.0}, ToolSettings)
+
+
+def test_the_speed_to_come_counts_what_an_acceleration_still_adds() -> None:
+    assert speed_to_come(np.array([0.3, 0.0, 0.4]), np.zeros(3), 200.0) == pytest.approx(0.5)
+    assert speed_to_come(np.zeros(3), np.array([4.0, 0.0, 0.0]), 200.0) == pytest.approx(0.04)
+
+
+def test_going_on_from_a_copy_of_the_state_gives_the_same_bits() -> None:
+    random = np.random.default_rng(5)
+    targets = [np.array([random.uniform(*BOX), *random.normal(0.0, 1.0, (2, 3))]) for _ in range(60)]
+    generator, state = SetpointGenerator(Settings()), blank(STATE)
+    generator.begin(state, at_rest(MIDDLE))
+    for target in targets[:30]:
+        generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
+    other, copy = SetpointGenerator(Settings()), state.copy()
+    for target in targets[30:]:
+        generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
+        other.step(copy, Target(*target, clamped=False), BOX, FREE, 1.0)
+    assert state.tobytes() == copy.tobytes()
