@@ -23,9 +23,7 @@ from service.core.setpoint import SetpointGenerator
 from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp
 
-TOO_FAST_S = (
-    0.03  # for so long the tool must be too fast to be a fault: an arm that catches up after a late command is not
-)
+TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 

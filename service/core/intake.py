@@ -30,9 +30,7 @@ def _stale_ticks(key: str, settings: Settings) -> int:
 
 
 class Intake:
-    """Hand and arm samples into the state: a constant-acceleration Kalman filter for each hand, the
-    newest sample of the arm.
-    """
+    """Hand and arm samples into the state: each hand's estimate, the arm's newest sample."""
 
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands

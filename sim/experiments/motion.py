@@ -25,11 +25,16 @@ from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, rea
 from sim.experiments.rehearsal import shipped
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
 
-PEOPLE, SECONDS, STOPS, REACHES = 3, 20.0, 24, 1
+PEOPLE, SECONDS, STOPS, REACHES = 3, 18.0, 24, 1
 SETTLED_MM = 5.0
-WEIGHTS = (6e-10, 1e-8, 4e-8)  # of jerk, besides the default: the trade-off
+WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
+LABELS = {
+    "ours": "ours, by weight of jerk (ringed: the default)",
+    "chase": "One-Euro filter, then Ruckig after the target",
+    "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
+}
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
 
 
@@ -224,7 +229,7 @@ def _draw(results: Results, table: dict[str, dict[str, dict[str, float]]], floor
         for family, (colour, marker) in styles.items():
             rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
             points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
-            label = {"ours": "ours, by weight of jerk", "chase": "One-Euro, then chase by Ruckig"}.get(family, family)
+            label = LABELS.get(family, family)
             panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
             if family == "ours":
                 chosen = rows["ours"]
@@ -238,7 +243,7 @@ def _draw(results: Results, table: dict[str, dict[str, dict[str, float]]], floor
         )
         panel.set(xscale="log", xlabel="jerk, times the truth's", ylabel="error, rms [mm]", ylim=(0, None))
         panel.set_title({"clean": "clean, 100 Hz", "recorded": "as a camera sees them, 30 Hz"}[group])
-    axes[0].legend(frameon=False, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     results.figure(figure)
 
 

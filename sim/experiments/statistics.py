@@ -25,10 +25,7 @@ from sim.scene import GRASP_DISTANCE
 
 SCENES, LIVE_SCENES = 100, 3
 DEMONSTRATIONS = 5
-OURS_HZ, RIVALS_HZ = (
-    500,
-    125,
-)  # rivals at a lower rate, to save time: it changes errors by 2 mm at most, ours and theirs
+OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
 METHODS = {
     "ours": "KMP, taught places\n(the service)",
     "gaussian_process": "Gaussian process,\nsame places",
