@@ -61,9 +61,7 @@ class ToolSettings(Section, frozen=True):
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
-    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = (
-        2.8e-9  # [s⁶] against the squared error: smoothness
-    )
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk², beside error²
 
 
 class ArmSettings(Section, frozen=True):

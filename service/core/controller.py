@@ -8,14 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 
 from service.config import Settings
+from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.arm import Arm, Kinematics, slow_down
-from service.core.frame import Frame, Lap, Record, Tick, Vector, blank, frame_layout, frozen, no_lap, state_layout
+from service.core.frame import (
+    Event,
+    Frame,
+    Lap,
+    Record,
+    Tick,
+    Vector,
+    blank,
+    frame_layout,
+    frozen,
+    no_lap,
+    state_layout,
+)
 from service.core.intake import Intake
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
@@ -23,6 +38,7 @@ from service.core.setpoint import SetpointGenerator
 from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp
 
+REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -42,8 +58,7 @@ class Controller:
     """Five stages in a row: intake, skill, setpoint, arm, limiter.
 
     `Controller(settings, skill, state)` goes on bit for bit from where another controller's `state`
-    was taken. `urdf` is the text of
-    the arm's description.
+    was taken. `urdf` is the text of the arm's description.
     """
 
     def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
@@ -252,3 +267,18 @@ def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap:
         frame = controller.step(tick, lap)
         for tap in taps:
             tap(tick, frame)
+
+
+def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
+    """Lets a controller that is thrown away follow two hands for a moment.
+
+    What its stages compile, or load compiled from disk, is then there: the first hand that a loop
+    sees would otherwise stop it for a fifth of a second, the first ever for many seconds.
+    """
+    arm = msgspec.structs.replace(settings.arm, source="assumed")
+    controller = Controller(msgspec.structs.replace(settings, arm=arm), replace(skill, threshold=math.inf), urdf=urdf)
+    for index in range(REHEARSED_TICKS):
+        stamp_ns = round(1e9 * (1 + index * settings.period_s))
+        sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
+        controller.step(Tick(index, tuple(hands)))

@@ -25,7 +25,7 @@ from service.contract import cdr, channels
 from service.contract.messages import Attachment, WireError
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
-from service.core.controller import Controller, run
+from service.core.controller import Controller, rehearse, run
 from service.core.frame import TIMING, Event, Frame, Tick, blank, frame_layout, order
 from service.core.outputs import outgoing
 from service.core.skill import Skill
@@ -53,7 +53,9 @@ class Daemon:
         self._scribe = scribe
         self._stop = threading.Event()
         self._ended = threading.Event()
-        self._controller = Controller(settings, skill, urdf=robot_description(settings))
+        urdf = robot_description(settings)
+        rehearse(settings, skill, urdf=urdf)
+        self._controller = Controller(settings, skill, urdf=urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
