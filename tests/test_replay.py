@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import ASSUMED, ticks_of
+from tests_paths import RECORDINGS
 from wam import URDF
 
 from service.contract.records import Mode, Reason
@@ -25,7 +26,6 @@ from sim.golden import refresh
 from sim.scene import Scene
 from sim.script import HandScript
 
-RECORDINGS = Path(__file__).parent.parent / "recordings"
 GOLDEN = RECORDINGS / "golden.mcap"
 
 

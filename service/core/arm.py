@@ -60,14 +60,14 @@ class Solution(NamedTuple):
 class Kinematics(NamedTuple):
     """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
 
-    The Jacobian (6, J) of the tool, linear rows first; the tasks (5, J): tool velocity, and turning
-    of its axis weighed by DIRECTION_LEVER; their damping [m²].
+    `across` (2, 3): what of a turn moves the tool's direction, times DIRECTION_LEVER; the tasks
+    (5, J): tool velocity, and that turning; their damping [m²].
     """
 
     joints: Vector
     position: Vector
     rotation: Vector
-    jacobian: Vector
+    across: Vector
     tasks: Vector
     damping: float
 
@@ -91,7 +91,6 @@ class Arm:
         self._data = self._model.createData()
         self._braking = CLOSING_BRAKES * settings.tool.max_acceleration
         self._closing_speed = min(settings.tool.max_speed, CLOSING_SPEED)
-        self._far_damping = FAR_DAMPING
         self._period = settings.period_s
         self._ahead = 1.0 / (1.0 + POSITION_GAIN * settings.period_s)  # the error decays as it will be, not as it is
         limits = settings.joints
@@ -125,18 +124,16 @@ class Arm:
         jacobian = self._jacobian(q)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
         rotation = placement.rotation.copy()
-        across = DIRECTION_LEVER * rotation[:, :2].T  # turning about the tool's x and y moves its direction
+        across = DIRECTION_LEVER * rotation[:, :2].T
         tasks = np.concatenate((jacobian[:3], across @ jacobian[3:]))
-        return Kinematics(q, placement.translation.copy(), rotation, jacobian, tasks, _damping(jacobian[:3]))
+        return Kinematics(q, placement.translation.copy(), rotation, across, tasks, _damping(jacobian[:3]))
 
     def costs(self, here: Kinematics) -> Vector:
-        """What a tool velocity, acceleration and jerk cost of each joint's limit:
+        """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
 
-        (3, 3, J), 1 for all of it.
-
-        By order of the derivative, then by axis. The tool's direction is kept.
+        (3, 3, J): by order of the derivative, then by axis. The tool's direction is kept.
         """
-        out = np.empty((3, *here.jacobian[:3].shape))
+        out = np.empty((3, 3, len(here.joints)))
         _joint_costs(here.tasks * self._scale, here.damping, self._limits, out)
         return out
 
@@ -156,12 +153,11 @@ class Arm:
         error = np.minimum(np.maximum(position - here.position, -10.0), 10.0) - self._period * linear
         closing = self._approach(error)
         _add_closing(linear, self._ahead * closing, self._most)
-        across = DIRECTION_LEVER * here.rotation[:, :2].T
-        wanted = np.concatenate((linear, across @ _turn(here.rotation[:, 2], direction)))
+        wanted = np.concatenate((linear, here.across @ _turn(here.rotation[:, 2], direction)))
         posture = np.minimum(np.maximum(POSTURE_GAIN * (self._posture - q), -POSTURE_SPEED), POSTURE_SPEED)
         fastest = self._gain * np.maximum(self._upper - q, 0.0)
         slowest = self._gain * np.minimum(self._lower - q, 0.0)
-        damping = here.damping + self._far_damping * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
+        damping = here.damping + FAR_DAMPING * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
         scale = self._scale
         bounds = (slowest / scale, fastest / scale)
         result = scale * _least_squares(here.tasks * scale, wanted, posture / scale, damping, bounds)
@@ -306,9 +302,8 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 
 @compiled
 def _joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> None:
-    """Joint speeds per tool velocity, by damped least squares, as shares of limits (3, J):
-
-    (3, 3, J).
+    """Into out (3, 3, J): joint speeds per tool velocity, by damped least squares, as shares of
+    limits (3, J).
     """
     joints = tasks.shape[1]
     root, right = np.empty((5, 5)), np.zeros((5, 3))

@@ -70,6 +70,7 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
+        fresh = self.is_fresh(state, side)
         cause: Cause | None = None
         if not (finite(sample.position) and finite(sample.orientation)):
             cause = Cause.NOT_FINITE
@@ -78,14 +79,11 @@ class Intake:
         elif math.hypot(*(position := self._in_base(sample.position)).tolist()) > FARTHEST_M:
             cause = Cause.OUT_OF_RANGE
         else:
-            cause = self._why_not_newer(
-                sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=self.is_fresh(state, side)
-            )
+            cause = self._why_not_newer(sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=fresh)
         if cause is not None:
             state["rejected"][cause] += 1
             return
         since = int(state["tick"]) - int(state["hand_ticks"][side])
-        fresh = self.is_fresh(state, side)
         self._estimator.take(state, side, position, interval_s=since * self._period_s, fresh=fresh)
         state["hand_stamps_ns"][side] = sample.stamp_ns
         state["hand_ticks"][side] = state["tick"]
