@@ -35,7 +35,7 @@ class Reason(enum.IntEnum):
     ARM_NOT_READY = 5
     ARM_ERROR = 6
     ARM_SILENT = 7
-    TOOL_SPEED = 8  # measured
+    TOOL_SPEED = 8  # measured, or commanded in spite of all bounds
     SETPOINT = 9  # passed a bound of its own, which cannot be
 
 

@@ -37,7 +37,7 @@ SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 t
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
 FAR_SPEED = 0.15  # [m/s]
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
-SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
+SPARING = 0.3  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
 PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
@@ -91,11 +91,13 @@ class Arm:
         self._data = self._model.createData()
         self._braking = CLOSING_BRAKES * settings.tool.max_acceleration
         self._closing_speed = min(settings.tool.max_speed, CLOSING_SPEED)
+        self._far_damping = FAR_DAMPING
         self._period = settings.period_s
         self._ahead = 1.0 / (1.0 + POSITION_GAIN * settings.period_s)  # the error decays as it will be, not as it is
         limits = settings.joints
         self._lower, self._upper = np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN
         self._velocity = np.array(limits.velocity)
+        self._jerk = np.array(limits.jerk)
         self._gain = approach_gain(limits)
         self._posture = np.array(settings.arm.posture)
         acceleration = np.array(limits.acceleration)
@@ -137,6 +139,13 @@ class Arm:
         _joint_costs(here.tasks * self._scale, here.damping, self._limits, out)
         return out
 
+    def speeds(self, here: Kinematics, dq: Vector, ddq: Vector) -> tuple[float, float]:
+        """Speed of the tool [m/s] at joint velocities and accelerations (J,) [rad/s, rad/s²]; and
+        the most it comes to as these accelerations are brought to 0.
+        """
+        found: tuple[float, float] = _speeds(here.tasks, dq, ddq, self._jerk)
+        return found
+
     def step(
         self, q: Vector, position: Vector, velocity: Vector, direction: Vector, here: Kinematics | None = None
     ) -> Solution:
@@ -157,7 +166,7 @@ class Arm:
         posture = np.minimum(np.maximum(POSTURE_GAIN * (self._posture - q), -POSTURE_SPEED), POSTURE_SPEED)
         fastest = self._gain * np.maximum(self._upper - q, 0.0)
         slowest = self._gain * np.minimum(self._lower - q, 0.0)
-        damping = here.damping + FAR_DAMPING * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
+        damping = here.damping + self._far_damping * max(math.hypot(*closing) - FAR_SPEED, 0.0) ** 2
         scale = self._scale
         bounds = (slowest / scale, fastest / scale)
         result = scale * _least_squares(here.tasks * scale, wanted, posture / scale, damping, bounds)
@@ -275,6 +284,21 @@ def slow_down(gap: Vector, velocity: Vector) -> float:
     if float(gap @ velocity) <= 0.0:
         return 1.0
     return 1.0 / (1.0 + max(0.0, math.hypot(*gap) - GAP_FREE) / GAP_SLOW)
+
+
+@compiled
+def _speeds(tasks: Vector, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float]:
+    """Speed now, and the greater of it and that of the crest, when the accelerations are 0."""
+    now = crest = 0.0
+    for axis in range(3):
+        v = v_crest = 0.0
+        for joint in range(len(dq)):
+            v += tasks[axis, joint] * dq[joint]
+            gained = ddq[joint] * abs(ddq[joint]) / (2.0 * jerk[joint])
+            v_crest += tasks[axis, joint] * (dq[joint] + gained)
+        now += v * v
+        crest += v_crest * v_crest
+    return math.sqrt(now), math.sqrt(max(now, crest))
 
 
 @compiled

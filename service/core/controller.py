@@ -71,6 +71,7 @@ class Controller:
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
+        self._here: Kinematics | None = None  # of the joints asked about last
 
     @property
     def state(self) -> Record:
@@ -96,25 +97,23 @@ class Controller:
         lap("skill")
         self._decide(prediction)
         flags = Flag(0)
-        joints, velocities, accelerations = state["joints"]
-        following = state["mode"] == Mode.FOLLOW and target is not None
-        if following and target is not None:
-            here = self._arm.at(joints)
+        joints, moving = state["joints"], self._is_moving()
+        if state["mode"] == Mode.FOLLOW and target is not None:
+            here = self._arm_at(joints[0])
             met = self._lead(target, here)
             lap("setpoint")
             setpoint = state["setpoint"]
-            wanted = self._arm.step(joints, setpoint[0], setpoint[1], self._direction, here)
+            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here)
             lap("arm")
-            limited = self._limiter.step(joints, velocities, accelerations, wanted.velocity)
+            limited = self._move(wanted.velocity)
             flags |= Flag.TARGET_CLAMPED * target.clamped
-            flags |= Flag.SPEED_LIMITED * (met or wanted.speed_limited or limited.limited)
+            flags |= Flag.SPEED_LIMITED * (met or wanted.speed_limited or limited)
             flags |= Flag.NEAR_JOINT_LIMIT * wanted.near_limit
-            state["joints"] = limited[:3]
         else:
-            state["joints"] = self._limiter.stop(joints, velocities, accelerations)[:3]
+            state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
             self._setpoint.begin(state, self._at_rest())
         lap("limiter")
-        return self._frame(prediction, target, flags)
+        return self._frame(prediction, target, flags, moving=moving)
 
     def _take_in(self, tick: Tick) -> None:
         state = self._state
@@ -227,6 +226,30 @@ class Controller:
             state["setpoint"] = before
         return bool(met)
 
+    def _move(self, wanted: Vector) -> bool:
+        """Moves the joints on toward wanted velocities (J,) [rad/s]; whether a limit kept them from
+        those.
+
+        They brake where the tool would pass its greatest speed; one that does all the same is a
+        fault.
+        """
+        state, fastest = self._state, self._settings.tool.max_speed
+        q, dq, ddq = state["joints"]
+        moved = self._limiter.step(q, dq, ddq, wanted)
+        limited = moved.limited
+        if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
+            moved, limited = self._limiter.stop(q, dq, ddq), True
+            if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0] > fastest:
+                state["mode"], state["reason"] = Mode.FAULT, Reason.TOOL_SPEED
+        state["joints"] = moved[:3]
+        return limited
+
+    def _arm_at(self, joints: Vector) -> Kinematics:
+        """The arm at joints (J,) [rad]; asked again for the same ones, it is not computed again."""
+        if self._here is None or (self._here.joints != joints).any():
+            self._here = self._arm.at(joints)
+        return self._here
+
     def _is_moving(self) -> bool:
         """Whether the commanded joints have not come to rest."""
         return bool(self._state["joints"][1:].any())
@@ -234,9 +257,10 @@ class Controller:
     def _at_rest(self) -> Vector:
         """The setpoint (3, 3) that goes with the commanded joints."""
         joints, velocities = self._state["joints"][:2]
-        return np.stack([self._arm.pose(joints)[0], self._arm.velocity(joints, velocities), np.zeros(3)])
+        here = self._arm_at(joints)
+        return np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)])
 
-    def _frame(self, prediction: Prediction | None, target: Target | None, flags: Flag) -> Frame:
+    def _frame(self, prediction: Prediction | None, target: Target | None, flags: Flag, *, moving: bool) -> Frame:
         state, frame = self._state, blank(self._layout)
         seen = state["hand_ticks"]
         frame["tick"] = state["tick"]
@@ -251,9 +275,9 @@ class Controller:
             frame["covariance"], frame["deviation"] = prediction.covariance, prediction.deviation
         frame["orientation"] = self._skill.orientation
         frame["joints"], frame["joint_velocities"], frame["joint_accelerations"] = state["joints"]
-        frame["tool"] = self._arm.pose(state["joints"][0])[0]
+        frame["tool"] = self._arm_at(state["joints"][0]).position
         frame["mode"], frame["reason"], frame["flags"] = state["mode"], state["reason"], flags
-        frame["commanded"] = self._is_moving() or (state["arm_ready"] and state["mode"] != Mode.FAULT)
+        frame["commanded"] = moving or (state["arm_ready"] and state["mode"] != Mode.FAULT)
         frame["rejected"] = state["rejected"]
         return frozen(frame)
 

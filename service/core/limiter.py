@@ -9,16 +9,20 @@ wanted velocities.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import ruckig
 
 from service.config import JointSettings
+from service.core.compiled import compiled
 from service.core.frame import Vector
+from service.core.stops import fastest_stop, stop_together
 
-DECIMALS = 9  # [rad] of the positions: rounded so that a replay on another kind of CPU agrees
+STEPS = 1e9  # [1/rad] of the positions: rounded so that a replay on another kind of CPU agrees
+LARGEST = 1e6  # of any number of a state that is calculated with
+BOUNDED, CHASED = 1, 2  # what `_toward` says: the wanted velocity was cut; some joint cannot have it in a tick
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
@@ -53,11 +57,9 @@ class Limiter:
 
     def __init__(self, limits: JointSettings, period_s: float) -> None:
         self._period = period_s
-        self._lower, self._upper = np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN
-        self._velocity = np.array(limits.velocity) * (1.0 - 1e-12)  # leaves room for rounding
-        self._acceleration = np.array(limits.acceleration)
-        self._jerk = np.array(limits.jerk)
-        self._jerk_step = self._jerk * period_s
+        self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
+        self._limits = np.array([limits.velocity, limits.acceleration, limits.jerk])
+        self._limits[0] *= 1.0 - 1e-12  # leaves room for rounding
         self._gain = approach_gain(limits)
         count = len(limits.velocity)
         self._ruckig = ruckig.Ruckig(count)
@@ -68,8 +70,6 @@ class Limiter:
         self._input.max_acceleration = list(limits.acceleration)
         self._input.max_jerk = list(limits.jerk)
         self._trajectory = ruckig.Trajectory(count)
-        self._rest = [0.0] * count
-        self._origin = np.zeros(count)
 
     def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited:
         """The joints one period later on the way to `velocity`; all (J,) [rad, rad/s, rad/s²].
@@ -77,109 +77,113 @@ class Limiter:
         A NaN in `velocity` means stop. A state that is not finite stays as it is, at velocity 0.
         Never raises.
         """
-        if not _usable(q, dq, ddq):
-            return _frozen(q.copy(), np.zeros(len(q)), np.zeros(len(q)), limited=True)
-        wanted, bounded = self._within_bounds(q, velocity)
-        position, speed, acceleration, linear = self._linear(q, dq, ddq, wanted)
-        if not linear.all():
-            chased = self._profile(q, dq, ddq, wanted.tolist())
-            position = np.where(linear, position, chased[0])
-            speed = np.where(linear, speed, chased[1])
-            acceleration = np.where(linear, acceleration, chased[2])
-        position = position.round(DECIMALS)
-        lowest, highest = self._stop_range(position, speed, acceleration)
-        safe = (highest <= np.maximum(self._upper, q)) & (lowest >= np.minimum(self._lower, q))
-        if not safe.all():
-            stop = self.stop(q, dq, ddq)
-            position = np.where(safe, position, stop.position)
-            speed = np.where(safe, speed, stop.velocity)
-            acceleration = np.where(safe, acceleration, stop.acceleration)
-        return _frozen(position, speed, acceleration, limited=bounded or not linear.all() or not safe.all())
+        state = np.stack((q, dq, ddq))
+        if not _usable(state):
+            return _stuck(q)
+        moved, wanted = np.empty_like(state), np.empty_like(q)
+        met = _toward(state, velocity, self._within, self._gain, self._limits, self._period, wanted, moved)
+        if met & CHASED:
+            self._chase(state, wanted, moved)
+        safe = _make_safe(state, moved, self._within, self._limits, self._period)
+        return _frozen(moved, limited=met > 0 or not safe)
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
-        """The joints one period later on the fastest way to rest; `limited` until they are.
+        """The joints one period later on the way to rest, at which all come at once and as soon as
+        they can: so the tool slows down along its way. `limited` until they are there.
 
         Never raises.
         """
-        if not _usable(q, dq, ddq):
-            return _frozen(q.copy(), np.zeros(len(q)), np.zeros(len(q)), limited=True)
-        position, velocity, acceleration = self._profile(q, dq, ddq, self._rest)
-        return _frozen(position.round(DECIMALS), velocity, acceleration, limited=bool(velocity.any()))
+        state = np.stack((q, dq, ddq))
+        if not _usable(state):
+            return _stuck(q)
+        moved = stop_together(dq, ddq, self._limits[1], self._limits[2], self._period)
+        moved[0] += q
+        _make_safe(state, moved, self._within, self._limits, self._period)
+        return _frozen(moved, limited=bool(moved[1].any()))
 
-    def _within_bounds(self, q: Vector, velocity: Vector) -> tuple[Vector, bool]:
-        """The wanted velocity (J,) within speed limits, slower near position limits; whether that
-        changed it.
+    def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
+        """Puts those joints of `moved` (3, J) that are NaN one period along Ruckig's profile to the
+        wanted velocities (J,), or on the fastest stop where there is none.
         """
-        if np.isnan(velocity).any():
-            return np.zeros(len(q)), True
-        fastest = np.minimum(self._velocity, self._gain * np.maximum(self._upper - q, 0.0))
-        slowest = np.maximum(-self._velocity, self._gain * np.minimum(self._lower - q, 0.0))
-        wanted = np.minimum(np.maximum(velocity, slowest), fastest)
-        return wanted, bool((wanted != velocity).any())
-
-    def _linear(
-        self, q: Vector, dq: Vector, ddq: Vector, wanted: Vector
-    ) -> tuple[Vector, Vector, Vector, npt.NDArray[np.bool_]]:
-        """Each joint one tick on at the jerk that reaches the wanted velocity; and which may.
-
-        A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
-        profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
-        """
-        acceleration = (wanted - dq) / self._period
-        change = acceleration - ddq
-        velocity = dq + (0.5 * self._period) * (ddq + acceleration)
-        position = q + self._period * (dq + self._period * (ddq / 3.0 + acceleration / 6.0))
-        size = np.abs(acceleration)
-        crest = np.abs(velocity + acceleration * size / (2.0 * self._jerk))  # the speed when acceleration has come to 0
-        allowed = (np.abs(change) <= self._jerk_step) & (size <= self._acceleration) & (crest <= self._velocity)
-        return position, velocity, acceleration, allowed & (np.abs(velocity) <= self._velocity)
-
-    def _profile(self, q: Vector, dq: Vector, ddq: Vector, target: list[float]) -> tuple[Vector, Vector, Vector]:
-        """One period along Ruckig's profile to the target velocities, or on a stop by hand where
-        there is none.
-        """
-        if self._calculate(q, dq, ddq, target) or self._calculate(q, dq, ddq, self._rest):
-            position, velocity, acceleration = self._trajectory.at_time(self._period)
-            return np.array(position), np.array(velocity), np.array(acceleration)
-        return self._stop_by_hand(q, dq, ddq)
-
-    def _stop_range(self, q: Vector, dq: Vector, ddq: Vector) -> tuple[Vector, Vector]:
-        """Lowest and highest position (J,) [rad] of a stop; unbounded where there is none."""
-        # Ruckig's extrema of a velocity profile count 0 among the positions, so each joint stops as
-        # from there.
-        if not self._calculate(self._origin, dq, ddq, self._rest):
-            return np.full(len(q), -np.inf), np.full(len(q), np.inf)
-        extrema = self._trajectory.position_extrema
-        return q + np.array([bound.min for bound in extrema]), q + np.array([bound.max for bound in extrema])
-
-    def _calculate(self, q: Vector, dq: Vector, ddq: Vector, target: list[float]) -> bool:
-        """Whether Ruckig found a profile; it is then in `_trajectory`."""
-        self._input.current_position = q.tolist()
-        self._input.current_velocity = dq.tolist()
-        self._input.current_acceleration = ddq.tolist()
-        self._input.target_velocity = target
+        self._input.current_position, self._input.current_velocity, self._input.current_acceleration = state.tolist()
+        self._input.target_velocity = wanted.tolist()
         try:
             self._ruckig.calculate(self._input, self._trajectory)
         except (ruckig.RuckigError, ValueError):  # ValueError: a result that the binding has no name for
-            return False
-        return True
-
-    def _stop_by_hand(self, q: Vector, dq: Vector, ddq: Vector) -> tuple[Vector, Vector, Vector]:
-        """One tick of a stop that jerk allows at once; for states from which Ruckig finds none."""
-        speed = np.abs(dq)
-        brake = np.minimum(np.minimum(self._acceleration, np.sqrt(2.0 * self._jerk * speed)), speed / self._period)
-        change = np.minimum(np.maximum(-np.sign(dq) * brake - ddq, -self._jerk_step), self._jerk_step)
-        acceleration = ddq + change
-        velocity = dq + 0.5 * self._period * (ddq + acceleration)
-        return q + self._period * 0.5 * (dq + velocity), velocity, acceleration
+            return
+        np.copyto(moved, self._trajectory.at_time(self._period), where=np.isnan(moved))
 
 
-def _usable(q: Vector, dq: Vector, ddq: Vector) -> bool:
+@compiled
+def _toward(
+    state: Vector,
+    velocity: Vector,
+    within: Vector,
+    gain: Vector,
+    limits: Vector,
+    dt: float,
+    wanted: Vector,
+    moved: Vector,
+) -> int:
+    """Into `wanted` (J,) the velocity within speed limits, slower near position limits; into
+    `moved` (3, J) each joint one tick on at the jerk that reaches it, NaN where a limit forbids.
+
+    A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
+    profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
+    """
+    met, stopping = 0, False
+    for i in range(len(velocity)):
+        stopping = stopping or math.isnan(velocity[i])
+    for i in range(len(velocity)):
+        q, v, a = state[0, i], state[1, i], state[2, i]
+        fastest = min(limits[0, i], gain[i] * max(within[1, i] - q, 0.0))
+        slowest = max(-limits[0, i], gain[i] * min(within[0, i] - q, 0.0))
+        wanted[i] = 0.0 if stopping else min(max(velocity[i], slowest), fastest)
+        if wanted[i] != velocity[i]:
+            met |= BOUNDED
+        acceleration = (wanted[i] - v) / dt
+        v_then = v + 0.5 * dt * (a + acceleration)
+        crest = v_then + acceleration * abs(acceleration) / (2.0 * limits[2, i])  # when acceleration has come to 0
+        if (
+            abs(acceleration - a) <= limits[2, i] * dt
+            and abs(acceleration) <= limits[1, i]
+            and max(abs(v_then), abs(crest)) <= limits[0, i]
+        ):
+            moved[0, i] = q + dt * (v + dt * (a / 3.0 + acceleration / 6.0))
+            moved[1, i], moved[2, i] = v_then, acceleration
+        else:
+            moved[0, i] = moved[1, i] = moved[2, i] = math.nan
+            met |= CHASED
+    return met
+
+
+@compiled
+def _make_safe(state: Vector, moved: Vector, within: Vector, limits: Vector, dt: float) -> bool:
+    """Rounds the moved joints (3, J); those that could not stop within their position limits after
+    it, or that are NaN, go on the fastest stop instead. Whether there were none.
+    """
+    safe, stop = True, np.empty(6)
+    for i in range(moved.shape[1]):
+        moved[0, i] = np.rint(moved[0, i] * STEPS) / STEPS
+        fastest_stop(moved[1, i], moved[2, i], limits[1, i], limits[2, i], dt, stop)
+        lowest, highest = min(within[0, i], state[0, i]), max(within[1, i], state[0, i])
+        if not (moved[0, i] + stop[3] >= lowest and moved[0, i] + stop[4] <= highest):
+            safe = False
+            fastest_stop(state[1, i], state[2, i], limits[1, i], limits[2, i], dt, stop)
+            moved[0, i] = np.rint((state[0, i] + stop[2]) * STEPS) / STEPS
+            moved[1, i], moved[2, i] = stop[0], stop[1]
+    return safe
+
+
+def _usable(state: Vector) -> bool:
     """Whether a state is finite, and small enough to calculate with: false for NaN too."""
-    return bool(np.abs(np.concatenate((q, dq, ddq))).max() < 1e6)
+    return bool(np.abs(state).max() < LARGEST)
 
 
-def _frozen(position: Vector, velocity: Vector, acceleration: Vector, *, limited: bool) -> Limited:
-    for array in (position, velocity, acceleration):
-        array.setflags(write=False)
-    return Limited(position, velocity, acceleration, limited)
+def _stuck(q: Vector) -> Limited:
+    return _frozen(np.stack((q, np.zeros(len(q)), np.zeros(len(q)))), limited=True)
+
+
+def _frozen(moved: Vector, *, limited: bool) -> Limited:
+    moved.setflags(write=False)
+    return Limited(moved[0], moved[1], moved[2], limited)

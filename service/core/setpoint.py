@@ -23,9 +23,10 @@ from scipy.linalg import solve_continuous_are
 from service.config import Settings
 from service.core.compiled import compiled
 from service.core.frame import Record, Vector
+from service.core.stops import fastest_stop
 from service.core.workspace import Target
 
-REVERT_A, REVERT_V = 9.0, 250.0  # [1/s], [1/s²] with which the tracker expects the target's motion to end
+REVERT_A, REVERT_V = 5.0, 150.0  # [1/s], [1/s²] with which the tracker expects the target's motion to end
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed more, for no hand stops at once ...
 STOP_BRAKE = 16.0  # [m/s²] ... nor brakes harder than this
@@ -152,7 +153,7 @@ def _step(
     dt: float,
 ) -> int:
     """The setpoint (3, 3) one period on, in place."""
-    jerk, ahead, stop = np.empty(3), np.empty((3, 3)), np.empty(5)
+    jerk, ahead, stop = np.empty(3), np.empty((3, 3)), np.empty(6)
     fastest, hardest, sharpest = limits[0], limits[1], limits[2]
     met = _track(setpoint, target, gains, limits, costs, slow, dt, jerk)
     for i in range(3):
@@ -164,10 +165,10 @@ def _step(
     allowed = speed_to_come(ahead[1], ahead[2], sharpest) <= max(fastest, before)
     if allowed:
         for i in range(3):
-            _stop(ahead[1, i], ahead[2, i], hardest, sharpest, dt, stop)
+            fastest_stop(ahead[1, i], ahead[2, i], hardest, sharpest, dt, stop)
             bottom, top = ahead[0, i] + stop[3], ahead[0, i] + stop[4]
             if bottom < low[i] or top > high[i]:  # it may stay outside where it is, but go no farther
-                _stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
+                fastest_stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
                 if bottom < min(low[i], setpoint[0, i] + stop[3]) - 1e-12:
                     allowed = False
                 if top > max(high[i], setpoint[0, i] + stop[4]) + 1e-12:
@@ -176,7 +177,7 @@ def _step(
         setpoint[:] = ahead
         return met
     for i in range(3):
-        _stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
+        fastest_stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
         setpoint[0, i] += stop[2]
         setpoint[1, i], setpoint[2, i] = stop[0], stop[1]
     return STOPPED
@@ -319,53 +320,3 @@ def speed_to_come(velocity: Vector, acceleration: Vector, sharpest: float) -> fl
         then = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * sharpest)
         total += max(abs(velocity[i]), abs(then)) ** 2
     return math.sqrt(total)
-
-
-@compiled
-def _stop(velocity: float, acceleration: float, hardest: float, sharpest: float, dt: float, out: Vector) -> None:
-    """The fastest stop of one axis.
-
-    out (5,): velocity, acceleration and way after dt, least and greatest way until rest.
-    """
-    then = velocity + acceleration * abs(acceleration) / (2.0 * sharpest)
-    sign = -1.0 if then > 0.0 else 1.0  # with it the stop begins with positive jerk
-    v, a = sign * velocity, sign * acceleration
-    peak = math.sqrt(max(0.5 * a * a - sharpest * v, 0.0))
-    hold = 0.0
-    if peak > hardest:
-        peak = hardest
-        hold = (-v + (a * a - 2.0 * hardest * hardest) / (2.0 * sharpest)) / hardest
-    peak = max(peak, a)
-    x = t = low = high = 0.0
-    found = False
-    after_x = after_v = after_a = 0.0
-    for phase in range(3):
-        jerk = sharpest if phase == 0 else (0.0 if phase == 1 else -sharpest)
-        lasts = (peak - a) / sharpest if phase == 0 else (hold if phase == 1 else peak / sharpest)
-        if lasts <= 0.0:
-            continue
-        if not found and dt <= t + lasts:
-            h = dt - t
-            after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-            after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
-            found = True
-        # the least and greatest way inside the phase are where the velocity is 0
-        disc = a * a - 2.0 * jerk * v
-        for root in (-1.0, 1.0):
-            h = 0.0
-            if jerk != 0.0 and disc >= 0.0:
-                h = (-a + root * math.sqrt(disc)) / jerk
-            elif jerk == 0.0 and a != 0.0:
-                h = -v / a
-            if 0.0 < h < lasts:
-                way = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-                low, high = min(low, way), max(high, way)
-        x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
-        v += lasts * (a + lasts * jerk / 2.0)
-        a += lasts * jerk
-        t += lasts
-        low, high = min(low, x), max(high, x)
-    if not found:
-        after_x, after_v, after_a = x, 0.0, 0.0
-    out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
-    out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -19,13 +19,15 @@ import rerun as rr
 
 from service.config import Settings
 from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
 from sim.experiments.linear_floor import Floor, best_linear
-from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, reaches, recorded, stops
+from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.rehearsal import shipped
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
 
-PEOPLE, SECONDS, STOPS, REACHES = 3, 18.0, 24, 1
+PEOPLE, SECONDS, STOPS, REACHES = 3, 15.0, 24, 1
 SETTLED_MM = 5.0
 WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
@@ -36,6 +38,9 @@ LABELS = {
     "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
 }
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
+TEACHERS, TAUGHT_S, TAUGHT_EVERY = range(100, 105), 20.0, 10  # people whom nobody follows, and ticks a sample
+LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # of their tool
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,20 @@ class Figures:
     top_speed: float  # [m/s] of the tool
     overshoot_mm: float
     settled_ms: float
+
+
+def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
+    """A skill learned from modelled people whose tool goes along with both hands."""
+    centre = shipped.primitive.mean(middle[None])[0]
+    demonstrations = []
+    for seed in TEACHERS:
+        hands = person(seed, middle, TAUGHT_S)[::TAUGHT_EVERY]
+        moved = hands - middle
+        tool = centre + LEFT_GAIN * moved[:, :3] + RIGHT_GAIN * moved[:, 3:]
+        stamps_ns = np.arange(len(hands)) * round(1e9 * PERIOD_S * TAUGHT_EVERY)
+        poses = [np.hstack([x, np.tile(shipped.orientation, (len(x), 1))]) for x in (hands[:, :3], hands[:, 3:], tool)]
+        demonstrations.append(Demonstration(stamps_ns, *poses))
+    return learn(demonstrations, name="of such hands")
 
 
 def followers(skill: Skill, share: float) -> dict[str, Follower]:
@@ -95,16 +114,18 @@ _known: dict[str, Any] = {}
 
 
 def prepare(share: float) -> None:
-    """Loads the skill and what follows, once in a process."""
+    """Loads the skills and what follows by them, once in a process."""
     skill = shipped()
-    _known.update(skill=skill, followers=followers(skill, share))
+    other = skill_of_such_hands(skill, skill.primitive.inputs.mean(axis=0))
+    _known.update({which: (one, followers(one, share)) for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other))})
 
 
-def measure(task: tuple[str, Moving]) -> Figures:
-    """The figures of one sequence with one follower."""
-    name, hands = task
-    target = np.clip(_known["skill"].primitive.mean(hands.truth), *_known["skill"].workspace)
-    return figures(name, hands, target, _known["followers"][name](hands))
+def measure(task: tuple[str, str, Moving]) -> Figures:
+    """The figures of one sequence with one follower, by one of the skills."""
+    name, which, hands = task
+    skill, by_name = _known[which]
+    target = np.clip(skill.primitive.mean(hands.truth), *skill.workspace)
+    return figures(name, replace(hands, group=hands.group + which), target, by_name[name](hands))
 
 
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
@@ -157,8 +178,11 @@ def _lag_ms(target: Array, tool: Array) -> float:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """Follows all hands with all followers; returns the numbers for its JSON."""
     prepare(options.share)
-    hands = sequences(options, _known["skill"].primitive.inputs.mean(axis=0))
-    tasks = [(name, one) for name in _known["followers"] for one in hands]
+    skill, by_name = _known[SHIPPED]
+    hands = sequences(options, skill.primitive.inputs.mean(axis=0))
+    tasks = [(name, SHIPPED, one) for name in by_name for one in hands]
+    by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
+    tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
     found: list[Figures] = []
     if options.workers == 1:
         found = [measure(task) for task in tasks]
@@ -168,15 +192,15 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             options.workers, mp_context=context, initializer=prepare, initargs=(options.share,)
         ) as pool:
             found = list(pool.map(measure, tasks, chunksize=8))
-    table = {name: _summary([one for one in found if one.follower == name]) for name in _known["followers"]}
+    table = {name: _summary([one for one in found if one.follower == name]) for name in by_name}
     for name, groups in table.items():
         results.say(f"{name}: {_line(groups)}")
     floors = {
-        group: best_linear([one for one in hands if one.group == group], _known["skill"], rate_hz=rate_hz)
+        group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
         for group, rate_hz in FLOOR_GROUPS.items()
     }
     _draw(results, table, floors)
-    _record(results, hands[1], _known["followers"]["ours"](hands[1]))
+    _record(results, hands[1], by_name["ours"](hands[1]))
     return {
         "hands": "recorded" if options.hands else "modelled",
         "by_follower": table,

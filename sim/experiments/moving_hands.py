@@ -88,7 +88,7 @@ def modelled(middle: Array, *, count: int, seconds: float) -> list[Moving]:
     """People modelled after the recordings, each seen by the trackers of `recorded`'s groups."""
     out = []
     for number in range(count):
-        truth = _person(number, middle, seconds)
+        truth = person(number, middle, seconds)
         times = np.arange(len(truth)) * PERIOD_S
         spline = CubicSpline(times, truth)
         for group, rate_hz, noise, spoilt in (
@@ -106,8 +106,8 @@ def modelled(middle: Array, *, count: int, seconds: float) -> list[Moving]:
     return out
 
 
-def _person(seed: int, middle: Array, seconds: float) -> Array:
-    """Overlapping reaches with rests and turns back, and sway: (N, 6)."""
+def person(seed: int, middle: Array, seconds: float) -> Array:
+    """Overlapping reaches with rests and turns back, and sway: both hands (N, 6) [m]."""
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
     x = np.zeros((len(t), 6))

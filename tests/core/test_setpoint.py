@@ -20,11 +20,11 @@ from service.core.intake import Intake
 from service.core.setpoint import (
     HULL_MARGIN,
     SetpointGenerator,
-    _stop,
     speed_to_come,
     stop_distance,
     tracker_gains,
 )
+from service.core.stops import fastest_stop
 from service.core.workspace import Target
 
 PERIOD_S = 0.002
@@ -189,12 +189,12 @@ def test_the_fastest_stop_of_an_axis_is_that_of_another_implementation(
 ) -> None:
     acceleration = max(-hardest, min(hardest, acceleration))
     profile = ruckig_stop(velocity, acceleration, hardest, sharpest)
-    out = np.empty(5)
-    _stop(velocity, acceleration, hardest, sharpest, PERIOD_S, out)
+    out = np.empty(6)
+    fastest_stop(velocity, acceleration, hardest, sharpest, PERIOD_S, out)
     position, speed, change = (value[0] for value in profile.at_time(min(PERIOD_S, profile.duration)))
     np.testing.assert_allclose(out[:3], [speed, change, position], atol=1e-7)
     extrema = profile.position_extrema[0]
-    np.testing.assert_allclose(out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0)], atol=1e-7)
+    np.testing.assert_allclose(out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0), profile.duration], atol=1e-7)
 
 
 def ruckig_stop(velocity: float, acceleration: float, hardest: float, sharpest: float) -> ruckig.Trajectory:

@@ -72,6 +72,13 @@ class TestExperiments:
                 assert ours[group]["jerk_ratio"] < 0.7 * found[rival][group]["jerk_ratio"], rival
                 if rival != "no smoothing":  # it is as near, and shakes
                     assert ours[group]["error_rms_mm"] < found[rival][group]["error_rms_mm"], rival
+                # a rival that does not follow is none
+                assert found[rival]["minimum jerk"]["error_rms_mm"] < 35, rival
+                assert found[rival][group]["error_rms_mm"] < 35, rival
+        for group in ("clean, skill of such hands", "recorded, skill of such hands"):
+            others = [found[rival][group] for rival in found if group in found[rival] and rival != "ours"]
+            assert others
+            assert all(ours[group]["error_rms_mm"] < other["error_rms_mm"] for other in others)
         stops = ours["sudden stops"]
         assert stops["overshoot_mean_mm"] < 6
         assert stops["overshoot_worst_mm"] < 12

@@ -1,0 +1,101 @@
+"""Stops within limits of acceleration and jerk: the fastest of one axis, and one of several axes
+that come to rest together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from service.core.compiled import compiled
+from service.core.frame import Vector
+
+LEAST_SHARE, HALVINGS = 1e-3, 40  # of its acceleration with which an axis waits for the slowest; how that is found
+
+
+@compiled
+def fastest_stop(velocity: float, acceleration: float, hardest: float, sharpest: float, dt: float, out: Vector) -> None:
+    """The fastest stop of one axis, at most `hardest` in acceleration and `sharpest` in jerk.
+
+    out (6,): velocity, acceleration and way after dt, least and greatest way until rest, duration.
+    """
+    then = velocity + acceleration * abs(acceleration) / (2.0 * sharpest)
+    sign = -1.0 if then > 0.0 else 1.0  # with it the stop is a push in positive direction
+    v, a = sign * velocity, sign * acceleration
+    peak = math.sqrt(max(0.5 * a * a - sharpest * v, 0.0))
+    hold = 0.0
+    if a > hardest:  # beyond its limit it comes down to that first
+        peak = hardest
+        hold = max(-v - a * a / (2.0 * sharpest), 0.0) / hardest
+    elif peak > hardest:
+        peak = hardest
+        hold = (-v + (a * a - 2.0 * hardest * hardest) / (2.0 * sharpest)) / hardest
+    else:
+        peak = max(peak, a)
+    x = t = low = high = 0.0
+    found = False
+    after_x = after_v = after_a = 0.0
+    for phase in range(3):
+        if phase == 0:
+            jerk, lasts = (sharpest, (peak - a) / sharpest) if a <= peak else (-sharpest, (a - peak) / sharpest)
+        elif phase == 1:
+            jerk, lasts = 0.0, hold
+        else:
+            jerk, lasts = -sharpest, peak / sharpest
+        if lasts <= 0.0:
+            continue
+        if not found and dt <= t + lasts:
+            h = dt - t
+            after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
+            after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
+            found = True
+        # the least and greatest way inside the phase are where the velocity is 0
+        disc = a * a - 2.0 * jerk * v
+        for root in (-1.0, 1.0):
+            h = 0.0
+            if jerk != 0.0 and disc >= 0.0:
+                h = (-a + root * math.sqrt(disc)) / jerk
+            elif jerk == 0.0 and a != 0.0:
+                h = -v / a
+            if 0.0 < h < lasts:
+                way = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
+                low, high = min(low, way), max(high, way)
+        x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
+        v += lasts * (a + lasts * jerk / 2.0)
+        a += lasts * jerk
+        t += lasts
+        low, high = min(low, x), max(high, x)
+    if not found:
+        after_x, after_v, after_a = x, 0.0, 0.0
+    out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
+    out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)
+    out[5] = t
+
+
+@compiled
+def stop_together(velocities: Vector, accelerations: Vector, hardest: Vector, sharpest: Vector, dt: float) -> Vector:
+    """One dt of a stop at whose end all axes (J,) come to rest at once, as soon as the slowest can.
+
+    (3, J): ways, velocities, accelerations. The others brake less than they could, so that what
+    they move together slows down on its way.
+    """
+    count = len(velocities)
+    out, stop = np.zeros((3, count)), np.zeros(6)
+    duration = 0.0
+    for i in range(count):
+        fastest_stop(velocities[i], accelerations[i], hardest[i], sharpest[i], dt, stop)
+        duration = max(duration, stop[5])
+    for i in range(count):
+        low, share = LEAST_SHARE, 1.0
+        if velocities[i] != 0.0 or accelerations[i] != 0.0:
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + share)
+                fastest_stop(velocities[i], accelerations[i], middle * hardest[i], sharpest[i], dt, stop)
+                if stop[5] <= duration:
+                    share = middle
+                else:
+                    low = middle
+        fastest_stop(velocities[i], accelerations[i], share * hardest[i], sharpest[i], dt, stop)
+        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
+    return out

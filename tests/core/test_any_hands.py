@@ -1,0 +1,92 @@
+"""The core under hands that no person has: alternating, noisy, told by two trackers, swapped, in
+wild motion, held and let go at any time; the tool keeps its bounds.
+
+`THIRDHAND_EXAMPLES=3000 pytest tests/core/test_any_hands.py` draws more.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+from in_process import ASSUMED, LEFT, RIGHT, hand
+from tests_paths import RECORDINGS
+from wam import URDF
+
+from service.contract.records import SIDES, Mode
+from service.core.arm import Arm
+from service.core.controller import Controller
+from service.core.frame import Tick, Vector, order
+from service.learning.skill_file import decoded
+
+PERIOD_S, TICKS = 0.002, 1000
+ARM = Arm(ASSUMED, URDF)
+SKILL = replace(decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="soldering"), threshold=math.inf)
+FASTEST = ASSUMED.tool.max_speed
+RISE, RISE_MPS = 1.01, 0.01  # of a stop over what the tool had or was coming to: joints' jerks differ
+KINDS = ("alternating", "noisy", "two sources", "swapped", "trembling", "wandering")
+MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "20"))
+
+
+def samples(kind: str, spread_m: float, rate_hz: float, seed: int) -> list[tuple[float, Vector]]:
+    """Times [s] and both hands (2, 3) [m], as trackers tell them."""
+    random = np.random.default_rng(seed)
+    centre = np.array([LEFT, RIGHT]) + random.uniform(-0.05, 0.05, (2, 3))
+    way = random.standard_normal((2, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    out = []
+    walk = np.zeros((2, 3))
+    speed = np.zeros((2, 3))
+    for k, t in enumerate(np.arange(0.0, TICKS * PERIOD_S, 1.0 / rate_hz)):
+        at = centre.copy()
+        if kind == "alternating":
+            at += spread_m * way * (1 if k % 2 else -1)
+        elif kind == "noisy":
+            at += spread_m * random.standard_normal((2, 3))
+        elif kind == "two sources":
+            at += spread_m * way * math.sin(2.0 * math.pi * t) + (
+                spread_m * way[::-1] if random.random() < 0.5 else 0.0
+            )
+        elif kind == "swapped":
+            at = at[::-1] if (k // int(1 + rate_hz * spread_m * 3)) % 2 else at
+        elif kind == "trembling":
+            at += spread_m * way * math.sin(2.0 * math.pi * (1.0 + 11.0 * (seed % 100) / 100.0) * t)
+        else:
+            speed += random.standard_normal((2, 3)) * math.sqrt(1.0 / rate_hz) * 4.0 - 2.0 * speed / rate_hz
+            walk += speed / rate_hz - walk / rate_hz
+            at += walk * spread_m / 0.1
+        out.append((float(t), at))
+    return out
+
+
+@example_settings(max_examples=MANY, deadline=None, derandomize=True)
+@given(st.sampled_from(KINDS), st.floats(0.002, 0.2), st.sampled_from([30, 60, 100, 240, 500]), st.integers(0, 10**6))
+def test_the_tool_keeps_its_speed_following_and_stopping(kind: str, spread_m: float, rate_hz: float, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    controller = Controller(ASSUMED, SKILL, urdf=URDF)
+    told = samples(kind, spread_m, rate_hz, seed)
+    turns = set(np.cumsum(random.integers(60, 400, 12)).tolist())
+    held, allowed, beyond = False, 0.0, []
+    for k in range(TICKS):
+        inbox = []
+        while told and told[0][0] <= k * PERIOD_S:
+            at = told.pop(0)[1]
+            inbox += [hand(side, tuple(at[i].tolist()), k + 1) for i, side in enumerate(SIDES)]
+        if k in turns:
+            held = not held
+            inbox.append(order("hold" if held else "resume"))
+        frame = controller.step(Tick(k, tuple(inbox)))
+        assert frame["mode"] != Mode.FAULT, (k, frame["reason"])
+        here = ARM.at(frame["joints"])
+        speed, coming = ARM.speeds(here, frame["joint_velocities"], frame["joint_accelerations"])
+        if frame["mode"] == Mode.FOLLOW:
+            assert speed <= FASTEST + 1e-6
+            allowed = RISE * coming + RISE_MPS
+        elif speed > allowed:
+            beyond.append((k, speed, allowed))
+    assert not beyond, beyond[:3]
