@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
 from kmp.checks import Array, RankReached, check_finite, check_shape, numbers, positive
+from kmp.compiled_query import CompiledQuery
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
 from kmp.gaussians import Gaussians, check_pairs, unchecked
@@ -147,12 +148,14 @@ class KMP(Immutable):
 
         The input's velocity (I,) [unit of the inputs / s] and its acceleration (I,) [unit of the
         inputs / s^2] give those of the output. The numbers are those of `predict`, `jacobian` and
-        `curvature`, bit for bit. The covariance takes as long as all else, and can be left out.
+        `curvature`: but for rounding where Numba is installed, whose compiled loops then serve, bit
+        for bit where it is not. The covariance takes longer than all else, and can be left out.
 
         Raises ValueError if a shape is another or a number is not finite.
         """
         s, v = self._checked("query", query), self._checked("velocity", velocity)
-        return self._query.motion(s, v, self._checked("acceleration", acceleration), covariance=covariance)
+        ready = self._compiled_query or self._query
+        return ready.motion(s, v, self._checked("acceleration", acceleration), covariance=covariance)
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
@@ -317,6 +320,10 @@ class KMP(Immutable):
     def _query(self) -> Query:
         count = len(self.base.inputs) - len(self._changes.replaced) + len(self.via_inputs)
         return Query.of(self._solution, count)
+
+    @cached_property
+    def _compiled_query(self) -> CompiledQuery | None:
+        return CompiledQuery.of(self._query)
 
     @cached_property
     def _spanned(self) -> Features:

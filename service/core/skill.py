@@ -14,7 +14,10 @@ import numpy as np
 
 from kmp import KMP
 from service.contract.requests import TOLERANCE_M, ViaPoint
+from service.core.compiled import compiled
 from service.core.frame import Vector
+
+MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded
 
 
 class Prediction(NamedTuple):
@@ -58,21 +61,32 @@ class Skill:
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
         """
-        v, a = velocities.reshape(6), accelerations.reshape(6)
-        found = self.primitive.predict_motion(hands.reshape(6), v, a, covariance=covariance is None)
-        if found.covariance is not None:
-            covariance = np.round(found.covariance, 10)
-        assert covariance is not None
-        jacobian = np.round(found.jacobian, 6)
-        return Prediction(
-            np.round(found.mean, 6),
-            np.round(jacobian @ v, 6),
-            np.round(jacobian @ a + found.curvature, 6),
-            covariance,
-            math.sqrt(float(np.trace(covariance)) / 3),
+        found = self.primitive.predict_motion(
+            hands.reshape(6), velocities.reshape(6), accelerations.reshape(6), covariance=covariance is None
         )
+        given = covariance if found.covariance is None else found.covariance
+        assert given is not None
+        motion, rounded = np.empty((3, 3)), np.empty((3, 3))
+        deviation = _round(found.mean, found.velocity, found.acceleration, given, motion, rounded)
+        return Prediction(motion[0], motion[1], motion[2], rounded, deviation)
 
     @cached_property
     def digest(self) -> bytes:
         """16 bytes that tell this skill from any other."""
         return hashlib.blake2b(self.file, digest_size=16).digest()
+
+
+@compiled
+def _round(
+    mean: Vector, velocity: Vector, acceleration: Vector, covariance: Vector, motion: Vector, rounded: Vector
+) -> float:
+    """Rounds a prediction into `motion` (3, 3) and `rounded` (3, 3); its deviation."""
+    variance = 0.0
+    for i in range(3):
+        motion[0, i] = np.rint(mean[i] * MOTION_STEPS) / MOTION_STEPS
+        motion[1, i] = np.rint(velocity[i] * MOTION_STEPS) / MOTION_STEPS
+        motion[2, i] = np.rint(acceleration[i] * MOTION_STEPS) / MOTION_STEPS
+        for j in range(3):
+            rounded[i, j] = np.rint(covariance[i, j] * COVARIANCE_STEPS) / COVARIANCE_STEPS
+        variance += rounded[i, i]
+    return math.sqrt(variance / 3.0)

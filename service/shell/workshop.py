@@ -111,8 +111,8 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
         skill = decoded(source, origin="the skill in force")
     if via_points is not None:
         skill = adapted(skill, via_points, tolerance=tolerance)
-    skill.primitive.predict(skill.primitive.inputs[:1])  # what is computed once is computed here
-    skill.primitive.jacobian(skill.primitive.inputs[0])
+    place = skill.primitive.inputs[0]
+    skill.primitive.predict_motion(place, 0 * place, 0 * place)  # what is computed once is computed here
     skill.digest  # noqa: B018
     return skill
 

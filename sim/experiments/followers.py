@@ -89,9 +89,8 @@ class _Eager(Arm):
 
     def __init__(self, settings: Settings, urdf: str) -> None:
         super().__init__(settings, urdf)
-        self._closing_speed = settings.tool.max_speed
-        self._braking = settings.tool.max_acceleration / 2
-        self._far_damping = 0.0
+        tool = settings.tool
+        self._closing = np.array([settings.period_s, tool.max_acceleration / 2, tool.max_speed, 0.0, self._closing[4]])
 
 
 class _Chain:

@@ -14,7 +14,8 @@ import sys
 from service import one_blas_thread
 from numba.core.dispatcher import Dispatcher
 from service.config import Settings, robot_description
-from service.core import arm, hand_estimator, setpoint
+from kmp import compiled_query
+from service.core import arm, hand_estimator, limiter, setpoint, skill, stops
 from service.core.controller import rehearse
 from service.cli.main import main
 from sim.experiments.rehearsal import shipped
@@ -22,7 +23,7 @@ from sim.experiments.rehearsal import shipped
 def compiled():
     return {
         name: len(f.signatures)
-        for module in (arm, hand_estimator, setpoint)
+        for module in (arm, compiled_query, hand_estimator, limiter, setpoint, skill, stops)
         for name, f in vars(module).items()
         if isinstance(f, Dispatcher)
     }

@@ -41,7 +41,8 @@ def moving(skill, seed=1):
     return inputs[30] + 0.02, *random.normal(size=(2, inputs.shape[1]))
 
 
-def test_one_call_gives_what_the_others_give_bit_for_bit(skill):
+def test_one_call_gives_what_the_others_give_bit_for_bit(skill, monkeypatch):
+    monkeypatch.setattr("kmp.compiled_query.njit", None)  # as where Numba is not installed
     s, v, a = moving(skill)
     found, one = skill.predict_motion(s, v, a), skill.predict(s[None])
     assert np.array_equal(found.mean, skill.mean(s[None])[0])
@@ -51,6 +52,18 @@ def test_one_call_gives_what_the_others_give_bit_for_bit(skill):
     assert np.array_equal(found.curvature, skill.curvature(s, v))
     assert np.array_equal(found.velocity, found.jacobian @ v)
     assert np.array_equal(found.acceleration, found.jacobian @ a + found.curvature)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compiled_loops_give_the_same_but_for_rounding(skill, seed):
+    motion = moving(skill, seed)
+    found, plain = skill.predict_motion(*motion), skill._query.motion(*motion, covariance=True)
+    assert (skill._compiled_query is None) == (skill.kernel.channels == 2)
+    for name in plain._fields[:3] + plain._fields[4:]:
+        size = np.abs(getattr(plain, name)).max()
+        np.testing.assert_allclose(getattr(found, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
+    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=0, atol=1e-9)
+    np.linalg.cholesky(found.covariance)
 
 
 def test_one_query_agrees_with_it_in_a_set(skill):

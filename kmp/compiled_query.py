@@ -1,0 +1,170 @@
+"""One query at a time, compiled by Numba where that is installed: loops over what the query touches
+and nothing else.
+
+For the Gaussian kernel, whose inputs are scaled once; the covariance for the dense solution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import lapack
+
+from kmp.checks import Array
+from kmp.dense import Dense
+from kmp.immutable import Immutable, frozen
+from kmp.kernel import GaussianKernel
+from kmp.linear_algebra import nearest_positive_semidefinite
+from kmp.query import MotionPrediction, Query
+
+try:
+    from numba import njit
+except ImportError:  # the NumPy path serves
+    njit = None
+
+
+def _compiled(function: Any) -> Any:
+    return function if njit is None else njit(cache=True)(function)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledQuery(Immutable):
+    """A query's arrays for compiled loops. R centres, O outputs."""
+
+    query: Query
+    columns: Array | None
+    """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c Sigma
+    = L L^T (R O, R O); None: the covariance is the solution's own."""
+
+    @classmethod
+    def of(cls, query: Query) -> CompiledQuery | None:
+        """The query for compiled loops; None where there are none for it."""
+        if njit is None or not isinstance(query.kernel, GaussianKernel):
+            return None
+        solution = query.solution
+        return cls(query, _packed(solution) if isinstance(solution, Dense) else None)
+
+    def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
+        """As `Query.motion`, but for rounding."""
+        q = self.query
+        outputs, inputs = len(q.prior_mean), len(query)
+        mean, jacobian, curvature = np.empty(outputs), np.empty((outputs, inputs)), np.empty(outputs)
+        moved, pushed, values = np.empty(outputs), np.empty(outputs), np.empty(len(q.centres))
+        _motion(
+            *(query, velocity, acceleration),
+            *(q.stretch, q.scale, q.centres, q.weights, q.prior_mean),
+            *(values, mean, jacobian, curvature, moved, pushed),
+        )
+        found = self._covariance(values) if covariance else None
+        return MotionPrediction(mean, moved, pushed, found, jacobian, curvature)
+
+    def _covariance(self, values: Array) -> Array:
+        q = self.query
+        if self.columns is None:
+            posterior = q.solution.posterior_covariance_one(values)
+            return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * q.covariance_scale)
+        outputs = len(q.prior_mean)
+        found = np.empty((outputs, outputs))
+        if not _posterior(values, self.columns, np.zeros((outputs, len(values) * outputs)), found):
+            found = nearest_positive_semidefinite(found[None])[0]
+        found *= q.covariance_scale
+        return found
+
+
+def _packed(solution: Dense) -> Array:
+    inverse, _ = lapack.dtrtri(solution._covariance_factor, lower=1)
+    o = solution.hyperparameters.outputs
+    return frozen(np.concatenate([inverse[i - i % o :, i] for i in range(len(inverse))]))
+
+
+@_compiled
+def _motion(
+    query: Array,
+    velocity: Array,
+    acceleration: Array,
+    stretch: Array,
+    scale: float,
+    centres: Array,
+    weights: Array,
+    prior: Array,
+    values: Array,
+    mean: Array,
+    jacobian: Array,
+    curvature: Array,
+    moved: Array,
+    pushed: Array,
+) -> None:
+    """Equation (8), and its first and second derivatives along the motion, from one pass over the
+    centres.
+    """
+    inputs, outputs = len(query), len(prior)
+    offset, direction = np.empty(inputs), np.empty(inputs)
+    square = 0.0
+    for i in range(inputs):
+        direction[i] = velocity[i] * stretch[i]
+        square += direction[i] * direction[i]
+    mean[:] = prior
+    jacobian[:] = 0.0
+    curvature[:] = 0.0
+    for r in range(len(centres)):
+        distance = along = 0.0
+        for i in range(inputs):
+            offset[i] = query[i] * stretch[i] - centres[r, i]
+            distance += offset[i] * offset[i]
+            along += offset[i] * direction[i]
+        value = math.exp(-scale * distance)
+        values[r] = value
+        slope = 2.0 * scale * along
+        bend = value * (slope * slope - 2.0 * scale * square)
+        for o in range(outputs):
+            weight = weights[r, o]
+            mean[o] += value * weight
+            curvature[o] += bend * weight
+            pull = -2.0 * scale * value * weight
+            for i in range(inputs):
+                jacobian[o, i] += pull * offset[i]
+    for o in range(outputs):
+        moved[o], pushed[o] = 0.0, curvature[o]
+        for i in range(inputs):
+            jacobian[o, i] *= stretch[i]
+            moved[o] += jacobian[o, i] * velocity[i]
+            pushed[o] += jacobian[o, i] * acceleration[i]
+
+
+@_compiled
+def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
+    """I - k (K + lambda_c Sigma)^-1 k^T into out (O, O), by roots (O, R O) = (L^-1 (k (x) I))^T;
+    whether it is positive definite.
+    """
+    outputs, size = roots.shape
+    at = 0
+    for r in range(len(values)):
+        value, first = values[r], r * outputs
+        length = size - first
+        for o in range(outputs):
+            root, column = roots[o, first:], columns[at : at + length]
+            for i in range(length):
+                root[i] += value * column[i]
+            at += length
+    for a in range(outputs):
+        for b in range(a + 1):
+            total = 1.0 if a == b else 0.0
+            for i in range(size):
+                total -= roots[a, i] * roots[b, i]
+            out[a, b] = out[b, a] = total
+    factor = np.zeros((outputs, outputs))
+    for a in range(outputs):
+        for b in range(a + 1):
+            total = out[a, b]
+            for i in range(b):
+                total -= factor[a, i] * factor[b, i]
+            if a != b:
+                factor[a, b] = total / factor[b, b]
+            elif total > 0.0:
+                factor[a, a] = math.sqrt(total)
+            else:
+                return False
+    return True

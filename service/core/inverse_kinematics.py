@@ -1,0 +1,315 @@
+"""The numbers of the arm's differential inverse kinematics, compiled: arrays in, arrays out.
+
+One step is a strictly convex least-squares problem with a bound on each joint's speed toward its
+limits, so that its solution is unique and continuous: unreachable targets and singular postures
+slow the arm, without chatter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from service.core.compiled import compiled
+from service.core.frame import Vector
+
+# Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.
+NEAR_LIMIT = 0.1  # [rad]
+
+POSITION_GAIN = 50.0  # [1/s] of a small error's decay
+DIRECTION_GAIN = 10.0  # [1/s]
+DIRECTION_SPEED = 0.5  # [rad/s] at most
+DIRECTION_LEVER = 0.01  # [m] 1 rad/s of direction counts as this many m/s of the tool: position goes first
+POSTURE_GAIN = 1.0  # [1/s]
+POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
+DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
+SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
+SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the table
+FAR_SPEED = 0.15  # [m/s]
+TASKS = 5  # three of the tool's velocity, two of its direction
+FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
+LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
+BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
+STEPS = 1e9  # [s/rad] of the result: rounded so that a replay on another kind of CPU agrees
+SPEED, NEAR = 1, 2  # what a step says: the joints' speed is limited; one is near its position limit
+
+
+@compiled
+def tool_speeds(tasks: Vector, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float]:
+    """Speed now, and the greater of it and that of the crest, when the accelerations are 0."""
+    now = crest = 0.0
+    for axis in range(3):
+        v = v_crest = 0.0
+        for joint in range(len(dq)):
+            v += tasks[axis, joint] * dq[joint]
+            gained = ddq[joint] * abs(ddq[joint]) / (2.0 * jerk[joint])
+            v_crest += tasks[axis, joint] * (dq[joint] + gained)
+        now += v * v
+        crest += v_crest * v_crest
+    return math.sqrt(now), math.sqrt(max(now, crest))
+
+
+@compiled
+def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
+    """Adds to a forward speed (3,) [m/s] as much of a closing speed as keeps the sum at most
+    `most`.
+    """
+    ff = fc = cc = 0.0
+    for i in range(3):
+        ff += forward[i] * forward[i]
+        fc += forward[i] * closing[i]
+        cc += closing[i] * closing[i]
+    if ff > most * most:
+        shrink = most / math.sqrt(ff)
+        for i in range(3):
+            forward[i] *= shrink
+        ff *= shrink * shrink
+        fc *= shrink
+    share = 1.0
+    if ff + 2.0 * fc + cc > most * most:
+        share = (-fc + math.sqrt(max(fc * fc + cc * (most * most - ff), 0.0))) / cc
+    for i in range(3):
+        forward[i] += min(max(share, 0.0), 1.0) * closing[i]
+
+
+@compiled
+def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> None:
+    """Into out (3, 3, J): joint speeds per tool velocity, by damped least squares, as shares of
+    limits (3, J).
+    """
+    root, right = np.empty((TASKS, TASKS)), np.empty(TASKS)
+    _factorise(tasks, damping, root)
+    for axis in range(3):
+        right[:] = 0.0
+        right[axis] = 1.0
+        _substitute(root, right)
+        for joint in range(tasks.shape[1]):
+            speed = 0.0
+            for i in range(TASKS):
+                speed += tasks[i, joint] * right[i]
+            for order in range(3):
+                out[order, axis, joint] = speed / limits[order, joint]
+
+
+@compiled
+def _factorise(tasks: Vector, damping: float, root: Vector) -> None:
+    """The lower Cholesky factor of tasks tasks^T + damping I."""
+    for i in range(TASKS):
+        for j in range(i + 1):
+            total = damping if i == j else 0.0
+            for k in range(tasks.shape[1]):
+                total += tasks[i, k] * tasks[j, k]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = math.sqrt(max(total, LEAST_SQUARE)) if i == j else total / root[j, j]
+
+
+@compiled
+def _substitute(root: Vector, right: Vector) -> None:
+    """Solves the equations of a Cholesky factor, in place."""
+    for i in range(TASKS):
+        for k in range(i):
+            right[i] -= root[i, k] * right[k]
+        right[i] /= root[i, i]
+    for i in range(TASKS - 1, -1, -1):
+        for k in range(i + 1, TASKS):
+            right[i] -= root[k, i] * right[k]
+        right[i] /= root[i, i]
+
+
+@compiled
+def tool_tasks(jacobian: Vector, rotation: Vector, tasks: Vector) -> float:
+    """The tasks (5, J) of a tool's Jacobian (6, J) and rotation (3, 3); their damping [m²]: small,
+    and growing smoothly where the tool's position becomes singular.
+    """
+    joints = jacobian.shape[1]
+    square = np.empty((3, 3))
+    for joint in range(joints):
+        for i in range(3):
+            tasks[i, joint] = jacobian[i, joint]
+        for i in range(2):
+            turn = 0.0
+            for k in range(3):
+                turn += rotation[k, i] * jacobian[3 + k, joint]
+            tasks[3 + i, joint] = DIRECTION_LEVER * turn
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for joint in range(joints):
+                total += jacobian[i, joint] * jacobian[j, joint]
+            square[i, j] = total
+    determinant = (
+        square[0, 0] * (square[1, 1] * square[2, 2] - square[1, 2] ** 2)
+        - square[0, 1] * (square[0, 1] * square[2, 2] - square[0, 2] * square[1, 2])
+        + square[0, 2] * (square[0, 1] * square[1, 2] - square[0, 2] * square[1, 1])
+    )
+    shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / SINGULAR_VOLUME, 0.0)
+    return DAMPING + SINGULAR_DAMPING * shortage * shortage
+
+
+@compiled
+def joint_step(
+    q: Vector,
+    tool: Vector,
+    rotation: Vector,
+    tasks: Vector,
+    damping: float,
+    position: Vector,
+    velocity: Vector,
+    direction: Vector,
+    posture: Vector,
+    within: Vector,
+    gain: Vector,
+    scale: Vector,
+    fastest: Vector,
+    closing: Vector,
+    out: Vector,
+) -> int:
+    """`Arm.step` into out (J,) [rad/s]; what is to be said of it."""
+    joints = len(q)
+    period, braking, closing_speed, far_damping, most = closing
+    wanted, error, linear, turn = np.empty(TASKS), np.empty(3), np.empty(3), np.empty(3)
+    distance = 0.0
+    for i in range(3):
+        linear[i] = min(max(velocity[i], -FARTHEST), FARTHEST)
+        error[i] = min(max(position[i] - tool[i], -FARTHEST), FARTHEST) - period * linear[i]
+        distance += error[i] * error[i]
+    distance = math.sqrt(distance)
+    # in proportion to the error when near, braking evenly from afar
+    near = braking / POSITION_GAIN**2
+    rate = POSITION_GAIN
+    if distance > near:
+        rate = min(math.sqrt(2.0 * braking * (distance - 0.5 * near)), closing_speed) / distance
+    excess = max(rate * distance - FAR_SPEED, 0.0)
+    damping += far_damping * excess * excess
+    for i in range(3):  # the error decays as it will be, not as it is
+        error[i] *= rate / (1.0 + POSITION_GAIN * period)
+    _add_closing(linear, error, most)
+    _turn(rotation, direction, turn)
+    for i in range(3):
+        wanted[i] = linear[i]
+    for i in range(2):
+        wanted[3 + i] = 0.0
+        for k in range(3):
+            wanted[3 + i] += DIRECTION_LEVER * rotation[k, i] * turn[k]
+    said, scaled, home, bounds = 0, np.empty((TASKS, joints)), np.empty(joints), np.empty((2, joints))
+    for j in range(joints):
+        low, high = q[j] - within[0, j], within[1, j] - q[j]
+        if min(low, high) < NEAR_LIMIT:
+            said |= NEAR
+        bounds[0, j] = -gain[j] * max(low, 0.0) / scale[j]
+        bounds[1, j] = gain[j] * max(high, 0.0) / scale[j]
+        home[j] = min(max(POSTURE_GAIN * (posture[j] - q[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
+        for i in range(TASKS):
+            scaled[i, j] = tasks[i, j] * scale[j]
+    least_squares(scaled, wanted, home, damping, bounds, out)
+    excess = 0.0
+    for j in range(joints):
+        out[j] *= scale[j]
+        excess = max(excess, abs(out[j]) / fastest[j])
+        if not math.isfinite(out[j]):
+            excess = math.nan
+            break
+    for j in range(joints):
+        if math.isnan(excess):
+            out[j] = 0.0
+        elif excess > 1.0:
+            out[j] /= excess
+        out[j] = np.rint(out[j] * STEPS) / STEPS
+    return said | SPEED if excess > 1.0 else said
+
+
+@compiled
+def _turn(rotation: Vector, direction: Vector, out: Vector) -> None:
+    """Into out (3,) [rad/s] the angular velocity that turns the tool's +z toward a direction; 0 if
+    that has no length.
+    """
+    out[:] = 0.0
+    largest = max(abs(direction[0]), abs(direction[1]), abs(direction[2]))
+    if not 0.0 < largest < math.inf:
+        return
+    ax, ay, az = rotation[0, 2], rotation[1, 2], rotation[2, 2]
+    dx, dy, dz = direction[0] / largest, direction[1] / largest, direction[2] / largest
+    x, y, z = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+    sine, cosine = math.sqrt(x * x + y * y + z * z), ax * dx + ay * dy + az * dz
+    if sine < 1e-9 * math.sqrt(dx * dx + dy * dy + dz * dz):
+        return  # there already, or exactly opposite, where no way is nearer
+    speed = min(DIRECTION_GAIN * math.atan2(sine, cosine), DIRECTION_SPEED) / sine
+    out[0], out[1], out[2] = speed * x, speed * y, speed * z
+
+
+@compiled
+def least_squares(
+    tasks: Vector, wanted: Vector, posture: Vector, damping: float, bounds: Vector, result: Vector
+) -> None:
+    """Into result the x (J,) in bounds (2, J) with least |tasks x - wanted|² + damping |x -
+    posture|², by an active-set method.
+    """
+    joints = len(posture)
+    free, best = np.ones(joints), np.empty(joints)
+    _solve(tasks, wanted, posture, damping, free, posture, result)
+    inside = True
+    for j in range(joints):
+        if not bounds[0, j] <= result[j] <= bounds[1, j]:
+            inside, free[j] = False, 0.0
+            result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
+    if inside:
+        return
+    rest = np.empty(TASKS)
+    for _ in range(BOUND_ROUNDS):
+        _solve(tasks, wanted, posture, damping, free, result, best)
+        blocked, least = -1, 1.0
+        for j in range(joints):
+            step = best[j] - result[j]
+            if step != 0.0:
+                fraction = ((bounds[1, j] if step > 0.0 else bounds[0, j]) - result[j]) / step
+                if fraction < least:
+                    blocked, least = j, fraction
+        for j in range(joints):
+            result[j] += least * (best[j] - result[j])
+        if blocked >= 0:
+            for j in range(joints):
+                result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
+            free[blocked] = 0.0
+            continue
+        result[:] = best
+        for i in range(TASKS):
+            rest[i] = -wanted[i]
+            for j in range(joints):
+                rest[i] += tasks[i, j] * result[j]
+        leaving, most = -1, LEAST_GAIN  # the bound whose inside is better by most
+        for j in range(joints):
+            if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
+                continue
+            slope = damping * (result[j] - posture[j])
+            for i in range(TASKS):
+                slope += tasks[i, j] * rest[i]
+            gained = slope if result[j] >= bounds[1, j] else -slope
+            if gained > most:
+                leaving, most = j, gained
+        if leaving < 0:
+            return
+        free[leaving] = 1.0
+
+
+@compiled
+def _solve(
+    tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
+) -> None:
+    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of five
+    equations.
+    """
+    joints = len(posture)
+    part, root, right = np.empty((TASKS, joints)), np.empty((TASKS, TASKS)), np.empty(TASKS)
+    for i in range(TASKS):
+        right[i] = wanted[i]
+        for j in range(joints):
+            part[i, j] = tasks[i, j] * free[j]
+            right[i] -= tasks[i, j] * (posture[j] if free[j] > 0.0 else held[j])
+    _factorise(part, damping, root)
+    _substitute(root, right)
+    for j in range(joints):
+        out[j] = posture[j] if free[j] > 0.0 else held[j]
+        for i in range(TASKS):
+            out[j] += part[i, j] * right[i]
