@@ -27,7 +27,6 @@ SPARING = 0.3  # power of a joint's acceleration limit by which its speed is wei
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
 PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
-GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
 
 
 class Solution(NamedTuple):
@@ -171,12 +170,3 @@ def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
     """The model with the named joints only, the others locked at 0."""
     locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
     return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
-
-
-def slow_down(gap: Vector, velocity: Vector) -> float:
-    """Share of its speed for a setpoint that is `gap` (3,) [m] ahead of the tool; 1 where it comes
-    back.
-    """
-    if float(gap @ velocity) <= 0.0:
-        return 1.0
-    return 1.0 / (1.0 + max(0.0, math.hypot(*gap) - GAP_FREE) / GAP_SLOW)

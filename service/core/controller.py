@@ -17,7 +17,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Flag, Mode, Reason
-from service.core.arm import Arm, Kinematics, slow_down
+from service.core.arm import Arm, Kinematics
 from service.core.frame import (
     Event,
     Frame,
@@ -29,9 +29,11 @@ from service.core.frame import (
     frame_layout,
     frozen,
     no_lap,
+    order,
     state_layout,
 )
 from service.core.intake import Intake
+from service.core.inverse_kinematics import slow_down
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
 from service.core.setpoint import SetpointGenerator
@@ -219,7 +221,7 @@ class Controller:
         """Moves the setpoint on; whether a limit was met. One that passes a bound is a fault."""
         state, box = self._state, self._skill.workspace
         before = state["setpoint"].copy()
-        slow = slow_down(before[0] - here.position, before[1])
+        slow = slow_down(before, here.position)
         met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
         if self._setpoint.why_wrong(state, before, box):
             state["mode"], state["reason"] = Mode.FAULT, Reason.SETPOINT
@@ -294,7 +296,7 @@ def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap:
 
 
 def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
-    """Lets a controller that is thrown away follow two hands for a moment.
+    """Lets a controller that is thrown away follow two hands for a moment, and stop.
 
     What its stages compile, or load compiled from disk, is then there: the first hand that a loop
     sees would otherwise stop it for a fifth of a second, the first ever for many seconds.
@@ -306,3 +308,4 @@ def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
         controller.step(Tick(index, tuple(hands)))
+    controller.step(Tick(REHEARSED_TICKS, (order("hold"),)))

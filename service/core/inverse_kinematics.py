@@ -27,12 +27,26 @@ DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of
 SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
 SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the table
 FAR_SPEED = 0.15  # [m/s]
+GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
 TASKS = 5  # three of the tool's velocity, two of its direction
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
 LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
 STEPS = 1e9  # [s/rad] of the result: rounded so that a replay on another kind of CPU agrees
 SPEED, NEAR = 1, 2  # what a step says: the joints' speed is limited; one is near its position limit
+
+
+@compiled
+def slow_down(setpoint: Vector, tool: Vector) -> float:
+    """Share of its speed for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1 where it comes
+    back.
+    """
+    along = gap = 0.0
+    for i in range(3):
+        ahead = setpoint[0, i] - tool[i]
+        along += ahead * setpoint[1, i]
+        gap += ahead * ahead
+    return 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
 
 
 @compiled

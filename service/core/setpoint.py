@@ -35,6 +35,7 @@ BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
 SHARE, SPEED_SHARE = 0.91, 0.97  # of acceleration and jerk, and of speed, that is planned with
 HULL_TIME_S, HULL_SPANS, HULL_MARGIN = 0.35, 7, 0.03  # [m]; of the spans one is always being filled
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
+WRONG = ("", "not finite", "speed", "acceleration", "jerk", "position")
 PLANNED, STOPPED = 1, 2  # what a step says: a bound was met in planning; the stop was begun
 DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
 
@@ -65,35 +66,31 @@ class SetpointGenerator:
         velocity, acceleration and jerk cost of each joint's limit, 1 for all of it. slow: share of
         the speed that is allowed, as the arm is behind.
         """
-        wanted = np.stack(target[:3])
-        hull, setpoint = state["hull"], state["setpoint"]
-        state["hull_ticks"] = _remember(hull, int(state["hull_ticks"]), wanted[0], self._span_ticks)
-        low, high = np.empty(3), np.empty(3)
-        _bounds(hull, np.maximum(box[0], self._least), box[1], low, high)
-        return int(_step(setpoint, wanted, self._gains, self._limits, costs, slow, low, high, self._period_s))
+        ticks, met = _lead(
+            state["setpoint"],
+            state["hull"],
+            int(state["hull_ticks"]),
+            self._span_ticks,
+            target.position,
+            target.velocity,
+            target.acceleration,
+            box,
+            self._least,
+            self._gains,
+            self._limits,
+            costs,
+            slow,
+            self._period_s,
+        )
+        state["hull_ticks"] = ticks
+        return int(met)
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
         """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
 
         They hold by the way a step is made; this looks again, from outside.
         """
-        setpoint, (speed, acceleration, jerk) = state["setpoint"], self._limits.tolist()
-        if not np.isfinite(setpoint).all():
-            return "not finite"
-        if math.hypot(*setpoint[1]) > max(speed, speed_to_come(before[1], before[2], jerk)) + 1e-9:
-            return "speed"
-        if np.abs(setpoint[2]).max() > max(acceleration, np.abs(before[2]).max()) + 1e-9:
-            return "acceleration"
-        if np.abs(setpoint[2] - before[2]).max() > (jerk + 1e-6) * self._period_s:
-            return "jerk"
-        low, high = np.empty(3), np.empty(3)
-        _bounds(state["hull"], np.maximum(box[0], self._least), box[1], low, high)
-        farthest = 0.5 * speed * speed / acceleration + speed  # of a stop from outside, generously
-        if (setpoint[0] < np.minimum(low, before[0]) - farthest).any():
-            return "position"
-        if (setpoint[0] > np.maximum(high, before[0]) + farthest).any():
-            return "position"
-        return ""
+        return WRONG[_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)]
 
 
 def tracker_gains(jerk_weight: float) -> Vector:
@@ -130,14 +127,69 @@ def _remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> in
 
 
 @compiled
-def _bounds(hull: Vector, lowest: Vector, highest: Vector, low: Vector, high: Vector) -> None:
+def _bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
     """Where the setpoint may go: around the last targets, and inside the workspace."""
     for axis in range(3):
         least, greatest = hull[0, 0, axis], hull[0, 1, axis]
         for span in range(1, HULL_SPANS):
             least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
-        low[axis] = max(lowest[axis], least - HULL_MARGIN)
-        high[axis] = min(highest[axis], greatest + HULL_MARGIN)
+        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN)
+        high[axis] = min(box[1, axis], greatest + HULL_MARGIN)
+
+
+@compiled
+def _wrong(
+    setpoint: Vector, before: Vector, hull: Vector, box: Vector, lowest: Vector, limits: Vector, dt: float
+) -> int:
+    """Which of WRONG a step from `before` (3, 3) is."""
+    fastest, hardest, sharpest = limits[0], limits[1], limits[2]
+    if not np.isfinite(setpoint).all():
+        return 1
+    speed = hardest_now = hardest_before = change = 0.0
+    for i in range(3):
+        speed += setpoint[1, i] ** 2
+        hardest_now, hardest_before = max(hardest_now, abs(setpoint[2, i])), max(hardest_before, abs(before[2, i]))
+        change = max(change, abs(setpoint[2, i] - before[2, i]))
+    if math.sqrt(speed) > max(fastest, speed_to_come(before[1], before[2], sharpest)) + 1e-9:
+        return 2
+    if hardest_now > max(hardest, hardest_before) + 1e-9:
+        return 3
+    if change > (sharpest + 1e-6) * dt:
+        return 4
+    low, high = np.empty(3), np.empty(3)
+    _bounds(hull, box, lowest, low, high)
+    farthest = 0.5 * fastest * fastest / hardest + fastest  # of a stop from outside, generously
+    for i in range(3):
+        if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
+            return 5
+        if setpoint[0, i] > max(high[i], before[0, i]) + farthest:
+            return 5
+    return 0
+
+
+@compiled
+def _lead(
+    setpoint: Vector,
+    hull: Vector,
+    ticks: int,
+    span_ticks: int,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    box: Vector,
+    lowest: Vector,
+    gains: Vector,
+    limits: Vector,
+    costs: Vector,
+    slow: float,
+    dt: float,
+) -> tuple[int, int]:
+    """One step, in place; ticks in the newest span, and what the step says."""
+    target, low, high = np.empty((3, 3)), np.empty(3), np.empty(3)
+    target[0], target[1], target[2] = position, velocity, acceleration
+    ticks = _remember(hull, ticks, position, span_ticks)
+    _bounds(hull, box, lowest, low, high)
+    return ticks, _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
 
 
 @compiled
