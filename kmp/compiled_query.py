@@ -47,17 +47,34 @@ class CompiledQuery(Immutable):
         solution = query.solution
         return cls(query, _packed(solution) if isinstance(solution, Dense) else None)
 
-    def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
-        """As `Query.motion`, but for rounding."""
+    def motion(
+        self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
+    ) -> MotionPrediction | None:
+        """As `Query.motion`, but for rounding; None where what was given, or comes of it, is not
+        finite.
+        """
         q = self.query
         outputs, inputs = len(q.prior_mean), len(query)
         mean, jacobian, curvature = np.empty(outputs), np.empty((outputs, inputs)), np.empty(outputs)
         moved, pushed, values = np.empty(outputs), np.empty(outputs), np.empty(len(q.centres))
-        _motion(
-            *(query, velocity, acceleration),
-            *(q.stretch, q.scale, q.centres, q.weights, q.prior_mean),
-            *(values, mean, jacobian, curvature, moved, pushed),
+        finite = _motion(
+            query,
+            velocity,
+            acceleration,
+            q.stretch,
+            q.scale,
+            q.centres,
+            q.weights,
+            q.prior_mean,
+            values,
+            mean,
+            jacobian,
+            curvature,
+            moved,
+            pushed,
         )
+        if not finite:
+            return None
         found = self._covariance(values) if covariance else None
         return MotionPrediction(mean, moved, pushed, found, jacobian, curvature)
 
@@ -96,9 +113,9 @@ def _motion(
     curvature: Array,
     moved: Array,
     pushed: Array,
-) -> None:
+) -> bool:
     """Equation (8), and its first and second derivatives along the motion, from one pass over the
-    centres.
+    centres; whether all is finite.
     """
     inputs, outputs = len(query), len(prior)
     offset, direction = np.empty(inputs), np.empty(inputs)
@@ -126,12 +143,15 @@ def _motion(
             pull = -2.0 * scale * value * weight
             for i in range(inputs):
                 jacobian[o, i] += pull * offset[i]
+    total = 0.0
     for o in range(outputs):
         moved[o], pushed[o] = 0.0, curvature[o]
         for i in range(inputs):
             jacobian[o, i] *= stretch[i]
             moved[o] += jacobian[o, i] * velocity[i]
             pushed[o] += jacobian[o, i] * acceleration[i]
+        total += mean[o] + moved[o] + pushed[o]
+    return math.isfinite(total)
 
 
 @_compiled

@@ -153,9 +153,14 @@ class KMP(Immutable):
 
         Raises ValueError if a shape is another or a number is not finite.
         """
-        s, v = self._checked("query", query), self._checked("velocity", velocity)
-        ready = self._compiled_query or self._query
-        return ready.motion(s, v, self._checked("acceleration", acceleration), covariance=covariance)
+        s, v, a = (np.asarray(x, dtype=np.float64) for x in (query, velocity, acceleration))
+        compiled = self._compiled_query
+        if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
+            found = compiled.motion(s, v, a, covariance=covariance)
+            if found is not None:
+                return found
+        checked = self._checked("query", s), self._checked("velocity", v), self._checked("acceleration", a)
+        return self._query.motion(*checked, covariance=covariance)
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].

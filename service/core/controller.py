@@ -25,7 +25,10 @@ from service.core.frame import (
     Record,
     Tick,
     Vector,
+    as_array,
     blank,
+    copied,
+    fill,
     frame_layout,
     frozen,
     no_lap,
@@ -33,15 +36,19 @@ from service.core.frame import (
     state_layout,
 )
 from service.core.intake import Intake
-from service.core.inverse_kinematics import slow_down
+from service.core.inverse_kinematics import measured_error, slow_down
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
 from service.core.setpoint import SetpointGenerator
 from service.core.skill import Prediction, Skill
-from service.core.workspace import Target, clamp
+from service.core.workspace import Target, clamp, is_inside, numbers
 
 REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
+
+# Plain numbers, as an enumeration's members cost a microsecond where they are combined.
+HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
+CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
@@ -66,19 +73,22 @@ class Controller:
     def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
         self._settings = settings
         self._skill = skill
-        self._state = (start_state(settings, skill) if state is None else state).copy()
+        self._state = copied(start_state(settings, skill) if state is None else state)
+        self._memory = as_array(self._state)
         self._layout = frame_layout(len(settings.joints.names))
         self._intake = Intake(settings)
         self._setpoint = SetpointGenerator(settings)
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
+        self._orientation = np.ascontiguousarray(skill.orientation)
+        self._reach, self._nothing = numbers(settings.reach), np.zeros((3, 3))
         self._here: Kinematics | None = None  # of the joints asked about last
 
     @property
     def state(self) -> Record:
         """A copy of all that the next frame depends on, but for settings and skill."""
-        return self._state.copy()
+        return copied(self._state)
 
     @property
     def skill(self) -> Skill:
@@ -98,9 +108,9 @@ class Controller:
         target = None if prediction is None else self._clamp(prediction)
         lap("skill")
         self._decide(prediction)
-        flags = Flag(0)
+        flags = 0
         joints, moving = state["joints"], self._is_moving()
-        if state["mode"] == Mode.FOLLOW and target is not None:
+        if state["mode"] == FOLLOW and target is not None:
             here = self._arm_at(joints[0])
             met = self._lead(target, here)
             lap("setpoint")
@@ -108,9 +118,9 @@ class Controller:
             wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here)
             lap("arm")
             limited = self._move(wanted.velocity)
-            flags |= Flag.TARGET_CLAMPED * target.clamped
-            flags |= Flag.SPEED_LIMITED * (met or wanted.speed_limited or limited)
-            flags |= Flag.NEAR_JOINT_LIMIT * wanted.near_limit
+            flags |= CLAMPED * target.clamped
+            flags |= LIMITED * (met or wanted.speed_limited or limited)
+            flags |= NEAR_LIMIT * wanted.near_limit
         else:
             state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
             self._setpoint.begin(state, self._at_rest())
@@ -133,14 +143,15 @@ class Controller:
                 case "hold" | "resume":
                     state["operator_hold"] = event.kind == "hold"
                 case "reset":
-                    if state["mode"] == Mode.FAULT:
-                        state["mode"], state["arm_ready"] = Mode.HOLD, 0
+                    if state["mode"] == FAULT:
+                        state["mode"], state["arm_ready"] = HOLD, 0
                 case _:
                     raise ValueError(f"tick {tick.index}: nothing is done with an event of kind {event.kind!r}")
 
     def _adopt(self, skill: Skill) -> None:
         self._skill = skill
         self._direction = rotation(tuple(skill.orientation))[:, 2]
+        self._orientation = np.ascontiguousarray(skill.orientation)
         self._state["skill"] = np.frombuffer(skill.digest, np.uint8)
         self._state["covariance"] = 0.0
 
@@ -150,25 +161,26 @@ class Controller:
         Its covariance is predicted anew only when a sample of a hand has come.
         """
         state = self._state
-        if not (self._intake.is_fresh(state, 0) and self._intake.is_fresh(state, 1)):
+        if not self._intake.are_fresh(state):
             return None
         hands, known = state["hands"], state["covariance"]
-        is_new = bool((state["hand_ticks"] == state["tick"]).any()) or not known.any()
+        is_new = int(state["tick"]) in state["hand_ticks"].tolist() or known[0, 0] == 0.0
         prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], covariance=None if is_new else known)
-        state["covariance"] = prediction.covariance
+        if is_new:
+            state["covariance"] = prediction.covariance
         return prediction
 
     def _decide(self, prediction: Prediction | None) -> None:
         """Mode and reason of this tick."""
         state = self._state
-        if state["mode"] == Mode.FAULT:
+        if state["mode"] == FAULT:
             return
         fault = self._watch_arm()
         if fault is not None:
-            state["mode"], state["reason"] = Mode.FAULT, fault
+            state["mode"], state["reason"] = FAULT, fault
             return
         reason = self._why_hold(prediction)
-        state["mode"] = Mode.FOLLOW if reason is Reason.NONE else Mode.HOLD
+        state["mode"] = FOLLOW if reason is Reason.NONE else HOLD
         state["reason"] = reason
 
     def _watch_arm(self) -> Reason | None:
@@ -188,14 +200,15 @@ class Controller:
                 self._setpoint.begin(state, self._at_rest())
             return None
         if not heard:
-            if state["mode"] == Mode.FOLLOW or self._is_moving():
+            if state["mode"] == FOLLOW or self._is_moving():
                 return Reason.ARM_SILENT
             state["arm_ready"] = 0
             return None
-        if np.abs(state["joints"][0] - state["measured"]).max() > arm.fault_error_rad:
+        here = self._arm_at(state["joints"][0])  # no farther than that error from where it is measured
+        error, speed = measured_error(here.joints, here.tasks, state["measured"], state["measured_velocities"])
+        if error > arm.fault_error_rad:
             return Reason.ARM_ERROR
-        speed = self._arm.velocity(state["measured"], state["measured_velocities"])
-        if math.hypot(*speed) <= self._settings.tool.fault_speed:
+        if speed <= self._settings.tool.fault_speed:
             state["slow_tick"] = state["tick"]
         return (
             Reason.TOOL_SPEED if (state["tick"] - state["slow_tick"]) * self._settings.period_s > TOO_FAST_S else None
@@ -208,13 +221,15 @@ class Controller:
         if state["operator_hold"]:
             return Reason.OPERATOR
         if prediction is None:
-            return Reason.NO_HANDS if (state["hand_ticks"] < 0).any() else Reason.STALE_HAND
+            return Reason.NO_HANDS if min(state["hand_ticks"].tolist()) < 0 else Reason.STALE_HAND
         # what has been found far must come clearly nearer again
         ease = 0.9 if state["reason"] == Reason.FAR_FROM_DEMONSTRATIONS else 1.0
         return Reason.FAR_FROM_DEMONSTRATIONS if prediction.deviation > ease * self._skill.threshold else Reason.NONE
 
     def _clamp(self, prediction: Prediction) -> Target:
         """The target where it may be, with the motion that stays there."""
+        if is_inside(prediction.position, self._skill.workspace, self._reach):
+            return Target(*prediction[:3], clamped=False)
         return clamp(*prediction[:3], box=self._skill.workspace, reach=self._settings.reach)
 
     def _lead(self, target: Target, here: Kinematics) -> bool:
@@ -224,7 +239,7 @@ class Controller:
         slow = slow_down(before, here.position)
         met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
         if self._setpoint.why_wrong(state, before, box):
-            state["mode"], state["reason"] = Mode.FAULT, Reason.SETPOINT
+            state["mode"], state["reason"] = FAULT, Reason.SETPOINT
             state["setpoint"] = before
         return bool(met)
 
@@ -242,13 +257,13 @@ class Controller:
         if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0] > fastest:
-                state["mode"], state["reason"] = Mode.FAULT, Reason.TOOL_SPEED
+                state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
         return limited
 
     def _arm_at(self, joints: Vector) -> Kinematics:
         """The arm at joints (J,) [rad]; asked again for the same ones, it is not computed again."""
-        if self._here is None or (self._here.joints != joints).any():
+        if self._here is None or self._here.joints.tobytes() != joints.tobytes():
             self._here = self._arm.at(joints)
         return self._here
 
@@ -262,25 +277,21 @@ class Controller:
         here = self._arm_at(joints)
         return np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)])
 
-    def _frame(self, prediction: Prediction | None, target: Target | None, flags: Flag, *, moving: bool) -> Frame:
+    def _frame(self, prediction: Prediction | None, target: Target | None, flags: int, *, moving: bool) -> Frame:
         state, frame = self._state, blank(self._layout)
-        seen = state["hand_ticks"]
-        frame["tick"] = state["tick"]
-        frame["hand_stamp_ns"] = state["hand_stamps_ns"][seen == seen.max()].max()
-        frame["hands"], frame["hand_velocities"] = state["hands"][:, 0], state["hands"][:, 1]
-        frame["hand_ages"] = np.where(seen < 0, -1, state["tick"] - seen)
-        frame["setpoint"], frame["setpoint_velocity"], frame["setpoint_acceleration"] = state["setpoint"]
-        if prediction is None or target is None:
-            frame["target"] = frame["setpoint"]
-        else:
-            frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-            frame["covariance"], frame["deviation"] = prediction.covariance, prediction.deviation
-        frame["orientation"] = self._skill.orientation
-        frame["joints"], frame["joint_velocities"], frame["joint_accelerations"] = state["joints"]
-        frame["tool"] = self._arm_at(state["joints"][0]).position
-        frame["mode"], frame["reason"], frame["flags"] = state["mode"], state["reason"], flags
-        frame["commanded"] = moving or (state["arm_ready"] and state["mode"] != Mode.FAULT)
-        frame["rejected"] = state["rejected"]
+        fill(
+            as_array(frame),
+            self._memory,
+            self._arm_at(state["joints"][0]).position,
+            self._orientation,
+            target.position if target else state["setpoint"][0],
+            target.velocity if target else self._nothing[0],
+            target.acceleration if target else self._nothing[0],
+            prediction.covariance if prediction else self._nothing,
+            prediction.deviation if prediction else 0.0,
+        )
+        frame["flags"] = flags
+        frame["commanded"] = moving or (state["arm_ready"] and state["mode"] != FAULT)
         return frozen(frame)
 
 

@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.contract import cdr, records
+from service.core.compiled import compiled
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
+Records: TypeAlias = NDArray[np.void]
 DType: TypeAlias = np.dtype[np.void]
 Frame: TypeAlias = Record  # of the layout `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
@@ -76,6 +78,20 @@ def blank(layout: DType) -> Record:
     return record
 
 
+def copied(record: Record) -> Record:
+    """A copy with memory of its own, as `blank` makes it."""
+    copy: Record = np.array([record])[0]
+    return copy
+
+
+def as_array(record: Record) -> Records:
+    """The memory (1,) of a record that was made by `blank` or `copied`, as compiled functions take
+    it.
+    """
+    memory: Any = record.base
+    return memory  # type: ignore[no-any-return]
+
+
 def frozen(record: Record) -> Record:
     """A copy that cannot be changed."""
     copy: Record = np.frombuffer(record.tobytes(), record.dtype)[0]
@@ -104,3 +120,36 @@ def differences(a: Record, b: Record) -> dict[str, float]:
         for field in a.dtype.names or ()
         if a[field].tobytes() != b[field].tobytes()
     }
+
+
+@compiled
+def fill(
+    frames: Records,
+    states: Records,
+    tool: Vector,
+    orientation: Vector,
+    target: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    covariance: Vector,
+    deviation: float,
+) -> None:
+    """Into the memory of a blank frame what the state's memory holds, and what was predicted."""
+    frame, state = frames[0], states[0]
+    frame.tick, frame.mode, frame.reason = state.tick, state.mode, state.reason
+    newest, stamp = max(state.hand_ticks[0], state.hand_ticks[1]), state.hand_stamps_ns[0]
+    for side in range(2):
+        seen = state.hand_ticks[side]
+        if seen == newest and (side == 0 or state.hand_ticks[0] < newest or stamp < state.hand_stamps_ns[side]):
+            stamp = state.hand_stamps_ns[side]
+        frame.hand_ages[side] = -1 if seen < 0 else state.tick - seen
+        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
+    frame.hand_stamp_ns = stamp
+    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
+    frame.setpoint_acceleration[:] = state.setpoint[2]
+    frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = target, velocity, acceleration
+    frame.covariance[:], frame.deviation = covariance, deviation
+    frame.orientation[:], frame.tool[:] = orientation, tool
+    frame.joints[:], frame.joint_velocities[:] = state.joints[0], state.joints[1]
+    frame.joint_accelerations[:] = state.joints[2]
+    frame.rejected[:] = state.rejected

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from service.core.compiled import compiled
-from service.core.frame import Record, Vector
+from service.core.frame import Record, Records, Vector, as_array
 
 MODES = 3
 REVERT_A, REVERT_V = 15.0, 100.0  # [1/s], [1/s²]
@@ -57,31 +57,10 @@ class HandEstimator:
         """Sets what no sample has told yet."""
         state["noise"][:, 0] = self._noise
 
-    def advance(self, state: Record, side: int, ticks: int) -> None:
-        """Moves one hand on by some ticks."""
+    def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
+        """Moves both hands on by some ticks; one that is not seen stands still."""
         transition, noise = self._model(ticks)
-        _advance(state["means"][side], state["covariances"][side], transition, noise)
-        _combine(state["means"][side], state["modes"][side], state["hands"][side])
-
-    def rest(self, state: Record, side: int) -> None:
-        """Lets a hand that is not seen stand still."""
-        state["means"][side, :, 1:] = 0.0
-        state["hands"][side, 1:] = 0.0
-
-    def take(self, state: Record, side: int, position: Vector, *, interval_s: float, fresh: bool) -> None:
-        """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before.
-
-        A hand that was not `fresh`, or that is far from where it was expected, starts anew.
-        """
-        noise, hand = state["noise"][side], state["hands"][side]
-        means, covariances, modes = state["means"][side], state["covariances"][side], state["modes"][side]
-        _update_noise(noise, state["past"][side], position, interval_s)
-        off = math.dist(position, hand[0])
-        if not fresh or off**2 >= max(JUMP_M**2, SURPRISE * float(noise[0])):
-            _start(means, covariances, modes, float(noise[0]), position)
-        else:
-            _update(means, covariances, modes, float(noise[0]), position, interval_s)
-        _combine(means, modes, hand)
+        _advance_both(as_array(state), stale_ticks, transition, noise)
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
@@ -226,3 +205,47 @@ def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
             for mode in range(MODES):
                 total += modes[mode] * means[mode, row, axis]
             estimate[row, axis] = total
+
+
+@compiled
+def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector) -> None:
+    state = states[0]
+    for side in range(2):
+        if is_fresh(states, side, stale_ticks):
+            _advance(state.means[side], state.covariances[side], transition, noise)
+            _combine(state.means[side], state.modes[side], state.hands[side])
+        else:
+            state.means[side, :, 1:] = 0.0
+            state.hands[side, 1:] = 0.0
+
+
+@compiled
+def are_fresh(states: Records, stale_ticks: int) -> bool:
+    """Whether both hands are."""
+    return is_fresh(states, 0, stale_ticks) and is_fresh(states, 1, stale_ticks)
+
+
+@compiled
+def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
+    """Whether a hand has been seen, and lately enough."""
+    seen = states[0].hand_ticks[side]
+    return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
+
+
+@compiled
+def take(states: Records, side: int, position: Vector, interval_s: float, fresh: bool) -> None:
+    """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before.
+
+    A hand that was not `fresh`, or that is far from where it was expected, starts anew.
+    """
+    state = states[0]
+    noise, hand, means = state.noise[side], state.hands[side], state.means[side]
+    _update_noise(noise, state.past[side], position, interval_s)
+    off = 0.0
+    for axis in range(3):
+        off += (position[axis] - hand[0, axis]) ** 2
+    if not fresh or off >= max(JUMP_M**2, SURPRISE * noise[0]):
+        _start(means, state.covariances[side], state.modes[side], noise[0], position)
+    else:
+        _update(means, state.covariances[side], state.modes[side], noise[0], position, interval_s)
+    _combine(means, state.modes[side], hand)

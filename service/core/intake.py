@@ -11,12 +11,15 @@ import numpy as np
 from service.config import Settings
 from service.contract.channels import BY_KEY
 from service.contract.messages import JointState, PoseStamped, WireError, finite, in_order
-from service.contract.records import SIDES, Cause
-from service.core.frame import Record, Vector
-from service.core.hand_estimator import HandEstimator
+from service.contract.records import Cause
+from service.core.compiled import compiled
+from service.core.frame import Record, Records, Vector, as_array
+from service.core.hand_estimator import HandEstimator, are_fresh, is_fresh, take
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
+REPEATED, OLDER = int(Cause.REPEATED), int(Cause.OLDER)
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
 
 
@@ -35,13 +38,12 @@ class Intake:
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands
         self._period_s = settings.period_s
-        self._stale_ticks = tuple(_stale_ticks(f"hands/{side}", settings) for side in SIDES)
+        self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._names = settings.joints.names
         self._farthest_joint = max(2 * math.pi, *(abs(x) + 1.0 for x in settings.joints.lower + settings.joints.upper))
-        self._scale = UNIT_M[hands.unit]
-        self._origin = np.array(hands.base_from_tracker[:3])
-        self._axes = rotation(hands.base_from_tracker[3:])
+        origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+        self._frame = np.column_stack((UNIT_M[hands.unit] * axes, origin))
         self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
     def begin(self, state: Record) -> None:
@@ -51,8 +53,11 @@ class Intake:
 
     def is_fresh(self, state: Record, side: int) -> bool:
         """Whether a hand has been seen, and lately enough."""
-        seen = int(state["hand_ticks"][side])
-        return seen >= 0 and int(state["tick"]) - seen < self._stale_ticks[side]
+        return bool(is_fresh(as_array(state), side, self._stale_ticks))
+
+    def are_fresh(self, state: Record) -> bool:
+        """Whether both hands are."""
+        return bool(are_fresh(as_array(state), self._stale_ticks))
 
     def is_arm_heard(self, state: Record) -> bool:
         """Whether the arm has told its joints lately enough."""
@@ -62,35 +67,20 @@ class Intake:
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         state["tick"] += ticks
-        for side in (0, 1):
-            if self.is_fresh(state, side):
-                self._estimator.advance(state, side, ticks)
-            else:
-                self._estimator.rest(state, side)
+        self._estimator.advance(state, ticks, self._stale_ticks)
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
-        fresh = self.is_fresh(state, side)
-        cause: Cause | None = None
-        if not (finite(sample.position) and finite(sample.orientation)):
-            cause = Cause.NOT_FINITE
-        elif abs(math.hypot(*sample.orientation) - 1.0) > 0.01:
-            cause = Cause.NOT_A_ROTATION
-        elif math.hypot(*(position := self._in_base(sample.position)).tolist()) > FARTHEST_M:
-            cause = Cause.OUT_OF_RANGE
-        else:
-            cause = self._why_not_newer(sample.stamp_ns, int(state["hand_stamps_ns"][side]), fresh=fresh)
-        if cause is not None:
-            state["rejected"][cause] += 1
-            return
-        since = int(state["tick"]) - int(state["hand_ticks"][side])
-        self._estimator.take(state, side, position, interval_s=since * self._period_s, fresh=fresh)
-        state["hand_stamps_ns"][side] = sample.stamp_ns
-        state["hand_ticks"][side] = state["tick"]
-
-    def _in_base(self, position: tuple[float, float, float]) -> Vector:
-        """A tracker's position (3,) in frame `base` [m]."""
-        return np.asarray(self._axes @ (self._scale * np.array(position)) + self._origin)
+        _take_hand(
+            as_array(state),
+            side,
+            sample.stamp_ns,
+            sample.position,
+            sample.orientation,
+            self._frame,
+            self._stale_ticks,
+            self._period_s,
+        )
 
     @staticmethod
     def _why_not_newer(stamp_ns: int, newest_ns: int, *, fresh: bool) -> Cause | None:
@@ -121,3 +111,44 @@ class Intake:
         state["measured_velocities"] = velocity
         state["arm_stamp_ns"] = sample.stamp_ns
         state["arm_tick"] = state["tick"]
+
+
+@compiled
+def _take_hand(
+    states: Records,
+    side: int,
+    stamp_ns: int,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    frame: Vector,
+    stale_ticks: int,
+    period_s: float,
+) -> None:
+    """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base."""
+    state, in_base, norm, far = states[0], np.empty(3), 0.0, 0.0
+    for k in range(4):
+        norm += turn[k] * turn[k]
+    for i in range(3):
+        in_base[i] = frame[i, 3]
+        for k in range(3):
+            in_base[i] += frame[i, k] * position[k]
+        far += in_base[i] * in_base[i]
+    fresh, newest = is_fresh(states, side, stale_ticks), state.hand_stamps_ns[side]
+    cause = -1
+    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+        cause = NOT_FINITE
+    elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
+        cause = NOT_A_ROTATION
+    elif far > FARTHEST_M * FARTHEST_M:
+        cause = OUT_OF_RANGE
+    elif stamp_ns == newest:
+        cause = REPEATED
+    elif fresh and stamp_ns < newest:
+        cause = OLDER
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return
+    since = state.tick - state.hand_ticks[side]
+    take(states, side, in_base, since * period_s, fresh)
+    state.hand_stamps_ns[side] = stamp_ns
+    state.hand_ticks[side] = state.tick

@@ -37,6 +37,22 @@ SPEED, NEAR = 1, 2  # what a step says: the joints' speed is limited; one is nea
 
 
 @compiled
+def measured_error(q: Vector, tasks: Vector, measured: Vector, velocities: Vector) -> tuple[float, float]:
+    """How far the joints are from where they are measured, the farthest [rad]; how fast the tool is
+    measured [m/s], by the tasks at q.
+    """
+    error = speed = 0.0
+    for joint in range(len(q)):
+        error = max(error, abs(q[joint] - measured[joint]))
+    for axis in range(3):
+        along = 0.0
+        for joint in range(len(q)):
+            along += tasks[axis, joint] * velocities[joint]
+        speed += along * along
+    return error, math.sqrt(speed)
+
+
+@compiled
 def slow_down(setpoint: Vector, tool: Vector) -> float:
     """Share of its speed for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1 where it comes
     back.

@@ -77,10 +77,10 @@ class Limiter:
         A NaN in `velocity` means stop. A state that is not finite stays as it is, at velocity 0.
         Never raises.
         """
-        state = np.stack((q, dq, ddq))
-        if not _usable(state):
+        state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.empty(len(q))
+        state[0], state[1], state[2] = q, dq, ddq
+        if not is_usable(state):
             return _stuck(q)
-        moved, wanted = np.empty_like(state), np.empty_like(q)
         met = _toward(state, velocity, self._within, self._gain, self._limits, self._period, wanted, moved)
         if met & CHASED:
             self._chase(state, wanted, moved)
@@ -94,7 +94,7 @@ class Limiter:
         Never raises.
         """
         state = np.stack((q, dq, ddq))
-        if not _usable(state):
+        if not is_usable(state):
             return _stuck(q)
         moved = stop_together(dq, ddq, self._limits[1], self._limits[2], self._period)
         moved[0] += q
@@ -175,9 +175,14 @@ def _make_safe(state: Vector, moved: Vector, within: Vector, limits: Vector, dt:
     return safe
 
 
-def _usable(state: Vector) -> bool:
-    """Whether a state is finite, and small enough to calculate with: false for NaN too."""
-    return bool(np.abs(state).max() < LARGEST)
+@compiled
+def is_usable(state: Vector) -> bool:
+    """Whether a state (3, J) is finite, and small enough to calculate with: false for NaN too."""
+    for row in state:
+        for value in row:
+            if not abs(value) < LARGEST:
+                return False
+    return True
 
 
 def _stuck(q: Vector) -> Limited:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.config import Reach
+from service.core.compiled import compiled
 from service.core.frame import Vector
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
@@ -37,6 +38,25 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
     if not outward:
         return Target(boxed, velocity, acceleration, not inside.all())
     return Target(reached, _without(velocity, outward), _without(acceleration, outward), clamped=True)
+
+
+def numbers(reach: Reach) -> Vector:
+    """A reach (7,) for `is_inside`: centre, inner and outer radius, least x and z [m]."""
+    return np.array([*reach.centre, reach.inner, reach.outer, reach.min_x, reach.min_z])
+
+
+@compiled
+def is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
+    """Whether a position (3,) [m] lies inside the box (2, 3) and the reach, whose `numbers` are
+    given.
+    """
+    square = 0.0
+    for i in range(3):
+        if not box[0, i] <= position[i] <= box[1, i]:
+            return False
+        square += (position[i] - reach[i]) ** 2
+    near, far = reach[3] * reach[3], reach[4] * reach[4]
+    return bool(near <= square <= far and position[0] >= reach[5] and position[2] >= reach[6])
 
 
 def is_reachable(position: Vector, reach: Reach) -> bool:
