@@ -110,7 +110,7 @@ def test_an_entry_point_asks_for_one_blas_thread_before_anything_else(path: Path
 
 
 def test_the_mathematics_imports_nothing_but_mathematics() -> None:
-    allowed = {"numpy", "scipy", "sklearn", "threadpoolctl", "kmp", *sys.stdlib_module_names}
+    allowed = {"numpy", "scipy", "numba", "sklearn", "threadpoolctl", "kmp", *sys.stdlib_module_names}
     for path in (ROOT / "kmp").rglob("*.py"):
         assert imported(path) <= allowed, named(path)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from service.contract.messages import (
     Attachment,
@@ -28,6 +28,8 @@ _POSE = struct.Struct("<7d")
 _COVARIANCE = struct.Struct("<36d")
 _TICK = struct.Struct("<qII")
 _ATTACHMENT = struct.Struct("<Qqq")
+_STAMPED = 12  # bytes of header and stamp
+_MOST_LAYOUTS = 16
 
 
 def _header(stamp_ns: int, frame: str) -> bytearray:
@@ -210,14 +212,52 @@ def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     return PoseWithCovarianceStamped(stamp, frame, values[:3], values[3:], covariance)
 
 
+class _JointLayout(NamedTuple):
+    """What messages of one length from one source have in common."""
+
+    fixed: bytes  # what follows the stamp, up to the first position
+    numbers: struct.Struct  # from there on
+    counts: tuple[int, int, int]  # of positions, velocities, efforts
+    names: tuple[str, ...]
+    frame_id: str
+
+
+_joint_layouts: dict[int, _JointLayout] = {}  # by the length of the message
+
+
 def decode_joints(data: bytes) -> JointState:
-    """The JointState in CDR bytes. Raises WireError."""
+    """The JointState in CDR bytes. Raises WireError.
+
+    A source sends the same names again and again: where they are is found out once.
+    """
+    known = _joint_layouts.get(len(data))
+    if known is not None and data.startswith(known.fixed, _STAMPED) and data.startswith(CDR_HEADER):
+        numbers = known.numbers.unpack_from(data, _STAMPED + len(known.fixed))
+        n, v = known.counts[0], known.counts[0] + 1 + known.counts[1]
+        if numbers[n] == known.counts[1] and numbers[v] == known.counts[2]:
+            sec, nanosec = _STAMP.unpack_from(data, 4)
+            return JointState(
+                sec * _NS + nanosec, known.names, numbers[:n], numbers[n + 1 : v], numbers[v + 1 :], known.frame_id
+            )
     reader = _Reader(data)
     stamp, frame = reader.header()
     names = tuple(reader.string() for _ in range(reader.length()))
     position, velocity, effort = reader.doubles(), reader.doubles(), reader.doubles()
     reader.end()
-    return JointState(stamp, names, position, velocity, effort, frame)
+    message = JointState(stamp, names, position, velocity, effort, frame)
+    _learn_layout(message, data)
+    return message
+
+
+def _learn_layout(message: JointState, data: bytes) -> None:
+    counts = len(message.position), len(message.velocity), len(message.effort)
+    if not message.position or encode_joints(message) != data:
+        return  # another writer's padding: read field by field
+    numbers = struct.Struct(f"<{counts[0]}d" + "".join(f"I4x{count}d" if count else "I" for count in counts[1:]))
+    if len(_joint_layouts) >= _MOST_LAYOUTS:
+        _joint_layouts.clear()
+    fixed = data[_STAMPED : len(data) - numbers.size]
+    _joint_layouts[len(data)] = _JointLayout(fixed, numbers, counts, message.names, message.frame_id)
 
 
 def decode_string(data: bytes) -> str:

@@ -4,6 +4,7 @@ rides with every output.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple, TypeAlias
 
@@ -73,17 +74,23 @@ def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, 
     """Position [rad] and velocity [rad/s] of the joints named, in that order, whatever order they
     came in. Raises WireError.
     """
-    found = {name: i for i, name in enumerate(message.names)}
-    missing = [name for name in names if name not in found]
-    if missing:
-        raise WireError(f"joints {missing} missing among {list(message.names)}")
+    order = _order(message.names, names)
     if len(message.position) != len(message.names) or len(message.velocity) not in (0, len(message.names)):
         raise WireError(
             f"{len(message.names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
         )
-    order = [found[name] for name in names]
     velocity = message.velocity or (0.0,) * len(message.names)
     return tuple(message.position[i] for i in order), tuple(velocity[i] for i in order)
+
+
+@functools.lru_cache(maxsize=64)
+def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
+    """Where each of the names is among those given. Raises WireError."""
+    found = {name: i for i, name in enumerate(given)}
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise WireError(f"joints {missing} missing among {list(given)}")
+    return tuple(found[name] for name in names)
 
 
 def finite(values: tuple[float, ...]) -> bool:

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from service.config import Settings
-from service.contract.messages import PoseStamped
+from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.arm import Arm, Kinematics
 from service.core.frame import (
@@ -312,11 +312,13 @@ def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
     What its stages compile, or load compiled from disk, is then there: the first hand that a loop
     sees would otherwise stop it for a fifth of a second, the first ever for many seconds.
     """
-    arm = msgspec.structs.replace(settings.arm, source="assumed")
+    arm = msgspec.structs.replace(settings.arm, source="state")
     controller = Controller(msgspec.structs.replace(settings, arm=arm), replace(skill, threshold=math.inf), urdf=urdf)
+    names = settings.joints.names
     for index in range(REHEARSED_TICKS):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
-        controller.step(Tick(index, tuple(hands)))
+        measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
+        controller.step(Tick(index, (*hands, measured)))
     controller.step(Tick(REHEARSED_TICKS, (order("hold"),)))

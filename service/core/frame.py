@@ -6,7 +6,8 @@ Frame, State and Timing are NumPy structured scalars laid out as `service.contra
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -70,6 +71,22 @@ def state_layout(joints: int) -> DType:
 
 
 TIMING = _dtype(records.TIMING, 0)
+_TIMING = struct.Struct(f"<3q3f{len(records.STAGES)}f")
+
+
+def timed(
+    tick: int,
+    time_ns: int,
+    missed: int,
+    lateness_us: float,
+    work_us: float,
+    latency_us: float,
+    stages_us: Sequence[float],
+) -> Record:
+    """A Timing of these, which are its fields, in a tenth of the time that setting each takes."""
+    data = _TIMING.pack(tick, time_ns, missed, lateness_us, work_us, latency_us, *stages_us)
+    record: Record = np.frombuffer(data, TIMING)[0]
+    return record
 
 
 def blank(layout: DType) -> Record:

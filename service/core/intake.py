@@ -10,7 +10,7 @@ import numpy as np
 
 from service.config import Settings
 from service.contract.channels import BY_KEY
-from service.contract.messages import JointState, PoseStamped, WireError, finite, in_order
+from service.contract.messages import JointState, PoseStamped, WireError, in_order
 from service.contract.records import Cause
 from service.core.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
@@ -20,6 +20,7 @@ from service.core.rotation import rotation
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 REPEATED, OLDER = int(Cause.REPEATED), int(Cause.OLDER)
+FASTEST_JOINT = 100.0  # [rad/s] beyond it a measured joint is a mistake
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
 
 
@@ -82,15 +83,6 @@ class Intake:
             self._period_s,
         )
 
-    @staticmethod
-    def _why_not_newer(stamp_ns: int, newest_ns: int, *, fresh: bool) -> Cause | None:
-        """A repeated stamp is never news; an older one is, once the source has been silent: its
-        clock was set back.
-        """
-        if stamp_ns == newest_ns:
-            return Cause.REPEATED
-        return Cause.OLDER if fresh and stamp_ns < newest_ns else None
-
     def take_arm(self, state: Record, sample: JointState) -> None:
         """The arm's sample into the state, or counted as rejected."""
         try:
@@ -98,19 +90,43 @@ class Intake:
         except WireError:
             state["rejected"][Cause.INCOMPLETE] += 1
             return
-        if not (finite(position) and finite(velocity)):
-            cause: Cause | None = Cause.NOT_FINITE
-        elif max(map(abs, position)) > self._farthest_joint or max(map(abs, velocity)) > 100:
-            cause = Cause.OUT_OF_RANGE
-        else:
-            cause = self._why_not_newer(sample.stamp_ns, int(state["arm_stamp_ns"]), fresh=self.is_arm_heard(state))
-        if cause is not None:
-            state["rejected"][cause] += 1
-            return
-        state["measured"] = position
-        state["measured_velocities"] = velocity
-        state["arm_stamp_ns"] = sample.stamp_ns
-        state["arm_tick"] = state["tick"]
+        _take_arm(
+            as_array(state),
+            sample.stamp_ns,
+            np.array(position),
+            np.array(velocity),
+            self._farthest_joint,
+            self._silent_ticks,
+        )
+
+
+@compiled
+def _take_arm(
+    states: Records, stamp_ns: int, position: Vector, velocity: Vector, farthest: float, silent_ticks: int
+) -> None:
+    state, cause = states[0], -1
+    fresh, newest = state.arm_tick >= 0 and state.tick - state.arm_tick < silent_ticks, state.arm_stamp_ns
+    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+        cause = NOT_FINITE
+    elif np.abs(position).max() > farthest or np.abs(velocity).max() > FASTEST_JOINT:
+        cause = OUT_OF_RANGE
+    else:
+        cause = _why_not_newer(stamp_ns, newest, fresh)
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return
+    state.measured[:], state.measured_velocities[:] = position, velocity
+    state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
+
+
+@compiled
+def _why_not_newer(stamp_ns: int, newest_ns: int, fresh: bool) -> int:
+    """The cause, or -1. A repeated stamp is never news; an older one is, once the source has been
+    silent: its clock was set back.
+    """
+    if stamp_ns == newest_ns:
+        return REPEATED
+    return OLDER if fresh and stamp_ns < newest_ns else -1
 
 
 @compiled
@@ -141,10 +157,8 @@ def _take_hand(
         cause = NOT_A_ROTATION
     elif far > FARTHEST_M * FARTHEST_M:
         cause = OUT_OF_RANGE
-    elif stamp_ns == newest:
-        cause = REPEATED
-    elif fresh and stamp_ns < newest:
-        cause = OLDER
+    else:
+        cause = _why_not_newer(stamp_ns, newest, fresh)
     if cause >= 0:
         state.rejected[cause] += 1
         return

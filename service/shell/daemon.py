@@ -26,7 +26,7 @@ from service.contract.messages import Attachment, WireError
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
 from service.core.controller import Controller, rehearse, run
-from service.core.frame import TIMING, Event, Frame, Tick, blank, frame_layout, order
+from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
@@ -172,25 +172,21 @@ class Daemon:
 
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
-        timing = blank(TIMING)
-        timing["tick"], timing["time_ns"], timing["missed"] = (
-            tick.index,
-            self._clock.time_ns(tick.index),
-            self._clock.missed,
-        )
-        timing["lateness_us"] = self._late_ns / 1e3
-        before = self._began_ns
+        stages, before, latency_ms = [0.0] * len(STAGES), self._began_ns, 0.0
         for stage, at in self._laps:
-            timing["stages_us"][STAGES.index(stage)] = (at - before) / 1e3
+            stages[STAGES.index(stage)] = (at - before) / 1e3
             before = at
-        if (frame["hand_ages"] == 0).any():
+        if 0 in frame["hand_ages"].tolist():
             latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
             if 0 <= latency_ms < LONGEST_LATENCY_MS:
-                timing["latency_us"] = latency_ms * 1e3
                 self._latency.add(latency_ms)
-        timing["work_us"] = (time.perf_counter_ns() - self._began_ns) / 1e3
-        self._lateness.add(self._late_ns / 1e3)
-        self._work.add(float(timing["work_us"]))
+            else:
+                latency_ms = 0.0
+        late_us, work_us = self._late_ns / 1e3, (time.perf_counter_ns() - self._began_ns) / 1e3
+        time_ns, missed = self._clock.time_ns(tick.index), self._clock.missed
+        timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
+        self._lateness.add(late_us)
+        self._work.add(work_us)
         self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._controller.skill.file)
 
     # --- beside the loop ---

@@ -15,17 +15,20 @@ from service import one_blas_thread
 from numba.core.dispatcher import Dispatcher
 from service.config import Settings, robot_description
 from kmp import compiled_query
-from service.core import arm, hand_estimator, limiter, setpoint, skill, stops
+from service.core import (
+    frame, hand_estimator, intake, inverse_kinematics, limiter, setpoint, skill, stops, workspace
+)
 from service.core.controller import rehearse
 from service.cli.main import main
 from sim.experiments.rehearsal import shipped
 
+MODULES = (
+    compiled_query, frame, hand_estimator, intake, inverse_kinematics, limiter, setpoint, skill, stops, workspace
+)
+
 def compiled():
     return {
-        name: len(f.signatures)
-        for module in (arm, compiled_query, hand_estimator, limiter, setpoint, skill, stops)
-        for name, f in vars(module).items()
-        if isinstance(f, Dispatcher)
+        name: len(f.signatures) for module in MODULES for name, f in vars(module).items() if isinstance(f, Dispatcher)
     }
 
 nothing = compiled()
