@@ -32,17 +32,19 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Exit code 0 only if the task succeeded."""
-    report = run(args.out, scene=args.scene, say=lambda line: print(line, file=sys.stderr, flush=True))
+    report = run(
+        args.out, scene=args.scene, rate_hz=args.rate, say=lambda line: print(line, file=sys.stderr, flush=True)
+    )
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] else 1
 
 
-def run(out: Path, *, scene: Path | None, say: Callable[[str], None]) -> dict[str, Any]:
+def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
     out.mkdir(parents=True, exist_ok=True)
     request = _output([sys.executable, "-m", "sim.scene", *([str(scene)] if scene else [])])
     add = decode_request(request.encode(), Add)
-    with launched(out, "--arm", "state", record=out) as service:
+    with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)

@@ -71,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--scene", metavar="FILE", type=Path, help="TOML file with handover, glass and soldering as [x, y, z] in metres"
     )
+    c.add_argument("--rate", metavar="HZ", type=int, default=500, help="of the loop (default: %(default)s)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(

@@ -39,7 +39,7 @@ from service.core.intake import Intake
 from service.core.inverse_kinematics import measured_error, slow_down
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
-from service.core.setpoint import SetpointGenerator
+from service.core.setpoint import WRONG, SetpointGenerator
 from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp, is_inside, numbers
 
@@ -89,6 +89,12 @@ class Controller:
     def state(self) -> Record:
         """A copy of all that the next frame depends on, but for settings and skill."""
         return copied(self._state)
+
+    def imitate(self, other: Controller) -> None:
+        """Takes over what another controller with the same settings remembers, and its skill."""
+        if self._skill is not other._skill:
+            self._adopt(other._skill)
+        self._memory[:] = other._memory
 
     @property
     def skill(self) -> Skill:
@@ -235,12 +241,10 @@ class Controller:
     def _lead(self, target: Target, here: Kinematics) -> bool:
         """Moves the setpoint on; whether a limit was met. One that passes a bound is a fault."""
         state, box = self._state, self._skill.workspace
-        before = state["setpoint"].copy()
-        slow = slow_down(before, here.position)
+        slow = slow_down(state["setpoint"], here.position)
         met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
-        if self._setpoint.why_wrong(state, before, box):
+        if met == WRONG:
             state["mode"], state["reason"] = FAULT, Reason.SETPOINT
-            state["setpoint"] = before
         return bool(met)
 
     def _move(self, wanted: Vector) -> bool:

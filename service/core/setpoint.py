@@ -35,8 +35,8 @@ BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
 SHARE, SPEED_SHARE = 0.91, 0.97  # of acceleration and jerk, and of speed, that is planned with
 HULL_TIME_S, HULL_SPANS, HULL_MARGIN = 0.35, 7, 0.03  # [m]; of the spans one is always being filled
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
-WRONG = ("", "not finite", "speed", "acceleration", "jerk", "position")
-PLANNED, STOPPED = 1, 2  # what a step says: a bound was met in planning; the stop was begun
+BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
+PLANNED, STOPPED, WRONG = 1, 2, 3  # what a step says: a bound was met in planning; the stop was begun; one was passed
 DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
 
 
@@ -60,13 +60,14 @@ class SetpointGenerator:
         state["hull_ticks"] = 0
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
-        """Moves the setpoint one period on; 0, or PLANNED or STOPPED where a limit was met.
+        """Moves the setpoint one period on; 0, or PLANNED or STOPPED where a limit was met, or
+        WRONG where a bound was passed, which cannot be: it then stays where it is.
 
         box: (2, 3) lower and upper corner [m] of the workspace. costs: (3, 3, J) what a tool
         velocity, acceleration and jerk cost of each joint's limit, 1 for all of it. slow: share of
         the speed that is allowed, as the arm is behind.
         """
-        ticks, met = _lead(
+        ticks, said = _lead(
             state["setpoint"],
             state["hull"],
             int(state["hull_ticks"]),
@@ -83,14 +84,14 @@ class SetpointGenerator:
             self._period_s,
         )
         state["hull_ticks"] = ticks
-        return int(met)
+        return int(said)
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
         """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
 
         They hold by the way a step is made; this looks again, from outside.
         """
-        return WRONG[_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)]
+        return BOUNDS[_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)]
 
 
 def tracker_gains(jerk_weight: float) -> Vector:
@@ -141,7 +142,7 @@ def _bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector
 def _wrong(
     setpoint: Vector, before: Vector, hull: Vector, box: Vector, lowest: Vector, limits: Vector, dt: float
 ) -> int:
-    """Which of WRONG a step from `before` (3, 3) is."""
+    """Which of BOUNDS a step from `before` (3, 3) is."""
     fastest, hardest, sharpest = limits[0], limits[1], limits[2]
     if not np.isfinite(setpoint).all():
         return 1
@@ -185,11 +186,15 @@ def _lead(
     dt: float,
 ) -> tuple[int, int]:
     """One step, in place; ticks in the newest span, and what the step says."""
-    target, low, high = np.empty((3, 3)), np.empty(3), np.empty(3)
+    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
     target[0], target[1], target[2] = position, velocity, acceleration
     ticks = _remember(hull, ticks, position, span_ticks)
     _bounds(hull, box, lowest, low, high)
-    return ticks, _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
+    met = _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
+    if _wrong(setpoint, before, hull, box, lowest, limits, dt):
+        setpoint[:] = before
+        return ticks, WRONG
+    return ticks, met
 
 
 @compiled

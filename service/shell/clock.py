@@ -17,6 +17,7 @@ from service.contract.requests import Percentiles
 from service.core.frame import Vector
 
 SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
+PREPARE_NS = 450_000  # before a deadline the next tick is prepared
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
 
 
@@ -43,18 +44,28 @@ class Deadlines:
         self._wall_ns = time.time_ns()
         self._index = -1
 
-    def wait(self) -> tuple[int, int]:
-        """The number of the next deadline, once it has come, and how late it is [ns]."""
+    def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
+        """The number of the next deadline, once it has come, and how late it is [ns].
+
+        `prepare` is called shortly before it, where there is time.
+        """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
         self.missed += index - self._index - 1
         self._index = index
         deadline = self._start_ns + index * self.period_ns
-        early = deadline - self._now_ns() - self._spin_ns
-        if early > 0:
-            self._sleep(early / 1e9)
+        if prepare is not None and self._sleep_until(deadline - PREPARE_NS):
+            prepare()
+        self._sleep_until(deadline - self._spin_ns)
         while (late := self._now_ns() - deadline) < 0:
             pass
         return index, late
+
+    def _sleep_until(self, at_ns: int) -> bool:
+        """Whether there was time to sleep."""
+        early = at_ns - self._now_ns()
+        if early > 0:
+            self._sleep(early / 1e9)
+        return early > 0
 
     def rate_hz(self) -> float:
         """Ticks a second since start, as achieved."""
