@@ -44,7 +44,9 @@ class Launched:
 
 
 @contextlib.contextmanager
-def launched(folder: Path, *arguments: str, record: Path | None = None) -> Iterator[Launched]:
+def launched(
+    folder: Path, *arguments: str, record: Path | None = None, program: tuple[str, ...] = ("-m", "service")
+) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
     Raises LaunchError.
@@ -59,8 +61,8 @@ def launched(folder: Path, *arguments: str, record: Path | None = None) -> Itera
         '[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\n'
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items())
     )
-    command = [sys.executable, "-m", "service", "serve", "--config", str(config), *arguments]
-    with log.open("a") as errors:
+    command = [sys.executable, *program, "serve", "--config", str(config), *arguments]
+    with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
     try:
         yield Launched(process, _endpoint(process, log), log)

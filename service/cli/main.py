@@ -31,6 +31,7 @@ RUN_BY = {
     "resume": "clients",
     "reset": "clients",
     "view": "view",
+    "bench": "bench",
 }
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
@@ -73,6 +74,12 @@ def parser() -> argparse.ArgumentParser:
     )
     c.add_argument("--rate", metavar="HZ", type=int, default=500, help="of the loop (default: %(default)s)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+
+    c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
+    c.add_argument("--seconds", metavar="S", type=float, default=24.0, help="to measure for (default: %(default)g)")
+    c.add_argument("--rate", metavar="HZ", type=int, default=500, help="of the loop (default: %(default)s)")
+    c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    c.add_argument("--output", metavar="DIR", type=Path, help="write bench.json there")
 
     c = command(
         "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
