@@ -36,6 +36,11 @@ def test_limits_may_be_lowered() -> None:
     assert given.tool.max_speed == 0.3
 
 
+@pytest.mark.parametrize("text", ['"a - at `$.x`" = 1', '[tool]\n"a - at `$.tool.max_speed[1]`" = 1'])
+def test_a_name_that_looks_like_a_path_is_refused_in_words(text: str) -> None:
+    assert "unknown field" in refusal(text)
+
+
 @pytest.mark.parametrize("name", ["a", "bench", "lab/bench2", "a/b/c", "Wärmebank", "cell-1_x.y"])
 def test_a_cell_may_hold_slashes(name: str) -> None:
     assert parse(f'cell = "{name}"', origin="cell.toml").cell == name

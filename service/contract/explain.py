@@ -26,7 +26,10 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
     message, path = (message, path.rstrip("`")) if found else (str(error), "$")
     if message.startswith("$"):
         return message  # said by a check of our own, which knows better
-    value, node, accepted = _at(path, given, inspect.type_info(kind))
+    try:
+        value, node, accepted = _at(path, given, inspect.type_info(kind))
+    except (LookupError, TypeError, AttributeError):  # a name in what was given looks like a path
+        return f"$: {error}"
     unknown = re.match(r"Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
         return f"{path}: unknown field {unknown[1]!r}; known are {', '.join(_known(node)) or 'none'}"
@@ -56,7 +59,7 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
         if isinstance(node, inspect.StructType) and field:
             if field == node.tag_field:
                 return value.get(field), inspect.LiteralType((node.tag,)), ""
-            inner = next(f.type for f in node.fields if f.encode_name == field)
+            inner = {f.encode_name: f.type for f in node.fields}[field]
         elif isinstance(node, inspect.UnionType) and field:
             tags = tuple(t.tag for t in node.types if isinstance(t, inspect.StructType))
             return value.get(field), inspect.LiteralType(tags), ""

@@ -61,7 +61,7 @@ class Daemon:
         self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
-        self._realtime = False
+        self._realtime, self._version = False, version("thirdhand")
         self._status: Status | None = None
         self._late_ns = self._began_ns = 0
         self._laps: list[tuple[str, int]] = []
@@ -253,7 +253,7 @@ class Daemon:
             latency_ms=self._latency.percentiles(),
             scribe=self._scribe.status(),
             endpoints=self.endpoints,
-            version=version("thirdhand"),
+            version=self._version,
         )
 
 

@@ -130,14 +130,14 @@ class Requests:
         run_beside_real_time()
         while (item := source.get()) is not None:
             suffix, query = item
-            if source is self._quick and suffix in SLOW and not self._is_list(query):
-                self._slow.put(item)
-                continue
-            with query:  # its end tells the asker that no more replies come
-                try:
+            try:
+                if source is self._quick and suffix in SLOW and not self._is_list(query):
+                    self._slow.put(item)
+                    continue
+                with query:  # its end tells the asker that no more replies come
                     self._reply(suffix, query)
-                except zenoh.ZError as error:
-                    self._note(f"{suffix} could not be answered: {error}")
+            except Exception as error:  # no request may end the thread that answers all others
+                self._note(f"{suffix} could not be answered: {error!r}")
             item = query = None
 
     def _is_list(self, query: zenoh.Query) -> bool:

@@ -113,6 +113,9 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         ("skill", {"name": "sodlering"}, "There are: soldering"),
         ("skill", {"name": "../secret"}, "$.name"),
         ("hold", {"why": "so"}, "why"),
+        ("via_points", {"op": "list", "a - at `$.x`": 1}, "unknown field"),
+        ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}, "unknown field"),
+        ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}, "unknown field"),
     ],
 )
 def test_what_is_not_understood_is_refused_in_words(
@@ -121,6 +124,7 @@ def test_what_is_not_understood_is_refused_in_words(
     with pytest.raises(RefusedError) as refused:
         shared_daemon.client.ask(suffix, request_)
     assert words in str(refused.value)
+    assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == []  # and others are still answered
 
 
 @pytest.fixture(scope="module")
