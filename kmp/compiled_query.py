@@ -27,7 +27,12 @@ except ImportError:  # the NumPy path serves
 
 
 def _compiled(function: Any) -> Any:
-    return function if njit is None else njit(cache=True)(function)
+    if njit is None:
+        return function
+    try:
+        return njit(cache=True)(function)
+    except RuntimeError:  # no folder can be written to: compiled anew at each start
+        return njit(function)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from service.contract.explain import ExplainedError
 
-START_TIMEOUT_S = 60.0
+START_TIMEOUT_S, LONG_START_S = 180.0, 6.0
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
 
@@ -45,7 +45,11 @@ class Launched:
 
 @contextlib.contextmanager
 def launched(
-    folder: Path, *arguments: str, record: Path | None = None, program: tuple[str, ...] = ("-m", "service")
+    folder: Path,
+    *arguments: str,
+    record: Path | None = None,
+    program: tuple[str, ...] = ("-m", "service"),
+    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
@@ -65,7 +69,7 @@ def launched(
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
     try:
-        yield Launched(process, _endpoint(process, log), log)
+        yield Launched(process, _endpoint(process, log, say), log)
     finally:
         if process.poll() is None:
             process.terminate()
@@ -77,9 +81,11 @@ def launched(
             process.stdout.close()
 
 
-def _endpoint(process: subprocess.Popen[str], log: Path) -> str:
+def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:
     """Where a daemon says that it listens."""
     assert process.stdout is not None
+    if not select.select([process.stdout], [], [], LONG_START_S)[0]:
+        say("its first start on this machine compiles what the loop runs: about half a minute")
     until = time.monotonic() + START_TIMEOUT_S
     while (left_s := until - time.monotonic()) > 0 and select.select([process.stdout], [], [], left_s)[0]:
         line = process.stdout.readline()

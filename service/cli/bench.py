@@ -28,7 +28,6 @@ from service.shell.probe import percentiles
 PROGRAM = ("-m", "service")
 PROBE = [sys.executable, "-m", "service.shell.probe"]
 PARTS = 6  # of the time: the empty loop before and after, the core before and after, the whole for two
-START_TIMEOUT_S = 60.0
 MISSED_MORE = 0.0005  # share of deadlines that the whole may miss more than the empty loop
 NOTHING_US = 10.0  # of lateness, that ratios of medians be none of two nothings
 SLOWER = 1.15  # than half a period, the way to the daemon and back, and the work
@@ -62,7 +61,7 @@ def run(
     for kind in ("empty", "core", "whole", "core", "empty"):
         if kind == "whole":
             say(f"whole: daemon with recorder and viewer, a tracker, {2 * part_s:g} s")
-            whole = _whole(rate_hz, 2 * part_s, skill, program)
+            whole = _whole(rate_hz, 2 * part_s, skill, program, say)
         else:
             say(f"{kind}: {part_s:g} s")
             found[kind].append(_probe(*kinds[kind]))
@@ -71,11 +70,13 @@ def run(
     return report | {"ratios": _ratios(report)}
 
 
-def _whole(rate_hz: int, seconds: float, skill: str, program: tuple[str, ...]) -> dict[str, Any]:
+def _whole(
+    rate_hz: int, seconds: float, skill: str, program: tuple[str, ...], say: Callable[[str], None]
+) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, _echo() as echo_at:
         folder = Path(name)
         arguments = ("--arm", "assumed", "--rate", str(rate_hz))
-        with launched(folder, *arguments, record=folder, program=program) as service:
+        with launched(folder, *arguments, record=folder, program=program, say=say) as service:
             heard = _probe("tracker", skill, service.endpoint, echo_at, str(seconds))
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()

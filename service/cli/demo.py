@@ -44,7 +44,7 @@ def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], Non
     out.mkdir(parents=True, exist_ok=True)
     request = _output([sys.executable, "-m", "sim.scene", *([str(scene)] if scene else [])])
     add = decode_request(request.encode(), Add)
-    with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out) as service:
+    with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)

@@ -13,5 +13,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """The function, compiled at its first call; its plain Python stays at hand as `.py_func`."""
-    return cast(F, numba.njit(cache=True)(function))
+    """The function, compiled at its first call; its plain Python stays at hand as `.py_func`.
+
+    Where no folder can be written to, it is compiled anew at each start.
+    """
+    try:
+        return cast(F, numba.njit(cache=True)(function))
+    except RuntimeError:
+        return cast(F, numba.njit(function))

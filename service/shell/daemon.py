@@ -39,6 +39,7 @@ from service.shell.workshop import Workshop
 log = logging.getLogger("thirdhand")
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 STOP_TIMEOUT_S = 3.0
+LONG_START_S = 3.0
 LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
 
 
@@ -54,7 +55,10 @@ class Daemon:
         self._stop = threading.Event()
         self._ended = threading.Event()
         urdf = robot_description(settings)
+        slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
+        slow.start()
         rehearse(settings, skill, urdf=urdf)
+        slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
