@@ -23,7 +23,7 @@ from service.core.limiter import MARGIN, approach_gain
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large one's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-SPARING = 0.3  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
+SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
 PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
