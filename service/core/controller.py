@@ -48,6 +48,7 @@ TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up aft
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
+FAR = int(Reason.FAR_FROM_DEMONSTRATIONS)
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -183,11 +184,11 @@ class Controller:
             return
         fault = self._watch_arm()
         if fault is not None:
-            state["mode"], state["reason"] = FAULT, fault
+            state["mode"], state["reason"] = FAULT, fault.value
             return
         reason = self._why_hold(prediction)
         state["mode"] = FOLLOW if reason is Reason.NONE else HOLD
-        state["reason"] = reason
+        state["reason"] = reason.value
 
     def _watch_arm(self) -> Reason | None:
         """What is wrong with the arm, if anything; where it appears anew, joints start from it."""
@@ -216,9 +217,8 @@ class Controller:
             return Reason.ARM_ERROR
         if speed <= self._settings.tool.fault_speed:
             state["slow_tick"] = state["tick"]
-        return (
-            Reason.TOOL_SPEED if (state["tick"] - state["slow_tick"]) * self._settings.period_s > TOO_FAST_S else None
-        )
+        fast_for = int(state["tick"]) - int(state["slow_tick"])
+        return Reason.TOOL_SPEED if fast_for * self._settings.period_s > TOO_FAST_S else None
 
     def _why_hold(self, prediction: Prediction | None) -> Reason:
         state = self._state
@@ -229,7 +229,7 @@ class Controller:
         if prediction is None:
             return Reason.NO_HANDS if min(state["hand_ticks"].tolist()) < 0 else Reason.STALE_HAND
         # what has been found far must come clearly nearer again
-        ease = 0.9 if state["reason"] == Reason.FAR_FROM_DEMONSTRATIONS else 1.0
+        ease = 0.9 if int(state["reason"]) == FAR else 1.0
         return Reason.FAR_FROM_DEMONSTRATIONS if prediction.deviation > ease * self._skill.threshold else Reason.NONE
 
     def _clamp(self, prediction: Prediction) -> Target:
