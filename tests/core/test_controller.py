@@ -308,3 +308,15 @@ def test_every_output_has_a_function(taught: Skill) -> None:
         "joints/command",
         "tool/setpoint",
     ]
+
+
+def test_a_twin_decides_the_same_and_leaves_the_other_alone(taught: Skill) -> None:
+    ticks = resting(0, 300)
+    controller, twin = (Controller(ASSUMED, taught, urdf=URDF) for _ in range(2))
+    for tick in ticks[:-1]:
+        controller.step(tick)
+    before = controller.state.tobytes()
+    twin.imitate(controller)
+    seen = twin.step(ticks[-1])
+    assert controller.state.tobytes() == before
+    assert controller.step(ticks[-1]).tobytes() == seen.tobytes()

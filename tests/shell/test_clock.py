@@ -11,7 +11,7 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.requests import Percentiles
-from service.shell.clock import Deadlines, Window
+from service.shell.clock import PREPARE_NS, Deadlines, Window
 
 PERIOD_NS = 2_000_000
 
@@ -133,3 +133,19 @@ def test_a_window_tells_percentiles_of_its_last_values_only() -> None:
     for value in range(1000, 1101):
         window.add(float(value))
     assert window.percentiles() == Percentiles(1050.0, 1099.0, 1100.0)
+
+
+def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -> None:
+    clock, prepared = FakeClock(), []
+    start, deadlines = clock.now, clock.deadlines()
+
+    def prepare() -> None:
+        prepared.append(clock.now - start)
+        clock.now += 200_000
+
+    deadlines.wait(prepare)  # the first deadline is now: no time
+    assert deadlines.wait(prepare) == (1, 0)
+    assert prepared == [PERIOD_NS - PREPARE_NS]
+    clock.now = start + 2 * PERIOD_NS - PREPARE_NS + 1
+    assert deadlines.wait(prepare) == (2, 0)
+    assert len(prepared) == 1

@@ -1,0 +1,65 @@
+"""The compiled numbers of the inverse kinematics against plain references."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from service.core.inverse_kinematics import (
+    DAMPING,
+    DIRECTION_LEVER,
+    GAP_FREE,
+    GAP_SLOW,
+    least_squares,
+    measured_error,
+    slow_down,
+    tool_speeds,
+    tool_tasks,
+)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    tasks, wanted, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
+    damping, width = 10 ** random.uniform(-4, -1), 10 ** random.uniform(-1.5, 0.5)
+    bounds = np.sort(random.normal(size=(2, 7)), axis=0) * width
+    bounds[0], bounds[1] = np.minimum(bounds[0], -1e-3), np.maximum(bounds[1], 1e-3)
+    found = np.empty(7)
+    least_squares(tasks, wanted, posture, damping, bounds, found)
+    whole = np.vstack([tasks, np.sqrt(damping) * np.eye(7)])
+    right = np.concatenate([wanted, np.sqrt(damping) * posture])
+    best = lsq_linear(whole, right, bounds=(bounds[0], bounds[1]), method="bvls", tol=1e-14).x
+    np.testing.assert_allclose(found, best, atol=1e-7)
+
+
+def test_tasks_are_the_tool_s_velocity_and_what_turns_its_direction() -> None:
+    random = np.random.default_rng(1)
+    jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
+    tasks = np.empty((5, 7))
+    damping = tool_tasks(jacobian, rotation, tasks)
+    expected = np.vstack([jacobian[:3], DIRECTION_LEVER * rotation[:, :2].T @ jacobian[3:]])
+    np.testing.assert_allclose(tasks, expected, rtol=1e-12, atol=1e-15)
+    assert damping == DAMPING  # far from singular
+
+
+def test_speeds_and_errors_are_those_of_numpy() -> None:
+    random = np.random.default_rng(2)
+    tasks, q, dq, ddq = random.normal(size=(5, 7)), *random.normal(size=(3, 7))
+    jerk = random.uniform(300, 500, 7)
+    speed, coming = tool_speeds(tasks, dq, ddq, jerk)
+    crest = np.linalg.norm(tasks[:3] @ (dq + ddq * np.abs(ddq) / (2 * jerk)))
+    assert speed == pytest.approx(np.linalg.norm(tasks[:3] @ dq), rel=1e-12)
+    assert coming == pytest.approx(max(speed, crest), rel=1e-12)
+    measured = q + 0.01 * random.normal(size=7)
+    error, fast = measured_error(q, tasks, measured, dq)
+    assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
+
+
+def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
+    setpoint, tool = np.zeros((3, 3)), np.zeros(3)
+    setpoint[0, 0], setpoint[1, 0] = GAP_FREE + GAP_SLOW, 0.2
+    assert slow_down(setpoint, tool) == pytest.approx(0.5)
+    setpoint[1, 0] = -0.2  # it comes back
+    assert slow_down(setpoint, tool) == 1.0
