@@ -31,7 +31,7 @@ from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
-from service.shell.clock import SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
+from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
@@ -134,10 +134,10 @@ class Daemon:
     def _ticks(self) -> Iterator[Tick]:
         inbox: list[Event] = []
         stop_by: float | None = None
+        # a period of 1 ms has no room for it
+        prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
         while True:
-            index, self._late_ns = self._clock.wait(
-                self._warm_up if __import__("os").environ.get("TH_WARM") == "1" else None
-            )
+            index, self._late_ns = self._clock.wait(prepare)
             self._began_ns = time.perf_counter_ns()
             self._laps = []
             inbox = [
