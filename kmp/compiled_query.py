@@ -8,31 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
 
 from kmp.checks import Array
+from kmp.compiled import AVAILABLE, compiled
 from kmp.dense import Dense
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel
 from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.query import MotionPrediction, Query
-
-try:
-    from numba import njit
-except ImportError:  # the NumPy path serves
-    njit = None
-
-
-def _compiled(function: Any) -> Any:
-    if njit is None:
-        return function
-    try:
-        return njit(cache=True)(function)
-    except RuntimeError:  # no folder can be written to: compiled anew at each start
-        return njit(function)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +33,7 @@ class CompiledQuery(Immutable):
     @classmethod
     def of(cls, query: Query) -> CompiledQuery | None:
         """The query for compiled loops; None where there are none for it."""
-        if njit is None or not isinstance(query.kernel, GaussianKernel):
+        if not AVAILABLE or not isinstance(query.kernel, GaussianKernel):
             return None
         solution = query.solution
         return cls(query, _packed(solution) if isinstance(solution, Dense) else None)
@@ -86,8 +72,7 @@ class CompiledQuery(Immutable):
     def _covariance(self, values: Array) -> Array:
         q = self.query
         if self.columns is None:
-            posterior = q.solution.posterior_covariance_one(values)
-            return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * q.covariance_scale)
+            return q.covariance(values)
         outputs = len(q.prior_mean)
         found = np.empty((outputs, outputs))
         if not _posterior(values, self.columns, np.zeros((outputs, len(values) * outputs)), found):
@@ -102,7 +87,7 @@ def _packed(solution: Dense) -> Array:
     return frozen(np.concatenate([inverse[i - i % o :, i] for i in range(len(inverse))]))
 
 
-@_compiled
+@compiled
 def _motion(
     query: Array,
     velocity: Array,
@@ -159,7 +144,7 @@ def _motion(
     return math.isfinite(total)
 
 
-@_compiled
+@compiled
 def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
     """I - k (K + lambda_c Sigma)^-1 k^T into out (O, O), by roots (O, R O) = (L^-1 (k (x) I))^T;
     whether it is positive definite.

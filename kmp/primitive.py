@@ -129,7 +129,7 @@ class KMP(Immutable):
         s = self._checked_many(queries)
         if len(s) == 1:
             row = self._query.row(s[0])
-            return unchecked(self._query.mean(row)[None], self._query.covariance(row)[None])
+            return unchecked(self._query.mean(row)[None], self._query.covariance(row.kernel)[None])
         solution = self._solution
         batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
         posterior = [solution.posterior_covariance(self.kernel(one, solution.centres)) for one in batches]

@@ -85,9 +85,9 @@ class Query(Immutable):
         """xi(s) (O,). Equation (8)."""
         return np.asarray((row.kernel @ self.weights).ravel() + self.prior_mean)
 
-    def covariance(self, row: KernelRow) -> Array:
-        """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O). IJRR 2019."""
-        posterior = self.solution.posterior_covariance_one(row.kernel)
+    def covariance(self, kernel: Array) -> Array:
+        """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
+        posterior = self.solution.posterior_covariance_one(kernel)
         return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * self.covariance_scale)
 
     def jacobian(self, row: KernelRow) -> Array:
@@ -106,7 +106,7 @@ class Query(Immutable):
             self.mean(row),
             jacobian @ velocity,
             jacobian @ acceleration + curvature,
-            self.covariance(row) if covariance else None,
+            self.covariance(row.kernel) if covariance else None,
             jacobian,
             curvature,
         )

@@ -88,14 +88,26 @@ def encode_joints(message: JointState) -> bytes:
     return bytes(out)
 
 
+def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
+    """The layout of so many positions, velocities and efforts, each behind its count but for the
+    first, whose count stands before.
+    """
+    layout, at = f"<{counts[0]}d", 0
+    for count in counts[1:]:
+        layout, at = layout + "I", at + 4
+        if count:
+            layout, at = layout + ("4x" if at % 8 else "") + f"{count}d", 0
+    return struct.Struct(layout)
+
+
 @functools.cache
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
     """What follows the stamp in every command of these joints up to its first number, and the
     layout from there on.
     """
     n = len(names)
-    empty = encode_joints(JointState(0, names, (0.0,) * n, ()))
-    return empty[12 : len(empty) - 8 - n * 8], struct.Struct(f"<{n}dII{n}dI")
+    empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
+    return empty[_STAMPED : len(empty) - layout.size], layout
 
 
 def encode_command(
@@ -106,7 +118,7 @@ def encode_command(
     """
     prefix, layout = _command_layout(names)
     return b"".join(
-        (CDR_HEADER, _STAMP.pack(*divmod(stamp_ns, _NS)), prefix, layout.pack(*position, len(names), 0, *velocity, 0))
+        (CDR_HEADER, _STAMP.pack(*divmod(stamp_ns, _NS)), prefix, layout.pack(*position, len(names), *velocity, 0))
     )
 
 
@@ -253,7 +265,7 @@ def _learn_layout(message: JointState, data: bytes) -> None:
     counts = len(message.position), len(message.velocity), len(message.effort)
     if not message.position or encode_joints(message) != data:
         return  # another writer's padding: read field by field
-    numbers = struct.Struct(f"<{counts[0]}d" + "".join(f"I4x{count}d" if count else "I" for count in counts[1:]))
+    numbers = _joint_numbers(counts)
     if len(_joint_layouts) >= _MOST_LAYOUTS:
         _joint_layouts.clear()
     fixed = data[_STAMPED : len(data) - numbers.size]

@@ -41,6 +41,16 @@ class Solution(NamedTuple):
     near_limit: bool
 
 
+class Closing(NamedTuple):
+    """How the tool closes in on a position that is far: braking [m/s²], greatest speed [m/s], and
+    the damping [s²] by which it is steady at unreachable ones.
+    """
+
+    braking: float
+    speed: float
+    far_damping: float
+
+
 class Kinematics(NamedTuple):
     """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
 
@@ -63,7 +73,7 @@ class Arm:
     J joints, in the order of the settings; all others of the description stay at 0.
     """
 
-    def __init__(self, settings: Settings, urdf: str) -> None:
+    def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
         self._model = _chain(pin.buildModelFromXML(urdf), settings.joints.names)
         plate = self._model.frames[self._model.getFrameId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
@@ -72,9 +82,9 @@ class Arm:
         tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
         self._tool = self._model.addFrame(tool)
         self._data = self._model.createData()
-        most, closing_speed = TOOL_SHARE * settings.tool.max_speed, min(settings.tool.max_speed, CLOSING_SPEED)
-        braking = CLOSING_BRAKES * settings.tool.max_acceleration
-        self._closing = np.array([settings.period_s, braking, closing_speed, FAR_DAMPING, most])
+        fastest, hardest = settings.tool.max_speed, settings.tool.max_acceleration
+        closing = closing or Closing(CLOSING_BRAKES * hardest, min(fastest, CLOSING_SPEED), FAR_DAMPING)
+        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * fastest])
         limits = settings.joints
         self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
         self._velocity = np.array(limits.velocity)
@@ -87,23 +97,11 @@ class Arm:
             PLANNED_SHARE[:, None] * np.array([limits.velocity, limits.acceleration, limits.jerk]) / self._scale
         )
 
-    def pose(self, q: Vector) -> tuple[Vector, Vector]:
-        """Position (3,) [m] and rotation (3, 3) of the tool in frame base, at joints q (J,)."""
-        pin.forwardKinematics(self._model, self._data, q)
-        placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        return placement.translation.copy(), placement.rotation.copy()
-
-    def velocity(self, q: Vector, dq: Vector) -> Vector:
-        """Velocity of the tool (3,) [m/s] in frame base, at joints q (J,) [rad] and dq (J,)
-        [rad/s].
-        """
-        linear: Vector = self._jacobian(q)[:3] @ dq
-        return linear
-
     def at(self, q: Vector) -> Kinematics:
         """The arm at joints q (J,) [rad]."""
         q = np.minimum(np.maximum(q, -1e3), 1e3)
-        jacobian = self._jacobian(q)
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
         rotation, tasks = placement.rotation.copy(), np.empty((5, len(q)))
         damping = tool_tasks(np.ascontiguousarray(jacobian), rotation, tasks)
@@ -156,14 +154,6 @@ class Arm:
         )
         out.setflags(write=False)
         return Solution(out, bool(said & SPEED), bool(said & NEAR))
-
-    def _jacobian(self, q: Vector) -> Vector:
-        """The tool's Jacobian (6, J) in frame base, linear rows first; leaves the placements in
-        `_data`.
-        """
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian: Vector = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
-        return jacobian
 
 
 def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:

@@ -41,7 +41,7 @@ from service.core.limiter import Limiter
 from service.core.rotation import rotation
 from service.core.setpoint import WRONG, SetpointGenerator
 from service.core.skill import Prediction, Skill
-from service.core.workspace import Target, clamp, is_inside, numbers
+from service.core.workspace import Target, clamp
 
 REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
@@ -83,7 +83,7 @@ class Controller:
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
         self._orientation = np.ascontiguousarray(skill.orientation)
-        self._reach, self._nothing = numbers(settings.reach), np.zeros((3, 3))
+        self._nothing = np.zeros((3, 3))
         self._here: Kinematics | None = None  # of the joints asked about last
 
     @property
@@ -234,8 +234,6 @@ class Controller:
 
     def _clamp(self, prediction: Prediction) -> Target:
         """The target where it may be, with the motion that stays there."""
-        if is_inside(prediction.position, self._skill.workspace, self._reach):
-            return Target(*prediction[:3], clamped=False)
         return clamp(*prediction[:3], box=self._skill.workspace, reach=self._settings.reach)
 
     def _lead(self, target: Target, here: Kinematics) -> bool:

@@ -24,7 +24,7 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from service.core.compiled import compiled
+from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
 
 MODES = 3
@@ -217,12 +217,6 @@ def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: 
         else:
             state.means[side, :, 1:] = 0.0
             state.hands[side, 1:] = 0.0
-
-
-@compiled
-def are_fresh(states: Records, stale_ticks: int) -> bool:
-    """Whether both hands are."""
-    return is_fresh(states, 0, stale_ticks) and is_fresh(states, 1, stale_ticks)
 
 
 @compiled

@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 
+from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.channels import BY_KEY
 from service.contract.messages import JointState, PoseStamped, WireError, in_order
 from service.contract.records import Cause
-from service.core.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
-from service.core.hand_estimator import HandEstimator, are_fresh, is_fresh, take
+from service.core.hand_estimator import HandEstimator, is_fresh, take
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -58,7 +58,7 @@ class Intake:
 
     def are_fresh(self, state: Record) -> bool:
         """Whether both hands are."""
-        return bool(are_fresh(as_array(state), self._stale_ticks))
+        return self.is_fresh(state, 0) and self.is_fresh(state, 1)
 
     def is_arm_heard(self, state: Record) -> bool:
         """Whether the arm has told its joints lately enough."""
@@ -104,29 +104,40 @@ class Intake:
 def _take_arm(
     states: Records, stamp_ns: int, position: Vector, velocity: Vector, farthest: float, silent_ticks: int
 ) -> None:
-    state, cause = states[0], -1
-    fresh, newest = state.arm_tick >= 0 and state.tick - state.arm_tick < silent_ticks, state.arm_stamp_ns
-    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-        cause = NOT_FINITE
-    elif np.abs(position).max() > farthest or np.abs(velocity).max() > FASTEST_JOINT:
-        cause = OUT_OF_RANGE
-    else:
-        cause = _why_not_newer(stamp_ns, newest, fresh)
-    if cause >= 0:
-        state.rejected[cause] += 1
+    state = states[0]
+    fresh = state.arm_tick >= 0 and state.tick - state.arm_tick < silent_ticks
+    finite = bool(np.isfinite(position).all() and np.isfinite(velocity).all())
+    near = bool(np.abs(position).max() <= farthest and np.abs(velocity).max() <= FASTEST_JOINT)
+    if _is_refused(state.rejected, finite, True, near, stamp_ns, state.arm_stamp_ns, fresh):
         return
     state.measured[:], state.measured_velocities[:] = position, velocity
     state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
 
 
 @compiled
-def _why_not_newer(stamp_ns: int, newest_ns: int, fresh: bool) -> int:
-    """The cause, or -1. A repeated stamp is never news; an older one is, once the source has been
-    silent: its clock was set back.
+def _is_refused(
+    rejected: Vector, finite: bool, turned: bool, near: bool, stamp_ns: int, newest_ns: int, fresh: bool
+) -> bool:
+    """Whether a sample is refused, and then counted by the first cause: not finite, no rotation,
+    out of range, or not newer.
+
+    A repeated stamp is never news; an older one is, once the source has been silent: its clock was
+    set back.
     """
-    if stamp_ns == newest_ns:
-        return REPEATED
-    return OLDER if fresh and stamp_ns < newest_ns else -1
+    cause = -1
+    if not finite:
+        cause = NOT_FINITE
+    elif not turned:
+        cause = NOT_A_ROTATION
+    elif not near:
+        cause = OUT_OF_RANGE
+    elif stamp_ns == newest_ns:
+        cause = REPEATED
+    elif fresh and stamp_ns < newest_ns:
+        cause = OLDER
+    if cause >= 0:
+        rejected[cause] += 1
+    return cause >= 0
 
 
 @compiled
@@ -149,18 +160,10 @@ def _take_hand(
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
-    fresh, newest = is_fresh(states, side, stale_ticks), state.hand_stamps_ns[side]
-    cause = -1
-    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
-        cause = NOT_FINITE
-    elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
-        cause = NOT_A_ROTATION
-    elif far > FARTHEST_M * FARTHEST_M:
-        cause = OUT_OF_RANGE
-    else:
-        cause = _why_not_newer(stamp_ns, newest, fresh)
-    if cause >= 0:
-        state.rejected[cause] += 1
+    fresh = is_fresh(states, side, stale_ticks)
+    finite = bool(np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all())
+    turned, near = abs(math.sqrt(norm) - 1.0) <= 0.01, far <= FARTHEST_M * FARTHEST_M
+    if _is_refused(state.rejected, finite, turned, near, stamp_ns, state.hand_stamps_ns[side], fresh):
         return
     since = state.tick - state.hand_ticks[side]
     take(states, side, in_base, since * period_s, fresh)

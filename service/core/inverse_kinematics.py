@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from service.core.compiled import compiled
+from kmp.compiled import compiled
 from service.core.frame import Vector
 
 # Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import ruckig
 
+from kmp.compiled import compiled
 from service.config import JointSettings
-from service.core.compiled import compiled
 from service.core.frame import Vector
 from service.core.stops import fastest_stop, stop_together
 

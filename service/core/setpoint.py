@@ -20,8 +20,8 @@ import math
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
+from kmp.compiled import compiled
 from service.config import Settings
-from service.core.compiled import compiled
 from service.core.frame import Record, Vector
 from service.core.stops import fastest_stop
 from service.core.workspace import Target

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kmp import KMP
+from kmp.compiled import compiled
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.compiled import compiled
 from service.core.frame import Vector
 
 MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded

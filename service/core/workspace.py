@@ -5,13 +5,14 @@ Plain geometry, without a model of the arm.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
 import numpy as np
 
+from kmp.compiled import compiled
 from service.config import Reach
-from service.core.compiled import compiled
 from service.core.frame import Vector
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
@@ -31,6 +32,8 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
 
     Where it was outside, the parts of velocity and acceleration that lead out are removed.
     """
+    if _is_inside(position, box, _numbers(reach)):
+        return Target(position, velocity, acceleration, clamped=False)
     boxed = np.minimum(np.maximum(position, box[0]), box[1])
     inside = boxed == position
     velocity, acceleration = velocity * inside, acceleration * inside
@@ -40,13 +43,14 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
     return Target(reached, _without(velocity, outward), _without(acceleration, outward), clamped=True)
 
 
-def numbers(reach: Reach) -> Vector:
-    """A reach (7,) for `is_inside`: centre, inner and outer radius, least x and z [m]."""
+@functools.cache
+def _numbers(reach: Reach) -> Vector:
+    """A reach (7,) for `_is_inside`: centre, inner and outer radius, least x and z [m]."""
     return np.array([*reach.centre, reach.inner, reach.outer, reach.min_x, reach.min_z])
 
 
 @compiled
-def is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
+def _is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
     """Whether a position (3,) [m] lies inside the box (2, 3) and the reach, whose `numbers` are
     given.
     """

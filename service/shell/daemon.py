@@ -57,8 +57,10 @@ class Daemon:
         urdf = robot_description(settings)
         slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
         slow.start()
-        rehearse(settings, skill, urdf=urdf)
-        slow.cancel()
+        try:
+            rehearse(settings, skill, urdf=urdf)
+        finally:
+            slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))

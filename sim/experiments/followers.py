@@ -17,7 +17,7 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from service.config import Settings, robot_description
 from service.contract.records import SIDES, Flag
-from service.core.arm import Arm
+from service.core.arm import Arm, Closing
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick, Vector
 from service.core.limiter import Limiter
@@ -82,23 +82,14 @@ def _ticks(hands: Moving) -> Iterator[Tick]:
         yield Tick(k, tuple(inbox))
 
 
-class _Eager(Arm):
-    """The inverse kinematics without what slows a tool that is far from its target: rivals plan no
-    stop.
-    """
-
-    def __init__(self, settings: Settings, urdf: str) -> None:
-        super().__init__(settings, urdf)
-        tool = settings.tool
-        self._closing = np.array([settings.period_s, tool.max_acceleration / 2, tool.max_speed, 0.0, self._closing[4]])
-
-
 class _Chain:
     """Inverse kinematics and joint limiter behind a rival's setpoints."""
 
     def __init__(self, skill: Skill, settings: Settings) -> None:
         self.skill, self.settings = skill, settings
-        self.arm = _Eager(settings, robot_description(settings))
+        # Rivals plan no stop: nothing slows a tool that is far from its target.
+        eager = Closing(settings.tool.max_acceleration / 2, settings.tool.max_speed, far_damping=0.0)
+        self.arm = Arm(settings, robot_description(settings), eager)
         self.limiter = Limiter(settings.joints, settings.period_s)
         self.direction = rotation(tuple(skill.orientation))[:, 2]
 
@@ -121,7 +112,7 @@ class _Chain:
         for k, (position, velocity) in enumerate(setpoints):
             wanted = self.arm.step(q, position, velocity, self.direction)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
-            tool[k] = self.arm.pose(q)[0]
+            tool[k] = self.arm.at(q).position
             limited += wanted.speed_limited
         return _followed(tool, limited)
 
@@ -192,7 +183,7 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
             low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)
             before, wanted[k] = q, low
         moved = _by_ruckig(wanted, limits)[:, 0]
-        return _followed(np.array([chain.arm.pose(q)[0] for q in moved]), limited)
+        return _followed(np.array([chain.arm.at(q).position for q in moved]), limited)
 
     return follow
 

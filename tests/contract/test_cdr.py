@@ -256,3 +256,15 @@ def test_what_only_recordings_hold_comes_back_too(data: bytes, index: int, lost:
         cdr.decode_tick(cdr.encode_tick(index, b"\0", lost)[:-1])
     with pytest.raises(messages.WireError, match="a Skill"):
         cdr.decode_skill(cdr.encode_skill(data)[:7])
+
+
+@pytest.mark.parametrize("counts", [(7, 7, 0), (7, 0, 0), (7, 7, 7), (7, 0, 7), (3, 2, 1), (1, 1, 0)])
+def test_joints_whose_layout_is_known_are_read_as_at_first(counts: tuple[int, int, int]) -> None:
+    names = JOINT_NAMES[: counts[0]]
+    for stamp_ns in (1, -5 * 10**9 + 3, 2 * 10**18):
+        values = [tuple(0.1 * stamp_ns + k for k in range(count)) for count in counts]
+        message = messages.JointState(stamp_ns, names, *values, "base")
+        assert cdr.decode_joints(cdr.encode_joints(message)) == message
+        cut = cdr.encode_joints(message)[:-1]
+        with pytest.raises(messages.WireError):
+            cdr.decode_joints(cut)

@@ -75,7 +75,7 @@ def random_joints(count: int, seed: int) -> Vector:
 
 
 def angle_to(q: Vector, direction: Vector) -> float:
-    return math.acos(min(1.0, float(ARM.pose(q)[1][:, 2] @ direction)))
+    return math.acos(min(1.0, float(ARM.at(q).rotation[:, 2] @ direction)))
 
 
 class Followed(NamedTuple):
@@ -97,7 +97,7 @@ def follow(q: Vector, path: Vector, velocity: Vector, direction: Vector) -> Foll
     for target, speed in zip(path, velocity, strict=True):
         solution = ARM.step(q, target, speed, direction)
         q, dq, ddq, _ = limiter.step(q, dq, ddq, solution.velocity)
-        errors.append(math.dist(ARM.pose(q)[0], target))
+        errors.append(math.dist(ARM.at(q).position, target))
         joints.append(q)
         accelerations.append(ddq)
         speed_limited += solution.speed_limited
@@ -118,12 +118,12 @@ def minimum_jerk(start: Vector, end: Vector, seconds: float) -> tuple[Vector, Ve
 
 def test_forward_kinematics_is_the_product_of_the_published_parameters_and_gives_their_check_values() -> None:
     for q in random_joints(200, seed=1):
-        position, rotation = ARM.pose(q)
+        _, position, rotation, *_ = ARM.at(q)
         expected = dh_frames(q)[-1]
         assert np.abs(position - expected[:3, 3]).max() < 1e-9
         assert np.abs(rotation - expected[:3, :3]).max() < 1e-9
-    assert ARM.pose(np.zeros(7))[0] == pytest.approx([0, 0, 1.256])
-    assert ARM.pose(np.array([0, -2, 0, 3.13, 0, 0, 0]))[0] == pytest.approx([-0.2125, 0, 0.3523], abs=1e-4)
+    assert ARM.at(np.zeros(7)).position == pytest.approx([0, 0, 1.256])
+    assert ARM.at(np.array([0, -2, 0, 3.13, 0, 0, 0])).position == pytest.approx([-0.2125, 0, 0.3523], abs=1e-4)
 
 
 def test_the_tool_sits_on_the_plate_where_the_settings_say() -> None:
@@ -133,7 +133,7 @@ def test_the_tool_sits_on_the_plate_where_the_settings_say() -> None:
     )
     q = random_joints(1, seed=2)[0]
     plate = dh_frames(q)[-1]
-    position, rotation = arm.pose(q)
+    _, position, rotation, *_ = arm.at(q)
     assert position == pytest.approx(plate[:3, 3] + plate[:3, :3] @ [0.01, 0.02, 0.1], abs=1e-9)
     assert rotation[:, 2] == pytest.approx(plate[:3, 0], abs=1e-9)
 
@@ -167,8 +167,8 @@ def test_joint_names_and_limits_of_the_model_are_those_of_wire_and_settings() ->
 def test_tool_velocity_is_the_derivative_of_its_position() -> None:
     step = 1e-6
     for q, dq in zip(random_joints(50, seed=4), random_joints(50, seed=5), strict=True):
-        ahead, behind = ARM.pose(q + step * dq)[0], ARM.pose(q - step * dq)[0]
-        assert ARM.velocity(q, dq) == pytest.approx((ahead - behind) / (2 * step), abs=1e-7)
+        ahead, behind = ARM.at(q + step * dq).position, ARM.at(q - step * dq).position
+        assert ARM.at(q).tasks[:3] @ dq == pytest.approx((ahead - behind) / (2 * step), abs=1e-7)
 
 
 @pytest.mark.parametrize("place", [(0.62, -0.28, 0.30), (0.50, 0.38, 0.16), (0.62, 0.0, 0.26), (0.75, 0.0, 0.06)])
@@ -181,7 +181,7 @@ def test_a_place_is_reached_and_the_tool_points_as_told(place: tuple[float, floa
 
 def test_the_posture_is_kept_where_the_task_leaves_it_free() -> None:
     q = np.array(POSTURE)
-    position = ARM.pose(q)[0]
+    position = ARM.at(q).position
     run = wait(q, position, AHEAD_AND_DOWN, seconds=0.5)
     assert np.abs(run.position - q).max() < 1e-3
     turned = q + np.array([0, 0, 0, 0, 0, 0, 1.5])
@@ -204,7 +204,7 @@ def test_the_soldering_path_is_followed_to_a_tenth_of_a_millimetre(
     places = [
         clamp(place.clip([-9, -9, 0.05], 9), STILL, STILL, box=EVERYWHERE, reach=CELL.reach)[0] for place in places
     ]
-    legs = zip([ARM.pose(q)[0], *places], places, (3.0, 3.5, 3.0), strict=False)
+    legs = zip([ARM.at(q).position, *places], places, (3.0, 3.5, 3.0), strict=False)
     paths, speeds = zip(*(minimum_jerk(a, b, seconds) for a, b, seconds in legs), strict=True)
     run = follow(q, np.vstack(paths), np.vstack(speeds), AHEAD_AND_DOWN)
     assert run.error.max() < 1e-4
@@ -241,21 +241,21 @@ def test_a_joint_slows_down_toward_its_limit_and_does_not_pass_it() -> None:
     for distance in (0.2, 0.05, 0.01, 0.0, -0.1):
         q = np.array(POSTURE)
         q[3] = LOWER[3] + distance
-        outward = ARM.velocity(q, np.array([0, 0, 0, -1.0, 0, 0, 0]))
-        solution = ARM.step(q, ARM.pose(q)[0], outward, AHEAD_AND_DOWN)
+        outward = ARM.at(q).tasks[:3] @ np.array([0, 0, 0, -1.0, 0, 0, 0])
+        solution = ARM.step(q, ARM.at(q).position, outward, AHEAD_AND_DOWN)
         assert solution.velocity[3] >= -max(distance, 0.0) * 0.5 * CELL.joints.acceleration[3] / FASTEST[3] - 1e-9
         assert solution.near_limit == (distance < 0.1)
 
 
 def test_too_fast_a_task_is_scaled_and_keeps_its_direction() -> None:
     q = np.array(POSTURE)
-    position = ARM.pose(q)[0]
+    position = ARM.at(q).position
     slow = ARM.step(q, position, np.array([0.0, 0.1, 0.0]), AHEAD_AND_DOWN)
     fast = ARM.step(q, position + np.array([0, 0.018, 0]), np.array([0.0, 9.0, 0.0]), AHEAD_AND_DOWN)
     assert not slow.speed_limited
     assert fast.speed_limited
     assert np.abs(fast.velocity).max() == pytest.approx(1.5)
-    moved = ARM.velocity(q, fast.velocity)
+    moved = ARM.at(q).tasks[:3] @ fast.velocity
     assert moved[1] / np.linalg.norm(moved) > 0.999
 
 
@@ -289,7 +289,7 @@ def test_the_wanted_velocity_of_the_joints_is_continuous_across_their_limits() -
         q = random_joints(1, seed=int(rng.integers(1 << 30)))[0]
         i = rng.integers(7)
         q[i] = rng.choice([LOWER[i], UPPER[i]]) + rng.uniform(-0.02, 0.02)
-        target = ARM.pose(q)[0] + rng.normal(size=3) * 0.005
+        target = ARM.at(q).position + rng.normal(size=3) * 0.005
         here = ARM.step(q, target, STILL, AHEAD_AND_DOWN).velocity
         there = ARM.step(q + 1e-9 * rng.normal(size=7), target, STILL, AHEAD_AND_DOWN).velocity
         assert np.abs(here - there).max() < 1e-4
