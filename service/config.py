@@ -18,6 +18,7 @@ from service.contract.explain import ExplainedError, explained
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
+RATES_HZ = (50, 1000)  # slowest and fastest
 FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
 NEAREST_POINT = 0.4
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -145,7 +146,7 @@ class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: Cell = "thirdhand"
-    rate_hz: Annotated[int, msgspec.Meta(ge=50, le=1000)] = 500
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)

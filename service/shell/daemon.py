@@ -31,7 +31,7 @@ from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
-from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
+from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Granted, Window, ask_for_real_time, run_beside_real_time
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
@@ -67,7 +67,7 @@ class Daemon:
         self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
-        self._realtime, self._version = False, version("thirdhand")
+        self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._status: Status | None = None
         self._late_ns = self._began_ns = 0
         self._laps: list[tuple[str, int]] = []
@@ -119,8 +119,8 @@ class Daemon:
             self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
             reporter.start()
             announce(self)
-            self._realtime = ask_for_real_time()
-            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._realtime else 0)
+            self._granted = ask_for_real_time()
+            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
         finally:
             self._ended.set()
@@ -245,7 +245,8 @@ class Daemon:
             tick=int(frame["tick"]),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
-            realtime=self._realtime,
+            realtime=self._granted.realtime,
+            memory_locked=self._granted.locked,
             skill=skill.name,
             places=tuple(point.name for point in skill.via_points),
             rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},
