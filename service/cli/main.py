@@ -132,11 +132,14 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "replay",
-        "Runs the core on a recording and compares every frame.",
+        "Runs the core on a recording, or on several that follow each other, and compares every frame. What is missing "
+        "or damaged is said; only --exact fails for it.",
         "thirdhand replay recordings/golden.mcap --exact",
     )
-    c.add_argument("file", metavar="FILE", type=Path, help="a recording")
-    c.add_argument("--exact", action="store_true", help="forbid even differences below 10 µm and 10 µrad")
+    c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording, and those that follow it")
+    c.add_argument(
+        "--exact", action="store_true", help="forbid gaps, damage, a cut, and even differences below 10 µm and 10 µrad"
+    )
     c.add_argument(
         "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
     )
