@@ -140,6 +140,10 @@ class Files(Section, frozen=True):
     state: str = "~/.local/state/thirdhand"
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # with each recording an .rrd file
+    segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
+    segment_minutes: Positive = 10.0
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # 0: no limit
 
 
 class Settings(Section, frozen=True):

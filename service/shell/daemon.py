@@ -129,7 +129,8 @@ class Daemon:
                 reporter.join(2)
             self._requests.close()
             self._session.close()  # type: ignore[no-untyped-call]
-            self._scribe.close(timeout_s=20)
+            if missing := self._scribe.close(timeout_s=20):
+                log.warning("%s", missing)
 
     # --- the loop: every line below costs each tick ---
 
