@@ -233,7 +233,7 @@ class Scribe:
                 running.process.kill()
                 running.process.wait()
             self._listen(timeout_s=0.0)
-            last = self._report
+            last, self._socket = self._report, None
             self._bury()
             self._report = msgspec.structs.replace(last, lost=0)
             self._child = None

@@ -32,6 +32,7 @@ class Places:
         self._number = attempt
         self._newest = datetime.min.replace(tzinfo=UTC)
         self._current = ""
+        self._ours: dict[str, bool] = {}  # by the names of recordings
         self._cell = settings.cell.replace("/", "-")
 
     def next(self) -> tuple[Path | None, Path | None]:
@@ -68,7 +69,7 @@ class Places:
         ours = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
         found: dict[str, list[tuple[Path, int, float]]] = {}
         for path in self._folder.glob("*Z*.*"):
-            if path.suffix in (".mcap", ".rrd") and ours.fullmatch(path.stem):
+            if path.suffix in (".mcap", ".rrd") and ours.fullmatch(path.stem) and self._is_ours(path):
                 with contextlib.suppress(OSError):
                     about = path.stat()
                     found.setdefault(path.stem, []).append((path, about.st_size, about.st_mtime))
@@ -78,11 +79,7 @@ class Places:
             files = found[stem]
             too_old = keep_s and time.time() - max(changed for *_, changed in files) > keep_s
             too_much = keep_bytes and total > keep_bytes
-            if (
-                stem == self._current
-                or not (too_old or too_much)
-                or not self._is_ours(files[0][0].with_suffix(".mcap"))
-            ):
+            if stem == self._current or not (too_old or too_much):
                 continue
             for path, size, _ in files:
                 with contextlib.suppress(OSError):
@@ -91,11 +88,14 @@ class Places:
                     removed.append(path)
         return removed
 
-    def _is_ours(self, recording: Path) -> bool:
-        """Whether a recording is not another cell's, whose name with its slashes replaced is the
-        same.
+    def _is_ours(self, path: Path) -> bool:
+        """Whether a recording, and the drawing beside it, is not another cell's, whose name with
+        its slashes replaced is the same.
         """
-        messages = Messages(recording)
-        with contextlib.suppress(OSError):
-            next(iter(messages), None)
-        return messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell) == self._settings.cell
+        if path.stem not in self._ours:
+            messages = Messages(path.with_suffix(".mcap"))
+            with contextlib.suppress(OSError):
+                next(iter(messages), None)
+            cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
+            self._ours[path.stem] = cell == self._settings.cell
+        return self._ours[path.stem]

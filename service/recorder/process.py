@@ -55,37 +55,43 @@ class DrawingThread:
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
         self.dropped = 0
-        self._next_file: Path | None = None
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._wanted_file: Path | None = None
+        self._waiting: deque[Callable[[], None] | Path] = deque()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._draw, name="drawing", daemon=True)
         self._thread.start()
+
+    @property
+    def rrd(self) -> str | None:
+        """The file drawn into, or about to be."""
+        return self.viewer.rrd if self._wanted_file is None else str(self._wanted_file)
 
     def put(self, act: Callable[[], None]) -> None:
         """Has something drawn, later; the oldest that waits too long is dropped."""
         self._waiting.append(act)
         if len(self._waiting) > DRAW_QUEUED:
-            self._waiting.popleft()
+            oldest = self._waiting.popleft()
+            if isinstance(oldest, Path) and self._waiting:  # the next file: what is drawn into it goes instead
+                self._waiting.popleft()
+                self._waiting.appendleft(oldest)
             self.dropped += 1
 
     def draw_into(self, rrd: Path) -> None:
-        """Has the file end, and what is drawn from now on go into another."""
-        self._next_file = rrd
-
-    @property
-    def rrd(self) -> str | None:
-        """The file drawn into, or about to be."""
-        return self.viewer.rrd if self._next_file is None else str(self._next_file)
+        """Has the file end, and what is put from now on go into another."""
+        self._wanted_file = rrd
+        self._waiting.append(rrd)
 
     def _draw(self) -> None:
         flushed = time.monotonic()
         while not (self._ended.wait(POLL_S) and not self._waiting):
-            if (rrd := self._next_file) is not None:
-                self.viewer.draw_into(rrd)
-                if self._next_file is rrd:
-                    self._next_file = None
-            while self._waiting and self._next_file is None:
-                self._waiting.popleft()()
+            while self._waiting:
+                next_ = self._waiting.popleft()
+                if isinstance(next_, Path):
+                    self.viewer.draw_into(next_)
+                    if self._wanted_file is next_:
+                        self._wanted_file = None
+                else:
+                    next_()
             if time.monotonic() - flushed > DRAW_FLUSH_S:
                 self.viewer.flush()
                 flushed = time.monotonic()

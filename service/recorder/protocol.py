@@ -110,7 +110,7 @@ class Report(msgspec.Struct, frozen=True):
     no recording says yet (`unmarked`).
     """
 
-    state: Literal["recording", "interrupted", "drawing"] = "drawing"
+    state: Literal["starting", "recording", "interrupted", "drawing"] = "starting"
     recording: str | None = None
     rrd: str | None = None
     live: str | None = None

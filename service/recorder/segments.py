@@ -60,9 +60,13 @@ class Segments:
         return self._complete if self._recorder is None else self._recorder.path
 
     @property
-    def state(self) -> Literal["recording", "interrupted", "drawing"]:
-        """`recording`, `interrupted`, or `drawing` where no recording is wanted."""
-        return "drawing" if not self._wanted else "interrupted" if self._recorder is None else "recording"
+    def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
+        """`starting` before there is a skill, `recording`, `interrupted`, or `drawing` where no
+        recording is wanted.
+        """
+        if self._skill is None or not self._wanted:
+            return "starting" if self._skill is None else "drawing"
+        return "interrupted" if self._recorder is None else "recording"
 
     def begin(self, skill: bytes | None, state: Record | None) -> None:
         """Begins with a skill and a state; without them, with the first that are told."""
@@ -139,9 +143,7 @@ class Segments:
             with contextlib.suppress(OSError):
                 sizes.append(self._rrd.stat().st_size)
         too_large = max(sizes, default=0) > files.segment_mb * MB
-        return (too_large or self._moved or now - self._began > files.segment_minutes * 60) and (
-            now - self._tried > RETRY_S
-        )
+        return too_large or self._moved or now - self._began > files.segment_minutes * 60
 
     def _next(self, state: Record) -> None:
         """Goes on in a new recording, which begins with the state that the old one ends with; stays
