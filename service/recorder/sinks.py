@@ -51,10 +51,9 @@ class _Destination:
         self.send()
         self.name = name
         self._chunks.begin_anew()
-        arrangement = blueprint(live=self._live)
-        self._stream.set_sinks(sink, default_blueprint=arrangement)
+        self._stream.set_sinks(sink)
         self._stream.send_recording_name(self._settings.cell)
-        self._stream.send_blueprint(arrangement)
+        self._stream.send_blueprint(blueprint(live=self._live))  # once: Rerun keeps 1.5 MB of each for good
         log_fixed(self._stream, self._tree, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
