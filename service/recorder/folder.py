@@ -31,7 +31,6 @@ class Places:
         self._explicit = [None if path is None else Path(path) for path in (recording, rrd)]
         self._number = attempt
         self._newest = datetime.min.replace(tzinfo=UTC)
-        self._current = ""
         self._ours: dict[str, bool] = {}  # by the names of recordings
         self._cell = settings.cell.replace("/", "-")
 
@@ -51,7 +50,6 @@ class Places:
             at += timedelta(seconds=1)
         self._newest = at
         recording, rrd = self._named(at)
-        self._current = recording.stem
         return recording, rrd if self._settings.files.rerun else None
 
     def _named(self, at: datetime) -> tuple[Path, Path]:
@@ -59,7 +57,7 @@ class Places:
         stem = f"{self._cell}-{at:%Y%m%dT%H%M%SZ}"
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
-    def prune(self) -> list[Path]:
+    def prune(self, writing: Path | None) -> list[Path]:
         """Removes this cell's oldest recordings beyond the limits, never the one being written;
         what was removed.
         """
@@ -79,7 +77,7 @@ class Places:
             files = found[stem]
             too_old = keep_s and time.time() - max(changed for *_, changed in files) > keep_s
             too_much = keep_bytes and total > keep_bytes
-            if stem == self._current or not (too_old or too_much):
+            if (writing is not None and stem == writing.stem) or not (too_old or too_much):
                 continue
             for path, size, _ in files:
                 with contextlib.suppress(OSError):

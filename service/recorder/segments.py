@@ -132,7 +132,7 @@ class Segments:
         self._safely(lambda recorder: _written(recorder, told, missing))
         if self._recorder is not None and not self._recorder.pending:
             self._marked_pending = 0
-        if told.state is not None and self._due(now):
+        if self._recorder is not None and told.state is not None and self._due(now):
             self._next(told.state)
         return missing
 
@@ -149,7 +149,8 @@ class Segments:
         """Goes on in a new recording, which begins with the state that the old one ends with; stays
         where none can be begun.
         """
-        new = self._opened(state)
+        self._safely(Recorder.flush)
+        new = None if self._recorder is None else self._opened(state)
         if new is not None:
             self._end()
             self._recorder = new
@@ -199,7 +200,7 @@ class Segments:
         if time.monotonic() - self._pruned > PRUNE_S:
             self._pruned = time.monotonic()
             with contextlib.suppress(OSError):
-                self._places.prune()
+                self._places.prune(self.path)
 
     def _look(self) -> None:
         recorder = self._recorder

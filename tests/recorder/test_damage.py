@@ -30,6 +30,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
+@pytest.fixture(scope="module")
+def frames(whole: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[int, bytes]:
+    """Its frames, by their ticks."""
+    _, steps = read(tmp_path_factory.mktemp("frames") / "a.mcap", whole)
+    return {step.tick: encode(step.frame) for step in steps if step.frame is not None}
+
+
 def records(data: bytes) -> list[tuple[int, int, int]]:
     """Opcode, first byte and end of every record."""
     found, at = [], 8
@@ -61,12 +68,11 @@ def read(path: Path, data: bytes) -> tuple[Recording, list[Step]]:
     [(0, 0xFF), (0, 0x03), (1, 0x01), (3, 0xFF), (8, 0xFF), (17, 0xFF), (28, 0x01), (34, 0x01), (40, 0x10), (70, 0x01)],
 )
 @pytest.mark.parametrize("which", [0, 5, -1])
-def test_what_follows_a_damaged_chunk_is_read(tmp_path: Path, whole: bytes, which: int, at: int, mask: int) -> None:
+def test_what_follows_a_damaged_chunk_is_read(
+    tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int, mask: int
+) -> None:
     """Wherever in a chunk, its head included: at most its ticks are missing, and that is said."""
-    path = tmp_path / "a.mcap"
-    _, told = read(path, whole)
-    frames = {step.tick: encode(step.frame) for step in told if step.frame is not None}
-    recording, steps = read(path, flipped(whole, chunks(whole)[which][0] + at, mask))
+    recording, steps = read(tmp_path / "a.mcap", flipped(whole, chunks(whole)[which][0] + at, mask))
     assert not recording.truncated
     assert len(recording.faults) >= 1
     assert all("damage at byte" in str(fault) for fault in recording.faults)

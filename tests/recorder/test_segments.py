@@ -104,16 +104,16 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
         path.write_bytes(bytes(80_000))
     write(current, 3, settings=settings)
     rrd.write_bytes(bytes(100_000))
-    removed = places.prune()
+    removed = places.prune(current)
     assert old[0] in removed
     assert old[0].with_suffix(".rrd") in removed
     assert old[2] not in removed
     assert all(path.exists() for path in [*spared, current, rrd, old[2]])
-    assert places.prune() == []
+    assert places.prune(current) == []
     os.utime(old[2], (0, 0))
     os.utime(old[2].with_suffix(".rrd"), (0, 0))
     aged = Places(msgspec.structs.replace(CELL, files=Files(keep_hours=1)), str(tmp_path), None, None)
-    assert sorted(aged.prune()) == sorted([old[2], old[2].with_suffix(".rrd")])
+    assert sorted(aged.prune(current)) == sorted([old[2], old[2].with_suffix(".rrd")])
 
 
 class Session:
