@@ -94,16 +94,19 @@ def _whole(  # noqa: PLR0917
     rate_hz: int, seconds: float, skill: str, program: tuple[str, ...], say: Callable[[str], None], keep: Path | None
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:
-        folder = Path(name)
-        arguments = ("--arm", "assumed", "--rate", str(rate_hz))
-        with launched(folder, *arguments, record=keep or folder, program=program, say=say) as service:
+        folder = keep or Path(name)
+        arguments, before = ("--arm", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
+        with launched(Path(name), *arguments, record=folder, program=program, say=say) as service:
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()
             processes = _used(service.process.pid)
             if service.stop() != 0:
                 raise BenchError(f"the service failed: {service.log.read_text()[-500:]}")
-        timing = np.array([s.timing for s in Recording.open(status["scribe"]["recording"]).steps() if s.timing], TIMING)
+        recorded = sorted(set(folder.glob("*.mcap")) - before)  # one after the other
+        timing = np.array(
+            [step.timing for path in recorded for step in Recording.open(path).steps() if step.timing], TIMING
+        )
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
     return heard | {
         "granted": {name: status[name] for name in ("realtime", "memory_locked")},

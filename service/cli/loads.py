@@ -126,7 +126,6 @@ def _asking(kind: str) -> Callable[[Cell], contextlib.AbstractContextManager[Non
     @contextlib.contextmanager
     def asked(cell: Cell) -> Iterator[None]:
         with asking(kind, cell.service.endpoint) as process:
-            time.sleep(SETTLE_S)
             yield
             if process.poll() is not None:
                 raise LoadError(f"what asks for {kind!r} ended with code {process.returncode}")
@@ -149,6 +148,8 @@ def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
     while True:
         with contextlib.suppress(RefusedError):
             act(k)
+        if k == 0:
+            print("begun", flush=True)
         k += 1
         time.sleep(max(0.0, began + k / rate_hz - time.monotonic()))
 
@@ -304,19 +305,24 @@ def _free_port() -> int:
         return int(free.getsockname()[1])
 
 
-def asking(kind: str, endpoint: str) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
-    """One of ASKING as a process of its own."""
-    return _process([sys.executable, "-m", "service.cli.loads", kind, endpoint])
+@contextlib.contextmanager
+def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    """One of ASKING as a process of its own, which has begun. Raises LoadError."""
+    with _process([sys.executable, "-m", "service.cli.loads", kind, endpoint]) as process:
+        assert process.stdout is not None
+        if not process.stdout.readline():
+            raise LoadError(f"what asks for {kind!r} did not begin")
+        yield process
 
 
 @contextlib.contextmanager
 def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
     try:
         yield process
     finally:
         process.kill()
-        process.wait()
+        process.communicate()
 
 
 def text(rows: list[dict[str, Any]]) -> str:

@@ -68,7 +68,7 @@ def read(path: Path, data: bytes) -> tuple[Recording, list[Step]]:
     [(0, 0xFF), (0, 0x03), (1, 0x01), (3, 0xFF), (8, 0xFF), (17, 0xFF), (28, 0x01), (34, 0x01), (40, 0x10), (70, 0x01)],
 )
 @pytest.mark.parametrize("which", [0, 5, -1])
-def test_what_follows_a_damaged_chunk_is_read(
+def test_what_follows_a_damaged_chunk_is_read(  # noqa: PLR0917
     tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int, mask: int
 ) -> None:
     """Wherever in a chunk, its head included: at most its ticks are missing, and that is said."""
