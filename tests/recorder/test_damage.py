@@ -63,16 +63,13 @@ def read(path: Path, data: bytes) -> tuple[Recording, list[Step]]:
     return recording, list(recording.steps())
 
 
-@pytest.mark.parametrize(
-    ("at", "mask"),
-    [(0, 0xFF), (0, 0x03), (1, 0x01), (3, 0xFF), (8, 0xFF), (17, 0xFF), (28, 0x01), (34, 0x01), (40, 0x10), (70, 0x01)],
-)
+@pytest.mark.parametrize("at", [0, 1, 3, 8, 17, 28, 34, 40, 70])
 @pytest.mark.parametrize("which", [0, 5, -1])
-def test_what_follows_a_damaged_chunk_is_read(  # noqa: PLR0917
-    tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int, mask: int
+def test_what_follows_a_damaged_chunk_is_read(
+    tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int
 ) -> None:
     """Wherever in a chunk, its head included: at most its ticks are missing, and that is said."""
-    recording, steps = read(tmp_path / "a.mcap", flipped(whole, chunks(whole)[which][0] + at, mask))
+    recording, steps = read(tmp_path / "a.mcap", flipped(whole, chunks(whole)[which][0] + at, 0x11))
     assert not recording.truncated
     assert len(recording.faults) >= 1
     assert all("damage at byte" in str(fault) for fault in recording.faults)
