@@ -114,7 +114,7 @@ class ScribeProcess:
         self._joints = len(task.settings.joints.names)
         self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
-        self._said_dropped = 0
+        self._said_dropped = self._said_kept = 0
         drawn = task.rrd is not None or (task.folder is not None and task.settings.files.rerun)
         if drawn or task.live_port is not None:
             from service.recorder.sinks import Viewer  # half a second that a scribe without viewer need not spend
@@ -140,6 +140,7 @@ class ScribeProcess:
             self._said_dropped = self._drawing.dropped
             self._errors.append(f"the drawing cannot keep up: {self._said_dropped} of its entries dropped")
         segments = self._segments
+        self._said_kept = segments.kept
         report = Report(
             state=segments.state,
             recording=None if segments.path is None else str(segments.path),
@@ -153,6 +154,13 @@ class ScribeProcess:
         with contextlib.suppress(OSError):
             self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)
             self._errors.clear()
+
+    def report_kept(self) -> None:
+        """Says how much is on disk, if that is more by now: what is not said counts as lost with a
+        process that is killed.
+        """
+        if self._segments.kept != self._said_kept:
+            self.report()
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
         """Writes and draws one message."""
@@ -231,6 +239,7 @@ def _work(source: socket.socket) -> None:
         now = time.monotonic()
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
+        scribe.report_kept()
         if now - flushed > FLUSH_S:
             scribe.flush()
             flushed = now
