@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 SIDES = ("left", "right")
+SOURCES = (*SIDES, "arm")
 STAGES = ("intake", "skill", "setpoint", "arm", "limiter")
 
 
@@ -37,6 +38,7 @@ class Reason(enum.IntEnum):
     ARM_SILENT = 7
     TOOL_SPEED = 8  # measured, or commanded in spite of all bounds
     SETPOINT = 9  # passed a bound of its own, which cannot be
+    TWO_SOURCES = 10  # of one hand or of the arm, which contradict each other
 
 
 class Flag(enum.IntFlag):
@@ -56,6 +58,9 @@ class Cause(enum.IntEnum):
     REPEATED = 3
     OLDER = 4
     INCOMPLETE = 5
+    AHEAD = 6  # stamped later than the time that has passed explains
+    JUMPED = 7  # not where it can have come to, and not yet confirmed
+    WRONG_FRAME = 8
 
 
 PER_JOINT = 0  # in a shape: one for each joint of the arm
@@ -108,12 +113,18 @@ STATE = (
     Field("arm_tick", "int64"),
     Field("hull_ticks", "int64"),  # in the newest span
     Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
+    Field("rest_tick", "int64"),  # since which the arm tells one posture, `rest`, and nothing else
+    Field("told_ticks", "int64", (len(SOURCES), 2)),  # the last two at which a sample could have been right
+    Field("doubts", "int64", (2, 3)),  # of samples of a hand that jumped, in a row: first and newest tick, count
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
     Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`
     Field("covariances", "float64", (2, 3, 3, 3)),
     Field("modes", "float64", (2, 3)),
     Field("noise", "float64", (2, 4)),
     Field("past", "float64", (2, 3, 3)),
+    Field("doubted", "float64", (2, 3)),  # where the newest of those was
+    Field("contested", "float64", (len(SOURCES),)),  # the share of the last second's samples that contradict the others
+    Field("rest", "float64", (PER_JOINT,)),
     Field("measured", "float64", (PER_JOINT,)),
     Field("measured_velocities", "float64", (PER_JOINT,)),
     Field("setpoint", "float64", (3, 3)),  # position, velocity, acceleration; by axis
@@ -124,7 +135,7 @@ STATE = (
     Field("mode", "uint8"),
     Field("reason", "uint8"),
     Field("operator_hold", "uint8"),
-    Field("arm_ready", "uint8"),
+    Field("arm_ready", "uint8"),  # 1: yes; 2: on its way into its limits
     Field("skill", "uint8", (16,)),  # digest of the skill in force, which is recorded apart
 )
 TIMING = (

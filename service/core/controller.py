@@ -35,7 +35,7 @@ from service.core.frame import (
     order,
     state_layout,
 )
-from service.core.intake import Intake
+from service.core.intake import Intake, rest_ticks
 from service.core.inverse_kinematics import measured_error, slow_down
 from service.core.limiter import Limiter
 from service.core.rotation import rotation
@@ -44,11 +44,14 @@ from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp
 
 REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
+READY, RETURNING = 1, 2  # of an arm: within its limits, on its way into them
+RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
-FAR = int(Reason.FAR_FROM_DEMONSTRATIONS)
+FAR, CONTESTED = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
+NOT_READY = int(Reason.ARM_NOT_READY)
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -129,7 +132,11 @@ class Controller:
             flags |= LIMITED * (met or wanted.speed_limited or limited)
             flags |= NEAR_LIMIT * wanted.near_limit
         else:
-            state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
+            inwards = self._inwards()
+            if inwards is None:
+                state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
+            else:
+                state["joints"] = self._limiter.step(joints[0], joints[1], joints[2], inwards)[:3]
             self._setpoint.begin(state, self._at_rest())
         lap("limiter")
         return self._frame(prediction, target, flags, moving=moving)
@@ -195,13 +202,15 @@ class Controller:
         state, arm = self._state, self._settings.arm
         if arm.source == "assumed":
             if not state["arm_ready"]:
-                state["arm_ready"] = 1
+                state["arm_ready"] = READY
                 self._setpoint.begin(state, self._at_rest())
             return None
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:
-            if heard and not self._is_moving():  # what still moves comes to rest first
-                state["arm_ready"], state["slow_tick"] = 1, state["tick"]
+            # what still moves comes to rest first; what was told must have been one posture
+            if self._intake.is_arm_at_rest(state) and not self._is_moving():
+                state["arm_ready"] = RETURNING if self._outside(state["measured"]).any() else READY
+                state["slow_tick"] = state["tick"]
                 state["joints"] = 0.0
                 state["joints"][0] = state["measured"]
                 self._setpoint.begin(state, self._at_rest())
@@ -211,6 +220,8 @@ class Controller:
                 return Reason.ARM_SILENT
             state["arm_ready"] = 0
             return None
+        if state["arm_ready"] == RETURNING and not self._outside(state["joints"][0]).any():
+            state["arm_ready"] = READY
         here = self._arm_at(state["joints"][0])  # no farther than that error from where it is measured
         error, speed = measured_error(here.joints, here.tasks, state["measured"], state["measured_velocities"])
         if error > arm.fault_error_rad:
@@ -220,9 +231,25 @@ class Controller:
         fast_for = int(state["tick"]) - int(state["slow_tick"])
         return Reason.TOOL_SPEED if fast_for * self._settings.period_s > TOO_FAST_S else None
 
+    def _outside(self, joints: Vector) -> Vector:
+        """(J,) 1 for each of the joints [rad] below its limits, -1 above them, 0 within."""
+        limits = self._settings.joints
+        low, high = joints < np.array(limits.lower), joints > np.array(limits.upper)
+        way: Vector = low.astype(np.float64) - high
+        return way
+
+    def _inwards(self) -> Vector | None:
+        """Velocities (J,) [rad/s] of an arm on its way into its limits, None of any other."""
+        state = self._state
+        if state["arm_ready"] != RETURNING or state["reason"] != NOT_READY or state["operator_hold"]:
+            return None
+        return RETURN_RADPS * self._outside(state["joints"][0])
+
     def _why_hold(self, prediction: Prediction | None) -> Reason:
         state = self._state
-        if not state["arm_ready"]:
+        if self._intake.is_contested(state, already=int(state["reason"]) == CONTESTED):
+            return Reason.TWO_SOURCES
+        if state["arm_ready"] != READY:
             return Reason.ARM_NOT_READY
         if state["operator_hold"]:
             return Reason.OPERATOR
@@ -317,10 +344,11 @@ def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
     arm = msgspec.structs.replace(settings.arm, source="state")
     controller = Controller(msgspec.structs.replace(settings, arm=arm), replace(skill, threshold=math.inf), urdf=urdf)
     names = settings.joints.names
-    for index in range(REHEARSED_TICKS):
+    count = rest_ticks(settings) + REHEARSED_TICKS
+    for index in range(count):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         controller.step(Tick(index, (*hands, measured)))
-    controller.step(Tick(REHEARSED_TICKS, (order("hold"),)))
+    controller.step(Tick(count, (order("hold"),)))

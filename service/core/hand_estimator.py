@@ -35,7 +35,8 @@ SWITCH_RATE = 3.0  # [1/s] at which a mode is left
 LEAST_NOISE, MOST_NOISE = 7e-4, 5e-2  # [m] bounds of its standard deviation; below the least, hands tremble
 AVERAGED = 60.0  # samples over which the noise is averaged
 SURPRISE = 9.0  # times the noise variance: as much as one difference may say
-JUMP_M = 0.1  # from where a hand was expected, unless its noise is as large: the filter starts anew
+JUMP_M, JUMP_MPS, JUMP_NOISE = 0.04, 1.0, 6.0  # what is farther from where a hand was expected than this, and than this
+# for each second since it was seen, and than so many of its noise's standard deviations, has jumped
 START_SPEED, START_ACCELERATION = 0.3, 1.0  # [m/s], [m/s²] of a hand of which one sample is known
 LEAST_PROBABILITY = 1e-4  # of a mode
 FARTHEST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
@@ -227,18 +228,29 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
 
 
 @compiled
-def take(states: Records, side: int, position: Vector, interval_s: float, fresh: bool) -> None:
-    """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before.
+def has_jumped(states: Records, side: int, position: Vector, interval_s: float) -> bool:
+    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
+    after the one before.
+    """
+    state = states[0]
+    gate = max(JUMP_M + JUMP_MPS * interval_s, JUMP_NOISE * math.sqrt(state.noise[side, 0]))
+    off = 0.0
+    for axis in range(3):
+        off += (position[axis] - state.hands[side, 0, axis]) ** 2
+    return bool(off > gate * gate)
 
-    A hand that was not `fresh`, or that is far from where it was expected, starts anew.
+
+@compiled
+def take(states: Records, side: int, position: Vector, interval_s: float, anew: bool) -> None:
+    """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before, or starts `anew`
+    with it.
     """
     state = states[0]
     noise, hand, means = state.noise[side], state.hands[side], state.means[side]
+    if anew:
+        noise[1] = 0.0
     _update_noise(noise, state.past[side], position, interval_s)
-    off = 0.0
-    for axis in range(3):
-        off += (position[axis] - hand[0, axis]) ** 2
-    if not fresh or off >= max(JUMP_M**2, SURPRISE * noise[0]):
+    if anew:
         _start(means, state.covariances[side], state.modes[side], noise[0], position)
     else:
         _update(means, state.covariances[side], state.modes[side], noise[0], position, interval_s)

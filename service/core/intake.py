@@ -11,16 +11,20 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.channels import BY_KEY
-from service.contract.messages import JointState, PoseStamped, WireError, in_order
-from service.contract.records import Cause
+from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
+from service.contract.records import SOURCES, Cause
 from service.core.frame import Record, Records, Vector, as_array
-from service.core.hand_estimator import HandEstimator, is_fresh, take
+from service.core.hand_estimator import HandEstimator, has_jumped, is_fresh, take
+from service.core.plausibility import REPEATED, is_confirmed, is_contested, note, refusal
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
-REPEATED, OLDER = int(Cause.REPEATED), int(Cause.OLDER)
+JUMPED, ARM = int(Cause.JUMPED), SOURCES.index("arm")
 FASTEST_JOINT = 100.0  # [rad/s] beyond it a measured joint is a mistake
+JUMP_RAD, JUMP_RADPS = 0.2, 5.0  # so far and so fast no joint gets from one sample to the next
+FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
+REST_RAD, REST_S = 0.02, 0.1  # an arm is at rest that stayed within so much for so long
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
 
 
@@ -33,6 +37,11 @@ def _stale_ticks(key: str, settings: Settings) -> int:
     return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
 
 
+def rest_ticks(settings: Settings) -> int:
+    """The ticks over which an arm must tell one posture before it is believed."""
+    return math.ceil(round(REST_S / settings.period_s, 6))
+
+
 class Intake:
     """Hand and arm samples into the state: each hand's estimate, the arm's newest sample."""
 
@@ -41,15 +50,17 @@ class Intake:
         self._period_s = settings.period_s
         self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
-        self._names = settings.joints.names
-        self._farthest_joint = max(2 * math.pi, *(abs(x) + 1.0 for x in settings.joints.lower + settings.joints.upper))
+        self._rest_ticks = rest_ticks(settings)
+        self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        limits = np.array([settings.joints.lower, settings.joints.upper])
+        self._plausible = limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]])
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
         self._frame = np.column_stack((UNIT_M[hands.unit] * axes, origin))
         self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
     def begin(self, state: Record) -> None:
         """Sets in a state of zeros what no sample has told yet."""
-        state["tick"] = state["hand_ticks"] = state["arm_tick"] = -1
+        state["tick"] = state["hand_ticks"] = state["arm_tick"] = state["rest_tick"] = state["told_ticks"] = -1
         self._estimator.begin(state)
 
     def is_fresh(self, state: Record, side: int) -> bool:
@@ -65,6 +76,15 @@ class Intake:
         seen = int(state["arm_tick"])
         return seen >= 0 and int(state["tick"]) - seen < self._silent_ticks
 
+    def is_arm_at_rest(self, state: Record) -> bool:
+        """Whether the arm is heard and has told one posture for a while, by whatever source."""
+        return self.is_arm_heard(state) and int(state["tick"]) - int(state["rest_tick"]) >= self._rest_ticks
+
+    @staticmethod
+    def is_contested(state: Record, *, already: bool) -> bool:
+        """Whether a hand or the arm is told by two sources; `already`: it was found so before."""
+        return is_contested(state, already=already)
+
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         state["tick"] += ticks
@@ -72,6 +92,9 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
+        if sample.frame_id not in self._frames:
+            state["rejected"][Cause.WRONG_FRAME] += 1
+            return
         _take_hand(
             as_array(state),
             side,
@@ -95,49 +118,50 @@ class Intake:
             sample.stamp_ns,
             np.array(position),
             np.array(velocity),
-            self._farthest_joint,
+            self._plausible,
             self._silent_ticks,
+            self._period_s,
         )
 
 
 @compiled
 def _take_arm(
-    states: Records, stamp_ns: int, position: Vector, velocity: Vector, farthest: float, silent_ticks: int
+    states: Records,
+    stamp_ns: int,
+    position: Vector,
+    velocity: Vector,
+    plausible: Vector,
+    silent_ticks: int,
+    period_s: float,
 ) -> None:
+    """`Intake.take_arm`, with the least and the greatest plausible joints (2, J) [rad]."""
     state = states[0]
-    fresh = state.arm_tick >= 0 and state.tick - state.arm_tick < silent_ticks
-    finite = bool(np.isfinite(position).all() and np.isfinite(velocity).all())
-    near = bool(np.abs(position).max() <= farthest and np.abs(velocity).max() <= FASTEST_JOINT)
-    if _is_refused(state.rejected, finite, True, near, stamp_ns, state.arm_stamp_ns, fresh):
+    passed = state.tick - state.arm_tick
+    fresh = state.arm_tick >= 0 and passed < silent_ticks
+    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+        state.rejected[NOT_FINITE] += 1
+        return
+    near, off, moved = True, 0.0, 0.0
+    for i in range(len(position)):
+        near = near and plausible[0, i] <= position[i] <= plausible[1, i] and abs(velocity[i]) <= FASTEST_JOINT
+        off = max(off, abs(position[i] - state.measured[i]))
+        moved = max(moved, abs(position[i] - state.rest[i]))
+    cause = -1 if near else OUT_OF_RANGE
+    if near:
+        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed * period_s, silent_ticks * period_s)
+    if near and cause != REPEATED:
+        jumped = fresh and off > JUMP_RAD + JUMP_RADPS * passed * period_s
+        note(states, ARM, jumped, period_s)
+        if jumped and cause < 0:
+            cause = JUMPED
+    if near and (moved > REST_RAD or not fresh):
+        state.rest[:] = position
+        state.rest_tick = state.tick
+    if cause >= 0:
+        state.rejected[cause] += 1
         return
     state.measured[:], state.measured_velocities[:] = position, velocity
     state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
-
-
-@compiled
-def _is_refused(
-    rejected: Vector, finite: bool, turned: bool, near: bool, stamp_ns: int, newest_ns: int, fresh: bool
-) -> bool:
-    """Whether a sample is refused, and then counted by the first cause: not finite, no rotation,
-    out of range, or not newer.
-
-    A repeated stamp is never news; an older one is, once the source has been silent: its clock was
-    set back.
-    """
-    cause = -1
-    if not finite:
-        cause = NOT_FINITE
-    elif not turned:
-        cause = NOT_A_ROTATION
-    elif not near:
-        cause = OUT_OF_RANGE
-    elif stamp_ns == newest_ns:
-        cause = REPEATED
-    elif fresh and stamp_ns < newest_ns:
-        cause = OLDER
-    if cause >= 0:
-        rejected[cause] += 1
-    return cause >= 0
 
 
 @compiled
@@ -161,11 +185,25 @@ def _take_hand(
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
     fresh = is_fresh(states, side, stale_ticks)
-    finite = bool(np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all())
-    turned, near = abs(math.sqrt(norm) - 1.0) <= 0.01, far <= FARTHEST_M * FARTHEST_M
-    if _is_refused(state.rejected, finite, turned, near, stamp_ns, state.hand_stamps_ns[side], fresh):
-        return
     since = state.tick - state.hand_ticks[side]
-    take(states, side, in_base, since * period_s, fresh)
+    jumped, cause = False, -1
+    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+        cause = NOT_FINITE
+    elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
+        cause = NOT_A_ROTATION
+    elif not far <= FARTHEST_M * FARTHEST_M:
+        cause = OUT_OF_RANGE
+    else:
+        cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
+        if cause != REPEATED:
+            jumped = fresh and has_jumped(states, side, in_base, since * period_s)
+            note(states, side, jumped, period_s)
+        if cause < 0 and jumped and not is_confirmed(states, side, in_base, stale_ticks, period_s):
+            cause = JUMPED
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return
+    take(states, side, in_base, since * period_s, jumped or not fresh)
+    state.doubts[side, 2] = 0
     state.hand_stamps_ns[side] = stamp_ns
     state.hand_ticks[side] = state.tick

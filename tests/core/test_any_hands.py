@@ -18,7 +18,7 @@ from in_process import ASSUMED, LEFT, RIGHT, hand
 from tests_paths import RECORDINGS
 from wam import URDF
 
-from service.contract.records import SIDES, Mode
+from service.contract.records import SIDES, Cause, Mode
 from service.core.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, order
@@ -90,3 +90,39 @@ def test_the_tool_keeps_its_speed_following_and_stopping(kind: str, spread_m: fl
         elif speed > allowed:
             beyond.append((k, speed, allowed))
     assert not beyond, beyond[:3]
+
+
+@example_settings(max_examples=MANY, deadline=None, derandomize=True)
+@given(st.floats(0.1, 1.5), st.floats(0.0, 0.003), st.floats(30.0, 500.0), st.integers(0, 10**6))
+def test_a_legal_hand_never_faults_nor_jumps_and_hardly_holds(
+    fastest: float, noise_m: float, rate_hz: float, seed: int
+) -> None:
+    """Reaches there and back at up to 1.5 m/s, with noise, late samples and dropouts of 30 to 90
+    ms.
+    """
+    random = np.random.default_rng(seed)
+    controller = Controller(ASSUMED, SKILL, urdf=URDF)
+    way = random.standard_normal((2, 3))
+    way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
+    lasts = 1.875 * np.linalg.norm(way, axis=1).max() / fastest  # of a minimum-jerk reach
+    stamps = np.arange(0.0, TICKS * PERIOD_S, 1.0 / rate_hz)
+    missing = np.zeros(len(stamps), bool)
+    for at in random.uniform(0.0, TICKS * PERIOD_S, 2):
+        missing |= (stamps > at) & (stamps < at + random.uniform(0.03, 0.09) - 1.0 / rate_hz)
+    told = stamps[~missing]
+    held = 0
+    for k in range(TICKS):
+        inbox = []
+        while len(told) and told[0] <= k * PERIOD_S:
+            turns, u = divmod(told[0] / lasts, 1.0)
+            there = u**3 * (10 - 15 * u + 6 * u * u)
+            moved = way * (1.0 - there if turns % 2 else there) + noise_m * random.standard_normal((2, 3))
+            inbox = [
+                hand(s, tuple((np.array((LEFT, RIGHT)[i]) + moved[i]).tolist()), k + 1) for i, s in enumerate(SIDES)
+            ]
+            told = told[1:]
+        frame = controller.step(Tick(k, tuple(inbox)))
+        assert frame["mode"] != Mode.FAULT, (k, frame["reason"])
+        held += frame["mode"] == Mode.HOLD
+    assert frame["rejected"].tolist() == [0] * len(Cause)
+    assert held <= 0.02 * TICKS

@@ -159,7 +159,9 @@ def test_nothing_is_commanded_before_the_arm_has_told_where_it_is(taught: Skill)
     before = frames(controller, resting(0, 200))
     assert modes(before) == [("hold", "arm_not_ready")]
     assert not before["commanded"].any()
-    after = frames(controller, resting(200, 1, lambda k: (arm(start, k),)))
+    after = frames(controller, resting(200, 60, lambda k: (arm(start, k),)))
+    assert np.flatnonzero(after["commanded"])[0] == 50  # a tenth of a second of one posture
+    after = after[50:]
     assert after["commanded"].all()
     assert np.abs(after["joints"][0] - start).max() < 1e-3
 

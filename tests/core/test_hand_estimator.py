@@ -11,7 +11,7 @@ from test_intake import LEFT, PERIOD_S, Hands, follow
 from service.config import HandSettings
 from service.core import hand_estimator
 from service.core.frame import Vector
-from service.core.hand_estimator import JUMP_M, LEAST_NOISE, MODES, MOST_NOISE, model
+from service.core.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE, model
 
 
 def reach(t: float) -> Vector:
@@ -55,28 +55,6 @@ def test_what_is_said_of_the_noise_makes_no_difference_after_a_second_and_a_half
     ]
     for other in told[1:]:
         assert np.linalg.norm(other[750:, 0] - told[0][750:, 0], axis=1).max() < 0.0005
-
-
-@pytest.mark.parametrize("rate_hz", [30, 100, 500])
-def test_hands_that_alternate_come_to_rest_between_their_places(rate_hz: int) -> None:
-    """Two sources of one hand, 9 cm apart, in turn."""
-    side, places = {"at": 0}, (np.array([0.5, -0.045, 0.2]), np.array([0.5, 0.045, 0.2]))
-
-    def where(t: float) -> Vector:
-        side["at"] = 1 - side["at"]
-        return places[side["at"]]
-
-    states = follow(Hands(), where, until_s=6.0, rate_hz=rate_hz)
-    assert np.abs(states[1500:, 0, 1]).max() < 0.06
-    assert np.abs(states[1500:, 1]).max() < 3.0
-
-
-def test_a_jump_is_no_motion() -> None:
-    hands = Hands()
-    follow(hands, lambda t: np.array([0.5, 0.0, 0.2]), until_s=1.0)
-    hands.hand(10**10, (0.5 + 2 * JUMP_M, 0.0, 0.2))
-    np.testing.assert_allclose(hands.state["hands"][LEFT, 0], [0.5 + 2 * JUMP_M, 0.0, 0.2])
-    assert not hands.state["hands"][LEFT, 1:].any()
 
 
 def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:

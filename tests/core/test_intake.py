@@ -134,6 +134,25 @@ def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
     assert hands.fresh()
 
 
+@pytest.mark.parametrize(
+    ("frame", "configured", "taken"),
+    [
+        ("base", "base", True),
+        ("", "base", True),
+        ("camera", "base", False),
+        ("camera", "camera", True),
+        ("base", "camera", True),
+        ("Base", "base", False),
+        ("base\0", "base", False),
+    ],
+)
+def test_a_hand_in_a_frame_that_nobody_configured_is_refused(frame: str, configured: str, taken: bool) -> None:
+    hands = Hands(HandSettings(frame=configured))
+    hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.5, 0.1, 0.2), STRAIGHT))
+    assert hands.fresh() == taken
+    assert hands.rejected() == ({} if taken else {Cause.WRONG_FRAME: 1})
+
+
 # --- stamps and ages -----------------------------------------------------------------------------
 
 
@@ -194,19 +213,50 @@ def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
     hands.advance()
     np.testing.assert_array_equal(hands.hand(50, (0.6, 0.0, 0.0)), [0.6, 0.0, 0.0])
     assert hands.fresh()
-    hands.hand(51)
+    hands.hand(51, (0.6, 0.0, 0.0))
     assert hands.rejected() == {Cause.OLDER: 49}
 
 
-def test_one_stamp_from_the_future_locks_a_hand_out_until_it_is_stale_only() -> None:
+@pytest.mark.parametrize("ahead_ns", [110_000_000, 10**9, 3600 * 10**9, 2**62, 2**63 - 1])
+def test_a_stamp_from_the_future_is_refused_and_locks_no_source_out(ahead_ns: int) -> None:
     hands = Hands()
-    hands.hand(1_000)
-    hands.hand(2**62)
+    hands.hand(0, side=RIGHT)  # repeated: the same as none
     for tick in range(1, 60):
+        hands.hand(tick)
+        hands.arm(tick)
+        if tick == 5:
+            hands.hand(ahead_ns)
+            hands.arm(ahead_ns)
         hands.advance()
-        hands.hand(1_000 + tick)
-    assert hands.rejected() == {Cause.OLDER: 49}
+    assert hands.rejected() == {Cause.REPEATED: 1, Cause.AHEAD: 2}
     assert hands.fresh()
+    assert hands.intake.is_arm_heard(hands.state)
+
+
+def test_a_stamp_may_be_ahead_by_the_time_that_passed_and_the_time_to_silence() -> None:
+    hands = Hands()
+    hands.hand(1)
+    hands.advance(30)
+    hands.hand(1 + 160_000_000)
+    hands.advance(10)
+    hands.hand(1 + 160_000_000 + 120_000_001)
+    assert hands.rejected() == {Cause.AHEAD: 1}
+
+
+@pytest.mark.parametrize("first", [-(2**63), -1, 1, 2**63 - 1])
+def test_stamps_at_the_ends_of_their_numbers_are_compared_without_overflow(first: int) -> None:
+    hands = Hands()
+    hands.hand(first)
+    hands.arm(first)
+    for other in (-(2**63), 2**63 - 1, 0):
+        hands.hand(other)
+        hands.arm(other)
+    assert hands.state["hand_stamps_ns"][LEFT] in {first, 0}
+    hands.advance(50)
+    hands.hand(7)
+    hands.arm(7)
+    assert hands.fresh()
+    assert hands.intake.is_arm_heard(hands.state)
 
 
 def test_a_stale_hand_stands_still_and_starts_anew() -> None:
@@ -251,6 +301,8 @@ def test_joints_without_velocities_stand_still() -> None:
         (JOINT_NAMES, (math.nan,) + (0.1,) * 6, (), Cause.NOT_FINITE),
         (JOINT_NAMES, (0.1,) * 7, (math.inf,) * 7, Cause.NOT_FINITE),
         (JOINT_NAMES, (7.0,) * 7, (), Cause.OUT_OF_RANGE),
+        (JOINT_NAMES, (2.81,) + (0.1,) * 6, (), Cause.OUT_OF_RANGE),  # 0.21 outside
+        (JOINT_NAMES, (5e-324,) * 7, (-1e308,) * 7, Cause.OUT_OF_RANGE),
         (JOINT_NAMES, (0.1,) * 7, (101.0,) * 7, Cause.OUT_OF_RANGE),
     ],
 )

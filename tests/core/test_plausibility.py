@@ -1,0 +1,232 @@
+"""What a source cannot mean: stamps far ahead, jumps, two sources of one hand or of the arm.
+
+Each was an attack once: on hands here, on the arm in `test_arm_sources`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+from in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from test_intake import LEFT as LEFT_SIDE
+from test_intake import STRAIGHT, Hands
+from wam import URDF
+
+from service.contract.messages import PoseStamped
+from service.contract.records import SIDES, Cause, Mode, Reason
+from service.core import plausibility
+from service.core.controller import Controller
+from service.core.frame import Tick, as_array, copied
+from service.core.skill import Skill
+
+PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
+
+
+def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int) -> list[float]:
+    """Samples at a rate, one after the other (None: missing); y of the estimate after each."""
+    every, told = 500 // rate_hz, []
+    for place in places:
+        hands.advance(every)
+        if place is not None:
+            hands.hand(10**9 + int(hands.state["tick"]), place)
+        told.append(float(hands.state["hands"][LEFT_SIDE, 0, 1]))
+    return told
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 250, 500])
+def test_a_jump_is_believed_once_three_samples_over_20_ms_agree_and_not_at_all_before(rate_hz: int) -> None:
+    hands = Hands()
+    tell(hands, [PLACE] * rate_hz, rate_hz)
+    y = np.array(tell(hands, [ELSEWHERE] * 30, rate_hz))
+    believed = int(np.argmax(y > 0.2))
+    every = 500 // rate_hz
+    assert believed == max(2, math.ceil(0.02 * 500 / every - 0.5))
+    assert np.abs(y[:believed] - 0.1).max() < 0.001
+    assert np.abs(y[believed:] - 0.3).max() < 0.001
+    assert hands.rejected() == {Cause.JUMPED: believed}
+    assert hands.fresh()
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+@pytest.mark.parametrize("length", [1, 2])
+def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, length: int) -> None:
+    told, missing = Hands(), Hands()
+    head, tail = [PLACE] * 40, [PLACE] * 20
+    tell(told, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
+    tell(missing, [*head, *[None] * length, *tail], rate_hz)
+    assert told.rejected() == {Cause.JUMPED: length}
+    for name in ("hands", "means", "covariances", "noise", "modes"):
+        assert told.state[name].tobytes() == missing.state[name].tobytes(), name
+
+
+def test_samples_that_jump_and_disagree_are_never_believed() -> None:
+    hands, random = Hands(), np.random.default_rng(5)
+    tell(hands, [PLACE] * 40, 100)
+    wild = [tuple(random.uniform(-1.0, 1.0, 3).tolist()) for _ in range(9)]
+    assert np.abs(np.array(tell(hands, wild, 100)) - 0.1).max() < 0.005
+    assert hands.rejected() == {Cause.JUMPED: 9}
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+@pytest.mark.parametrize("apart_m", [0.09, 0.4])
+def test_of_two_sources_that_take_turns_the_first_is_believed_and_the_contest_is_noticed(
+    rate_hz: int, apart_m: float
+) -> None:
+    hands = Hands()
+    other = (PLACE[0], PLACE[1] + apart_m, PLACE[2])
+    tell(hands, [PLACE] * 20, rate_hz)
+    y = tell(hands, [other, PLACE] * (3 * rate_hz // 2), rate_hz)
+    assert np.abs(np.array(y) - PLACE[1]).max() < 0.001
+    assert hands.intake.is_contested(hands.state, already=False)
+    assert hands.fresh()
+    tell(hands, [PLACE] * (3 * rate_hz), rate_hz)
+    assert not hands.intake.is_contested(hands.state, already=True)
+
+
+@pytest.mark.parametrize("offset_ns", [-5_000_000, 3600 * 10**9])
+def test_a_second_source_with_a_clock_of_its_own_is_noticed_too(offset_ns: int) -> None:
+    hands = Hands()
+    for _ in range(500):
+        hands.advance(5)
+        stamp_ns = 10**15 + int(hands.state["tick"]) * 2_000_000
+        hands.hand(stamp_ns, PLACE)
+        hands.hand(stamp_ns + offset_ns, ELSEWHERE)
+    assert hands.intake.is_contested(hands.state, already=False)
+    assert abs(hands.state["hands"][LEFT_SIDE, 0, 1] - 0.1) < 0.001
+
+
+def test_a_copy_of_the_same_source_that_comes_late_is_no_contest() -> None:
+    hands = Hands()
+    for k in range(500):
+        hands.advance(5)
+        hands.hand(10**9 + k, PLACE)
+        hands.hand(10**9 + k - 3, PLACE)
+        hands.hand(10**9 + k, PLACE)
+    assert not hands.intake.is_contested(hands.state, already=True)
+    assert set(hands.rejected()) == {Cause.OLDER, Cause.REPEATED}
+
+
+def test_a_flood_of_ten_samples_a_tick_is_taken_in_turn() -> None:
+    hands = Hands()
+    noise = np.random.default_rng(6).normal(0.0, 0.003, (5000, 3))
+    for k, row in enumerate(noise):
+        if k % 10 == 0:
+            hands.advance()
+        hands.hand(10**9 + 200_000 * k, tuple((np.array(PLACE) + row).tolist()))
+    assert hands.rejected() == {}
+    np.testing.assert_allclose(hands.state["hands"][LEFT_SIDE, 0], PLACE, atol=0.002)
+
+
+NUMBERS = st.one_of(
+    st.floats(width=64), st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e-310, 1.0, 0.5, math.nan, math.inf, 1e308, 5.0])
+)
+STAMPS = st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from([-(2**63), -1, 0, 1, 2**63 - 1]))
+SAMPLES = st.tuples(
+    st.integers(0, 60),
+    STAMPS,
+    st.sampled_from(["base", "", "camera"]),
+    st.one_of(st.just(PLACE), st.tuples(NUMBERS, NUMBERS, NUMBERS)),
+    st.one_of(st.just(STRAIGHT), st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS)),
+)
+
+
+@example_settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.lists(SAMPLES, max_size=12))
+@example([(0, 2**63 - 1, "base", PLACE, STRAIGHT), (50, -(2**63), "", (5e-324,) * 3, STRAIGHT)])
+def test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculated_with(
+    samples: list[tuple[int, int, str, tuple[float, ...], tuple[float, ...]]],
+) -> None:
+    hands = Hands()
+    for k, (ticks, stamp_ns, frame, position, turn) in enumerate(samples):
+        if ticks:
+            hands.advance(ticks)
+        before, count = int(hands.state["hand_ticks"][LEFT_SIDE]), sum(hands.rejected().values())
+        hands.intake.take_hand(hands.state, LEFT_SIDE, PoseStamped(stamp_ns, frame, position, turn))  # type: ignore[arg-type]
+        taken = sum(hands.rejected().values()) == count
+        assert taken <= (int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])), (k, before)
+        for name in ("hands", "means", "covariances", "noise", "modes", "contested"):
+            assert np.isfinite(hands.state[name]).all(), name
+        assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 0]) < 10.0
+
+
+# --- in the core ---
+
+
+def told(until: int, contest: range, *, swap: bool = False) -> list[Tick]:
+    """Ticks with hands at rest; between two sources take turns, or the hands' labels are mixed
+    up in every other sample.
+    """
+    ticks = []
+    for k in range(until):
+        inbox = []
+        if k % 5 == 0:
+            left, right = LEFT, RIGHT
+            if k in contest and k // 5 % 2:
+                left, right = (right, left) if swap else ((LEFT[0], LEFT[1] + 0.3, LEFT[2]), RIGHT)
+            inbox = [hand("left", left, k + 1), hand("right", right, k + 1)]
+        ticks.append(Tick(k, tuple(inbox)))
+    return ticks
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_while_two_sources_tell_of_a_hand_it_holds_and_then_goes_on(skill: Skill, swap: bool) -> None:
+    contest = range(1000, 2500)
+    seen = frames(Controller(ASSUMED, skill, urdf=URDF), told(4000, contest, swap=swap))
+    assert (seen["mode"][50:1000] == Mode.FOLLOW).all()
+    held = np.flatnonzero(seen["mode"] == Mode.HOLD)
+    assert set(seen["reason"][held[held > 50]].tolist()) == {Reason.TWO_SOURCES}
+    assert held[held > 50][0] < contest.start + 500
+    assert contest.stop < held[-1] < contest.stop + 1000
+    assert seen["mode"][-1] == Mode.FOLLOW
+    still = seen["hands"][1000:, 0] - np.array(LEFT)
+    assert np.abs(still).max() < 0.002
+    steps = np.abs(np.diff(seen["joints"], axis=0)).max()
+    assert steps <= 1.5 * 0.002 + 1e-9
+
+
+def test_one_sudden_move_of_both_hands_is_followed_without_a_hold(skill: Skill) -> None:
+    ticks = []
+    for k in range(2000):
+        y = 0.09 if k >= 1000 else 0.0
+        inbox = [hand(side, (at[0], at[1] + y, at[2]), k + 1) for side, at in zip(SIDES, (LEFT, RIGHT), strict=True)]
+        ticks.append(Tick(k, tuple(inbox) if k % 16 == 0 else ()))
+    seen = frames(Controller(ASSUMED, replace(skill, threshold=math.inf), urdf=URDF), ticks)
+    assert set(seen["reason"][50:].tolist()) == {Reason.NONE}
+
+
+# --- plain and compiled ---
+
+
+@given(STAMPS, STAMPS, st.booleans(), st.floats(0.0, 10.0))
+@example_settings(max_examples=200, deadline=None, derandomize=True)
+def test_stamps_are_judged_as_the_plain_rule_says(stamp: int, newest: int, fresh: bool, passed_s: float) -> None:
+    found = plausibility.refusal(stamp, newest, fresh, passed_s, 0.1)
+    if stamp == newest:
+        wanted = Cause.REPEATED
+    elif fresh and stamp < newest:
+        wanted = Cause.OLDER
+    else:
+        wanted = Cause.AHEAD if fresh and stamp - newest > (passed_s + 0.1) * 1e9 else -1
+    assert found == wanted
+
+
+def test_compiled_and_plain_memory_agree() -> None:
+    hands, random = Hands(), np.random.default_rng(7)
+    compiled, plain = copied(hands.state), copied(hands.state)
+    for _ in range(200):
+        jumped, at = bool(random.random() < 0.4), random.choice([0.0, 0.01, 0.3]) * np.ones(3)
+        ticks, answers = int(random.integers(0, 12)), []
+        for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
+            state["tick"] += ticks
+            way(plausibility.note)(as_array(state).view(np.recarray), 0, jumped, 0.002)
+            answers.append(way(plausibility.is_confirmed)(as_array(state).view(np.recarray), 0, at, 50, 0.002))
+        assert answers[0] == answers[1]
+        np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
+        assert compiled["doubts"].tobytes() == plain["doubts"].tobytes()
