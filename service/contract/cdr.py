@@ -30,6 +30,7 @@ _TICK = struct.Struct("<qII")
 _ATTACHMENT = struct.Struct("<Qqq")
 _STAMPED = 12  # bytes of header and stamp
 _MOST_LAYOUTS = 16
+_LONGEST = 8192  # bytes of what the loop reads: the time it takes is bounded
 
 
 def _header(stamp_ns: int, frame: str) -> bytearray:
@@ -160,10 +161,18 @@ def encode_record(data: bytes) -> bytes:
     return CDR_HEADER + data
 
 
+def _stamp_ns(sec: int, nanosec: int) -> int:
+    if nanosec >= _NS:
+        raise WireError(f"a stamp of {nanosec} ns beside its seconds, less than {_NS} needed")
+    return sec * _NS + nanosec
+
+
 class _Reader:
     """A cursor over CDR bytes; every read is checked against the end."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, most: int | None = None) -> None:
+        if most is not None and len(data) > most:
+            raise WireError(f"a message of {len(data)} bytes, at most {most} accepted")
         if data[:4] != CDR_HEADER:
             raise WireError(f"header {data[:4].hex(' ') or 'missing'}, little-endian CDR {CDR_HEADER.hex(' ')} needed")
         self._data = data
@@ -197,8 +206,7 @@ class _Reader:
         return self.unpack(struct.Struct(f"<{count}d"), 8) if count else ()
 
     def header(self) -> tuple[int, str]:
-        sec, nanosec = self.unpack(_STAMP, 4)
-        return sec * _NS + nanosec, self.string()
+        return _stamp_ns(*self.unpack(_STAMP, 4)), self.string()
 
     def end(self) -> None:
         if len(self._data) - self._at > 3:  # some writers pad to four bytes
@@ -207,7 +215,7 @@ class _Reader:
 
 def decode_pose(data: bytes) -> PoseStamped:
     """The PoseStamped in CDR bytes. Raises WireError."""
-    reader = _Reader(data)
+    reader = _Reader(data, _LONGEST)
     stamp, frame = reader.header()
     values = reader.unpack(_POSE, 8)
     reader.end()
@@ -216,7 +224,7 @@ def decode_pose(data: bytes) -> PoseStamped:
 
 def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     """The PoseWithCovarianceStamped in CDR bytes. Raises WireError."""
-    reader = _Reader(data)
+    reader = _Reader(data, _LONGEST)
     stamp, frame = reader.header()
     values = reader.unpack(_POSE, 8)
     covariance = reader.unpack(_COVARIANCE, 8)
@@ -247,11 +255,15 @@ def decode_joints(data: bytes) -> JointState:
         numbers = known.numbers.unpack_from(data, _STAMPED + len(known.fixed))
         n, v = known.counts[0], known.counts[0] + 1 + known.counts[1]
         if numbers[n] == known.counts[1] and numbers[v] == known.counts[2]:
-            sec, nanosec = _STAMP.unpack_from(data, 4)
             return JointState(
-                sec * _NS + nanosec, known.names, numbers[:n], numbers[n + 1 : v], numbers[v + 1 :], known.frame_id
+                _stamp_ns(*_STAMP.unpack_from(data, 4)),
+                known.names,
+                numbers[:n],
+                numbers[n + 1 : v],
+                numbers[v + 1 :],
+                known.frame_id,
             )
-    reader = _Reader(data)
+    reader = _Reader(data, _LONGEST)
     stamp, frame = reader.header()
     names = tuple(reader.string() for _ in range(reader.length()))
     position, velocity, effort = reader.doubles(), reader.doubles(), reader.doubles()

@@ -10,6 +10,8 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+LONGEST = 300  # characters of what others say is wrong
+
 
 class ExplainedError(Exception):
     """An error whose message tells people what failed, what was given and what is accepted:
@@ -30,9 +32,9 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
         value, node, accepted = _at(path, given, inspect.type_info(kind))
     except (LookupError, TypeError, AttributeError):  # a name in what was given looks like a path
         return f"$: {error}"
-    unknown = re.match(r"Object contains unknown field `(.*)`", message)
+    unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
-        return f"{path}: unknown field {unknown[1]!r}; known are {', '.join(_known(node)) or 'none'}"
+        return f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(_known(node)) or 'none'}"
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
     if (
@@ -44,7 +46,7 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
             counted = "numbers" if isinstance(node, inspect.TupleType) else "given"
             return f"{path}: {len(value) or 'none'} {counted}, {needed}"
         return f"{path}: {_short(value)} given; {needed}"
-    return f"{path}: {message}"
+    return f"{path}: {message[:LONGEST]}"
 
 
 def _known(node: inspect.StructType) -> list[str]:
@@ -115,7 +117,10 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        return "what is nested too deep"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

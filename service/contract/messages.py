@@ -89,7 +89,7 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
     found = {name: i for i, name in enumerate(given)}
     missing = [name for name in names if name not in found]
     if missing:
-        raise WireError(f"joints {missing} missing among {list(given)}")
+        raise WireError(f"joints {missing} missing among {len(given)}, {', '.join(given[:10])[:200]}")
     return tuple(found[name] for name in names)
 
 

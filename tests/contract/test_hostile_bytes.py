@@ -1,0 +1,89 @@
+"""Bytes from strangers: every decoder answers with a value or a refusal in words, and soon.
+
+`THIRDHAND_EXAMPLES=100000 pytest tests/contract/test_hostile_bytes.py` mutates more;
+`hostile_bytes` itself searches with atheris.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from random import Random
+
+import pytest
+from hostile_bytes import DECODERS, FOUND, REQUESTS, check, mutated, seeds
+
+from service.contract import cdr
+from service.contract.messages import WireError
+from service.contract.requests import RequestError
+
+MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "1500"))
+LARGE = 2_000_000  # bytes, far more than any message has
+SOON_S = 5.0  # on a machine that does much else; what is quadratic takes minutes
+
+
+@pytest.mark.parametrize("name", DECODERS)
+def test_seeds_are_taken_and_what_was_found_is_refused(name: str) -> None:
+    for data in seeds(name):
+        assert check(name, data) == (data not in FOUND.get(name, [])), data
+
+
+@pytest.mark.parametrize("name", DECODERS)
+def test_mutated_messages_are_taken_or_refused_in_words(name: str) -> None:
+    random, kept = Random(name), seeds(name)
+    taken = 0
+    for _ in range(MANY):
+        data = mutated(name, random.choice(kept), random)
+        taken += check(name, data)
+        if len(kept) < 200 and random.random() < 0.1:
+            kept.append(data[:4000])
+    assert taken < MANY
+
+
+@pytest.mark.parametrize("name", DECODERS)
+def test_every_cut_of_a_message_is_taken_or_refused(name: str) -> None:
+    for data in seeds(name):
+        for size in range(len(data)):
+            check(name, data[:size])
+
+
+@pytest.mark.parametrize("name", DECODERS)
+@pytest.mark.parametrize("filler", [b"\0", b"\xff", b"\1\0\0\0", b"[", b'{"a":', b'"', b"9"])
+def test_what_is_large_is_answered_soon(name: str, filler: bytes) -> None:
+    begin = time.process_time()
+    for head in (b"", cdr.CDR_HEADER, seeds(name)[0]):
+        check(name, head + filler * (LARGE // len(filler)))
+    assert time.process_time() - begin < SOON_S
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_what_is_nested_deep_is_refused_at_any_depth(name: str) -> None:
+    limit = sys.getrecursionlimit()
+    for depth in [*range(limit - 120, limit + 10, 3), 10 * limit]:
+        for text in ("[" * depth + "]" * depth, '{"op":' * depth + "1" + "}" * depth):
+            assert not check(name, text.encode())
+            assert not check(name, b'{"op": "add", "points": ' + text.encode() + b"}")
+            assert not check(name, b'{"name": ' + text.encode() + b"}")
+
+
+def test_a_name_of_any_length_is_told_in_few_words() -> None:
+    for field in ("op", "name", "x" * 100_000, "\n" * 1000):
+        for value in ("y" * 100_000, list(range(100_000)), 10**4000):
+            assert not check("via_points", json.dumps({field: value}).encode())
+
+
+@pytest.mark.parametrize("decode", [cdr.decode_pose, cdr.decode_pose_with_covariance, cdr.decode_joints])
+def test_what_the_loop_reads_is_refused_by_its_size_alone(decode: Callable[[bytes], object]) -> None:
+    with pytest.raises(WireError, match="a message of 8193 bytes, at most 8192 accepted"):
+        decode(b"x" * 8193)
+
+
+def test_a_stamp_has_less_than_a_second_of_nanoseconds() -> None:
+    for data in FOUND["joints"]:
+        with pytest.raises(WireError, match="4294967295 ns"):
+            cdr.decode_joints(data)
+    with pytest.raises(RequestError, match="not JSON"):
+        DECODERS["nothing"](b"\xff")
