@@ -24,9 +24,12 @@ class RankReached(UserWarning):
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     """A read-only copy of `value` of the given shape, where a word stands for any length.
 
-    Raises ValueError if the shape is another or a number is not finite.
+    Raises ValueError if the shape is another or a number is not real and finite.
     """
-    array = np.array(value, dtype=np.float64, order="C")
+    given = np.asarray(value)
+    if given.dtype.kind not in "biuf":
+        raise ValueError(f"{name}: numbers of type {given.dtype} given, real ones needed.")
+    array = np.array(given, dtype=np.float64, order="C")
     check_shape(name, array, *shape)
     check_finite(name, array)
     return frozen(array)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import zlib
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
-from zipfile import BadZipFile
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.primitive import KMP
 
@@ -22,6 +23,17 @@ class Stored(NamedTuple):
     output_unit: str
 
 
+def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """A checksum of arrays by name, in 32 letters; an array `checksum` among them is left out."""
+    sums = hashlib.blake2b(digest_size=16)
+    for name in sorted(arrays):
+        if name != "checksum":
+            array = np.asarray(arrays[name])
+            sums.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+            sums.update(np.ascontiguousarray(array).tobytes())
+    return sums.hexdigest()
+
+
 def save(path: str | Path, primitive: KMP, *, input_unit: str, output_unit: str) -> None:
     """Writes the primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
 
@@ -32,23 +44,29 @@ def save(path: str | Path, primitive: KMP, *, input_unit: str, output_unit: str)
         "input_unit": np.array(input_unit),
         "output_unit": np.array(output_unit),
     }
+    arrays: dict[str, Any] = units | primitive.to_arrays()
     with Path(path).open("wb") as file:
-        np.savez(file, allow_pickle=False, **units, **primitive.to_arrays())
+        np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
 
 def load(path: str | Path) -> Stored:
     """The primitive and the units that `save` wrote; it predicts the same, bit for bit.
 
-    Raises OSError if the file cannot be read, and ValueError if it is not one that `save` wrote.
+    Raises OSError if the file cannot be read, and ValueError if it is not one that `save` wrote, or
+    was changed since. Files of earlier versions have no checksum, and are taken without.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = dict(archive)
-    except (ValueError, EOFError, TypeError, BadZipFile, zlib.error) as error:
+    except OSError:
+        raise
+    except Exception as error:  # what a damaged archive may raise is not documented by anyone
         raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote: {error}") from None
-    if int(arrays.get("kmp_format", 0)) != _FORMAT:
-        raise ValueError(f"{path}: format {int(arrays.get('kmp_format', 0))} given, {_FORMAT} needed.")
+    if (given := arrays.get("kmp_format", np.array(0)).tolist()) != _FORMAT:
+        raise ValueError(f"{path}: format {given} given, {_FORMAT} needed.")
+    if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
+        raise ValueError(f"{path}: the numbers are not those that were saved: their checksum is another.")
     try:
         return Stored(KMP.from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -142,7 +142,7 @@ def refresh(path: Path) -> dict[str, float]:
     except RecordingError:  # frames or states had another layout then: there is nothing to compare with
         before = []
     beside = path.with_suffix(".new")
-    frames = record(beside, old.settings, decoded(old.skill, origin=str(path)), ticks(old))
+    frames = record(beside, old.settings, decoded(old.skill, origin=str(path), recorded=True), ticks(old))
     beside.replace(path)
     changes: dict[str, float] = {}
     for was, now in zip(before, frames, strict=bool(before)):

@@ -18,16 +18,21 @@ from service.core.frame import Vector
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError, with_file
 
+STEEPEST = 3.0  # at such places the skill itself comes to be twice as steep, 8 at most; where it was learned, 4
+NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 
 
 def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
     """A new skill that goes through these via-points and no others. Raises SkillError.
 
-    Algorithm 1 of Huang et al. 2019, from the skill as it was learned.
+    Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
+    tool would have to move more than `STEEPEST` times as far as the hands contradict each other:
+    hands at rest tremble, and the tool would shake so many times as much.
     """
+    inputs, outputs, deviations = neighbourhoods(via_points)
+    _check_agreement(via_points, inputs, outputs, deviations)
     try:
-        inputs, outputs, deviations = neighbourhoods(via_points)
         desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
@@ -35,6 +40,21 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
+
+
+def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
+    """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
+    contradict each other.
+    """
+    hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
+    tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
+    allowed = STEEPEST * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
+    owners = [name for point in via_points for name in [point.name] * points_made_of([point])]
+    for i, j in np.argwhere(tools > allowed)[:1].tolist():
+        raise SkillError(
+            f"via-points {owners[i]!r} and {owners[j]!r} contradict each other: their hands are {hands[i, j]:.4f} m "
+            f"apart and their tools {tools[i, j]:.4f} m; {STEEPEST:g} times as far, {allowed[i, j]:.4f} m, accepted"
+        )
 
 
 def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:

@@ -137,7 +137,7 @@ class _Skills:
 
         Raises SkillError.
         """
-        skill = decoded(data, origin="the recording")
+        skill = decoded(data, origin="the recording", recorded=True)
         return self._found.setdefault(skill.digest, skill)
 
     def events(self, step: Step) -> tuple[Event, ...]:

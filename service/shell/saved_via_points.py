@@ -4,10 +4,12 @@ were taught to.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -15,6 +17,11 @@ from service.config import Settings
 from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
+
+
+def _checksum(saved: dict[str, Any]) -> str:
+    """Of all that is saved, however it is laid out."""
+    return hashlib.blake2b(json.dumps(saved, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 class SavedViaPoints:
@@ -36,6 +43,8 @@ class SavedViaPoints:
             raise SkillError(f"cannot read via-points {self.path}: {error.strerror}") from None
         try:
             saved = json.loads(content)
+            if saved.pop("checksum") != _checksum(saved):
+                raise ValueError("its checksum is another: it was changed since; remove it, and teach them again")
             request = (
                 decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
                 if saved["request"]
@@ -43,7 +52,7 @@ class SavedViaPoints:
             )
             if saved["learned_from"] != skill.learned_from:
                 return None
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise SkillError(f"{self.path} does not hold via-points ({error})") from None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
@@ -57,7 +66,8 @@ class SavedViaPoints:
             if skill.via_points
             else None
         )
-        content = json.dumps({"skill": skill.name, "learned_from": skill.learned_from, "request": request}, indent=1)
+        saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
+        content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile("w", dir=self.path.parent, suffix=".new", delete=False) as file:

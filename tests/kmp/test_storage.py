@@ -71,3 +71,23 @@ def test_a_file_that_is_cut_or_of_one_array_is_refused_with_its_name(tmp_path):
     np.save(tmp_path / "one.npy", np.ones(3))
     with pytest.raises(ValueError, match=r"one\.npy: not an \.npz file"):
         kmp.load(tmp_path / "one.npy")
+
+
+def test_numbers_that_were_changed_are_refused_and_files_of_earlier_versions_taken(tmp_path):
+    whole, part = tmp_path / "whole.npz", tmp_path / "part.npz"
+    kmp.save(whole, next(primitives()), input_unit="m", output_unit="m")
+    arrays = dict(np.load(whole))
+    np.savez(part, **(arrays | {"weights": 2 * arrays["weights"]}))
+    with pytest.raises(ValueError, match=r"part\.npz: the numbers are not those that were saved"):
+        kmp.load(part)
+    del arrays["checksum"]
+    np.savez(part, **arrays)
+    assert np.array_equal(kmp.load(part).primitive.weights, arrays["weights"])
+    for name, value in (
+        ("base_weights", arrays["base_weights"] + 1j),
+        ("ell", np.array("x")),
+        ("kmp_format", np.ones(2)),
+    ):
+        np.savez(part, **(arrays | {name: value}))
+        with pytest.raises(ValueError, match=r"part\.npz: "):
+            kmp.load(part)

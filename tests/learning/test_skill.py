@@ -12,9 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.skill import Skill
@@ -276,9 +278,13 @@ def test_there_is_no_pickle_in_a_file(aimed: Skill) -> None:
 
 
 def changed(skill: Skill, **arrays: Any) -> bytes:
-    """The skill's file with some arrays in place of its own; None leaves one out."""
+    """The skill's file with some arrays in place of its own, and their checksum; None leaves one
+    out.
+    """
     with np.load(io.BytesIO(skill.file), allow_pickle=False) as original:
         kept = {name: value for name, value in (dict(original) | arrays).items() if value is not None}
+    if not any(value.dtype == object for value in kept.values()):
+        kept |= {"checksum": np.array(checksum(kept))} if "checksum" not in arrays else {}
     out = io.BytesIO()
     np.savez(out, allow_pickle=True, **kept)
     return out.getvalue()
@@ -334,7 +340,7 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill)
         ({"box": None}, "box"),
         ({"base_inputs": np.zeros(3)}, "inputs"),
         ({"base_inputs": np.zeros((200, 2)), "via_inputs": np.zeros((0, 2))}, "2 inputs and 3 outputs, 6 and 3 needed"),
-        ({"ell": np.array(-1.0)}, "ell is -1"),
+        ({"ell": np.array(-1.0)}, "ell has -1"),
         ({"places": np.array('[{"name": "a"}]')}, "left"),
         ({"name": np.array([{}], dtype=object)}, "x.npz"),
     ],
@@ -362,6 +368,99 @@ def test_a_wrong_array_is_named(skill: Skill, arrays: dict[str, Any], message: s
 def test_an_array_that_would_harm_the_motion_is_refused(skill: Skill, arrays: dict[str, Any]) -> None:
     with pytest.raises(SkillError, match=next(iter(arrays))):
         decoded(changed(skill, **arrays), origin="x.npz")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"weights": np.full((200, 3), 1e300)}, "weights has 1e+300, -1e+12 to 1e+12 accepted"),
+        ({"base_weights": np.full((200, 3), 1e300), "weights": np.full((200, 3), 1e300)}, "base_weights has 1e+300"),
+        ({"base_weights": np.full((200, 3), 5e3), "weights": np.full((200, 3), 5e3)}, "where it was learned, the tool"),
+        ({"weights": np.zeros((200, 3), complex)}, "weights has numbers of type complex128, real ones needed"),
+        ({"threshold": np.array(0.5 + 2j)}, "threshold has numbers of type complex128"),
+        ({"ell": np.array(1e300)}, "ell has 1e+300, 0.001 to 10000 1/m² accepted"),
+        ({"lambda_mean": np.array(1e300)}, "lambda_mean has 1e+300"),
+        ({"lambda_covariance": np.array(1e-300)}, "lambda_covariance has 1e-300"),
+        ({"prior_mean": np.array([0.0, 1e5, 0.0])}, "prior_mean has 100000, -10 to 10 m accepted"),
+        ({"base_inputs": np.full((200, 6), 1e9)}, "base_inputs has 1e+09"),
+        ({"base_inputs": np.zeros((2501, 6))}, "2501 reference points, at most 2500 accepted"),
+        ({"box": np.array([[-1e9] * 3, [1e9] * 3])}, "box has -1e+09"),
+        ({"threshold": np.array(1e300)}, "threshold has 1e+300"),
+        ({"tolerance": np.array(-1.0)}, "tolerance has -1"),
+        ({"components": np.array(-3)}, "components has -3"),
+        ({"name": np.array("x" * 201)}, "name is no text of up to 200 letters"),
+        ({"name": np.array(3)}, "name is no text"),
+        ({"checksum": None}, "no checksum: written by an earlier version"),
+        ({"checksum": np.array("0" * 32)}, "the checksum is another"),
+        ({"tolerance": np.array(0.06), "checksum": np.array("0" * 32)}, "the checksum is another"),
+    ],
+    ids=lambda value: value[:40] if isinstance(value, str) else "",
+)
+def test_what_no_skill_has_is_refused_with_what_is_accepted(skill: Skill, arrays: dict[str, Any], message: str) -> None:
+    with pytest.raises(SkillError) as caught:
+        decoded(changed(skill, **arrays), origin="x.npz")
+    assert str(caught.value).startswith("x.npz: ")
+    assert message in str(caught.value)
+
+
+def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill) -> None:
+    random, whole = np.random.default_rng(8), aimed.file
+    same = 0
+    for _ in range(400):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << int(random.integers(8))
+        try:
+            back = decoded(bytes(damaged), origin="x.npz")
+        except SkillError:
+            continue
+        same += 1
+        assert with_file(replace(back, file=b"")).file == whole
+    assert same < 40
+
+
+def test_a_recording_may_hold_a_skill_of_an_earlier_version(skill: Skill) -> None:
+    old = changed(skill, checksum=None)
+    assert with_file(replace(decoded(old, origin="a recording", recorded=True), file=b"")).file == skill.file
+
+
+def test_a_file_that_unpacks_to_much_is_not_unpacked(skill: Skill) -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("format.npy", "w") as file:
+        file.write(b"\x93NUMPY\x01\x00")
+        for _ in range(101):
+            file.write(bytes(1_000_000))
+    with pytest.raises(SkillError, match=r"101000008 bytes unpacked, at most 100000000 accepted"):
+        decoded(out.getvalue(), origin="x.npz")
+
+
+def moved(point: ViaPoint, name: str, *, hands: float, tool: float, **more: Any) -> ViaPoint:
+    """A via-point whose left hand and tool are elsewhere [m]."""
+    left, at = point.left, point.tool
+    return msgspec.structs.replace(
+        point, name=name, left=(left[0] + hands, left[1], left[2]), tool=(at[0], at[1] + tool, at[2]), **more
+    )
+
+
+EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
+
+
+@pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
+def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, hands: float) -> None:
+    steep = 3.0 * hands + 0.001 + 0.0006
+    with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
+        adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
+    assert f"3 times as far, {steep:.4f} m, accepted" in str(caught.value)
+    allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
+    here = np.array([*EXACT.left, *EXACT.right])
+    assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 8.0
+
+
+def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill: Skill) -> None:
+    adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
+    apart = moved(EXACT, "twin", hands=0.05, tool=0.12)
+    adapted(skill, (EXACT, apart), tolerance=0.05)
+    with pytest.raises(SkillError, match="contradict each other"):
+        adapted(skill, (EXACT, msgspec.structs.replace(apart, radius=0.025)), tolerance=0.05)
 
 
 def test_a_skill_file_can_be_read_from_disk_as_bytes(tmp_path: Path, aimed: Skill) -> None:

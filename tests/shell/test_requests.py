@@ -173,7 +173,9 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     assert all(taught["missed_by_m"] < 0.003 for taught in reply["points"])
     assert cell.client.ask("via_points", {"op": "list"})["points"] == reply["points"]
 
-    moved = cell.client.ask("via_points", add(point(name="glass", tool=[0.5, 0.1, 0.3])))
+    moved = cell.client.ask(
+        "via_points", add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3]))
+    )
     assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
     assert len(moved["points"]) == 3
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -78,3 +80,26 @@ def test_a_file_that_cannot_be_read_is_told(saved: SavedViaPoints, skill: Skill)
     saved.path.mkdir(parents=True)
     with pytest.raises(SkillError, match=r"cannot read via-points .*: Is a directory"):
         saved.read(skill)
+
+
+def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    random = Random(1)
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
+    whole = saved.path.read_bytes()
+    for _ in range(1000):
+        damaged = bytearray(whole)
+        damaged[random.randrange(len(whole))] ^= 1 << random.randrange(8)
+        saved.path.write_bytes(damaged)
+        with contextlib.suppress(SkillError):
+            assert saved.read(skill) == (POINTS, 0.03)
+
+
+def test_a_file_that_somebody_edited_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
+    whole = saved.path.read_text()
+    for text, why in ((whole.replace("0.03", "0.04"), "changed since"), (whole.replace("checksum", "sum"), "checksum")):
+        saved.path.write_text(text)
+        with pytest.raises(SkillError, match=why):
+            saved.read(skill)
+    saved.path.write_text(json.dumps(json.loads(whole)))  # laid out in another way
+    assert saved.read(skill) == (POINTS, 0.03)
