@@ -18,7 +18,7 @@ from service.core.frame import Vector
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError, with_file
 
-STEEPEST = 3.0  # at such places the skill itself comes to be twice as steep, 8 at most; where it was learned, 4
+STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 

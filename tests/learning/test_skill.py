@@ -446,13 +446,13 @@ EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
 
 @pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
 def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, hands: float) -> None:
-    steep = 3.0 * hands + 0.001 + 0.0006
+    steep = 4.0 * hands + 0.001 + 0.0006
     with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
         adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
-    assert f"3 times as far, {steep:.4f} m, accepted" in str(caught.value)
+    assert f"4 times as far, {steep:.4f} m, accepted" in str(caught.value)
     allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
     here = np.array([*EXACT.left, *EXACT.right])
-    assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 8.0
+    assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 10.0
 
 
 def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill: Skill) -> None:
