@@ -151,7 +151,11 @@ def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_
 
 
 def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> None:
-    many = [msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(0.5 + 0.005 * i, 0.0, 0.1)) for i in range(30)]
+    along = [0.5 + 0.005 * i for i in range(30)]  # the tool goes along with the hand
+    many = [
+        msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(x, 0.0, 0.1), tool=(x, *HANDOVER.tool[1:]))
+        for i, x in enumerate(along)
+    ]
     replies = shared_daemon.session.get(
         "thirdhand/via_points", payload=requests.encode_json(requests.Add(tuple(many))), timeout=30
     )
