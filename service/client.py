@@ -7,13 +7,15 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import zenoh
 
 from service.contract import channels, requests
 from service.contract.explain import ExplainedError
+
+ENDPOINTS_TIMEOUT_S = 30.0  # a machine that is busy answers late
 
 
 class UnreachableError(ExplainedError, OSError):
@@ -24,8 +26,14 @@ class RefusedError(ExplainedError, ValueError):
     """The daemon's answer to a request that it did not carry out."""
 
 
-def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), timeout_s: float = 10.0) -> zenoh.Session:
-    """An open Zenoh session between named endpoints, without scouting.
+def open_session(
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    timeout_s: float = 10.0,
+    more: Mapping[str, Any] | None = None,
+) -> zenoh.Session:
+    """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
 
     Close it. Raises UnreachableError.
     """
@@ -40,6 +48,8 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
         "connect/exit_on_failure": True,
         "listen/exit_on_failure": True,
         "adminspace/enabled": bool(listen),
+        "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in
+        **(more or {}),
     }
     try:
         for name, value in settings.items():
@@ -62,14 +72,14 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
             ) from None
         if connect and "connect" in reason:
             raise UnreachableError(
-                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?"
+                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there, and not overrun?"
             ) from None
         raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
 
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:
     """The endpoints at which a session really listens, with the ports that it was given."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=5.0):
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=ENDPOINTS_TIMEOUT_S):
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
     return ()
@@ -89,6 +99,8 @@ class Client:
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
         """The reply to one request; `request` is anything that becomes JSON."""
         payload = requests.encode_json({} if request is None else request)
+        if len(payload) > channels.LARGEST_REQUEST:
+            raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
         for reply in self._session.get(channels.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
             if reply.ok is not None:
                 answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())

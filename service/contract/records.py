@@ -37,6 +37,7 @@ class Reason(enum.IntEnum):
     ARM_SILENT = 7
     TOOL_SPEED = 8  # measured, or commanded in spite of all bounds
     SETPOINT = 9  # passed a bound of its own, which cannot be
+    SERVICE = 10  # a part of the service failed; the log says which
 
 
 class Flag(enum.IntFlag):

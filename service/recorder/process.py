@@ -39,6 +39,7 @@ FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 2.0
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
+CLOSING_S = 20.0  # that it may take to write the rest when the daemon was killed
 POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
 
 
@@ -243,6 +244,7 @@ def main() -> None:
     """Serves the socket whose descriptor is the only argument."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends when the socket does, with all that was told
+    child.end_with_parent(CLOSING_S)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(5)

@@ -43,7 +43,9 @@ class Cell:
         self.running = True
         self._tick = 0
         self._end = threading.Event()
-        tell = {"status": self.status, "note": self.notes.append, "keep": self.kept.append}
+        self.failures: list[str] = []
+        tell = {"status": lambda: requests.encode_json(self.status()), "tick": lambda: self._tick}
+        tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
         self.requests = Requests(near, self.settings, skill, workshop=workshop, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
@@ -219,7 +221,9 @@ class SlowWorkshop(Workshop):
         super().__init__()
         self.begun, self.let = threading.Event(), threading.Event()
 
-    def adapt(self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float) -> Skill:
+    def adapt(
+        self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float, timeout_s: float = 0.0
+    ) -> Skill:
         self.begun.set()
         assert self.let.wait(20)
         return adapted(skill, places, tolerance=tolerance)
@@ -326,7 +330,7 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
         (b"\xff\xfe", "not JSON: JSON is malformed"),
         (b"[" * 100_000, "not JSON: maximum recursion depth"),
-        (b" " * 20_000_000, "a request of 20000000 bytes, at most 262144 accepted"),
+        (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
     ],
     ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
 )
