@@ -50,7 +50,11 @@ def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
     process runs that Python.
     """
-    program = ("-c", f"{before}\nfrom service.__main__ import main\nmain()") if before else ("-m", "service")
+    program = (
+        ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
+        if before
+        else ("-m", "service")
+    )
     with (
         launched(folder, *arguments, program=program) as service,
         open_session(connect=[service.endpoint]) as session,

@@ -64,6 +64,13 @@ class Daemon:
         self._stop = threading.Event()
         self._ended = threading.Event()
         urdf = robot_description(settings)
+        allow_descriptors()
+        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen, more=BOUNDS)
+        try:
+            self._token = occupy(self._session, settings.cell)
+        except OccupiedError:
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise
         slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
         slow.start()
         try:
@@ -80,14 +87,8 @@ class Daemon:
         self._faults: deque[Event] = deque()
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
+        self._newest = -1  # tick
         self._laps: list[tuple[str, int]] = []
-        allow_descriptors()
-        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen, more=BOUNDS)
-        try:
-            self._token = occupy(self._session, settings.cell)
-        except OccupiedError:
-            self._session.close()  # type: ignore[no-untyped-call]
-            raise
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         self._subscribers = [
             (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
@@ -176,6 +177,7 @@ class Daemon:
         prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
         while True:
             index, self._late_ns = self._clock.wait(prepare)
+            self._newest = index
             self._began_ns = time.perf_counter_ns()
             self._laps = []
             inbox = [
@@ -197,7 +199,7 @@ class Daemon:
     def _warm_up(self) -> None:
         """Steps a twin through what the next tick may be: so it finds code and numbers near."""
         self._twin.imitate(self._controller)
-        self._twin.step(Tick(int(self._frame["tick"]) + 1, tuple(self._seen.values())))
+        self._twin.step(Tick(self._newest + 1, tuple(self._seen.values())))
 
     def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
         """The newest message on one channel, if it is one."""
@@ -220,7 +222,7 @@ class Daemon:
     def _publish(self, tick: Tick, frame: Frame) -> None:
         now_ns = time.time_ns()
         attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
-        for channel, payload in outgoing(frame, self._clock.time_ns(tick.index), self._settings.joints.names):
+        for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
             self._publishers[channel.key].put(payload, attachment=attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
@@ -236,7 +238,7 @@ class Daemon:
             else:
                 latency_ms = 0.0
         late_us, work_us = self._late_ns / 1e3, (time.perf_counter_ns() - self._began_ns) / 1e3
-        time_ns, missed = self._clock.time_ns(tick.index), self._clock.missed
+        time_ns, missed = self._clock.stamp_ns, self._clock.missed
         timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
         self._lateness.add(late_us)
         self._work.add(work_us)

@@ -16,12 +16,14 @@ from service.contract.explain import ExplainedError
 
 MOST_SESSIONS = 64
 MOST_DESCRIPTORS = 65536
+MOST_HANDSHAKES = 16  # at once: those given up are closed together, and that holds up the others
 HANDSHAKE_TIMEOUT_MS = 2000
 ENVELOPE = 1024  # bytes of key, attachment and Zenoh's own around the largest request
 NEIGHBOURS_TIMEOUT_S = 5.0
 
 BOUNDS: dict[str, Any] = {
     "transport/unicast/max_sessions": MOST_SESSIONS,
+    "transport/unicast/accept_pending": MOST_HANDSHAKES,
     "transport/unicast/accept_timeout": HANDSHAKE_TIMEOUT_MS,
     "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE,
 }
