@@ -49,20 +49,21 @@ def launched(
     *arguments: str,
     record: Path | None = None,
     program: tuple[str, ...] = ("-m", "service"),
+    network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
     Raises LaunchError.
 
-    Its configuration, log and saved via-points are in `folder`, its recordings in `record` where
-    that is given.
+    Its configuration (with `network` for its door), log and saved via-points are in `folder`, its
+    recordings in `record` where that is given.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state"} | ({} if record is None else {"record": record})
     config.write_text(
         "# A cell with a free port and its own files.\n"
-        '[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\n'
+        f"{network}[files]\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items())
     )
     command = [sys.executable, *program, "serve", "--config", str(config), *arguments]

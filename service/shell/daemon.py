@@ -36,6 +36,7 @@ from service.shell import watch
 from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
 from service.shell.door import BOUNDS, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
+from service.shell.roles import access_control
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
 
@@ -65,7 +66,13 @@ class Daemon:
         self._ended = threading.Event()
         urdf = robot_description(settings)
         allow_descriptors()
-        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen, more=BOUNDS)
+        network = settings.network
+        self._session = open_session(
+            connect=network.connect,
+            listen=network.listen,
+            certificate=network.certificate,
+            more=BOUNDS | (access_control(settings.cell) if network.certificate else {}),
+        )
         try:
             self._token = occupy(self._session, settings.cell)
         except OccupiedError:
