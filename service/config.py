@@ -130,7 +130,7 @@ class Table(Section, frozen=True):
 def is_local(endpoint: str) -> bool:
     """Whether only processes of this machine reach a Zenoh endpoint."""
     protocol, _, address = endpoint.partition("/")
-    host = re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
+    host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
     try:
         return protocol == "unixsock-stream" or host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

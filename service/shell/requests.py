@@ -219,8 +219,9 @@ class Requests:
 
     def _load(self, name: str) -> Reply:
         path = self._skills / (name if name.endswith(".npz") else f"{name}.npz")
-        if not path.is_file() or path.resolve().parent != self._skills.resolve():
-            there = ", ".join(sorted(p.stem for p in self._skills.glob("*.npz"))) or "none"
+        folder = self._skills.resolve()
+        if not path.is_file() or path.resolve().parent != folder:
+            there = ", ".join(sorted(p.stem for p in folder.glob("*.npz") if p.resolve().parent == folder)) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {there}")
         skill = self._workshop.load(path)
         if (

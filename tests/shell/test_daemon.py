@@ -227,7 +227,21 @@ def test_bad_usage_and_failures_are_told_on_standard_error(arguments: tuple[str,
 
 
 @pytest.mark.parametrize(
-    "name", ["demo", "serve", "play", "replay", "learn", "via-points", "status", "hold", "resume", "reset", "view"]
+    "name",
+    [
+        "demo",
+        "serve",
+        "play",
+        "replay",
+        "learn",
+        "via-points",
+        "status",
+        "hold",
+        "resume",
+        "reset",
+        "view",
+        "certificates",
+    ],
 )
 def test_every_command_has_help_with_an_example(name: str) -> None:
     done = thirdhand(name, "--help")

@@ -376,6 +376,16 @@ def test_a_plain_request_with_something_in_it_is_refused(
     assert taught_cell.refusal(suffix, request_).startswith(message)
 
 
+def test_a_link_does_not_lead_out_of_the_skill_folder(taught_cell: Cell, skill: Skill, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.npz").write_bytes(skill.file)
+    link = taught_cell.folder / "linked.npz"
+    link.symlink_to(tmp_path / "elsewhere.npz")
+    try:
+        assert "no skill 'linked' in the skill folder" in taught_cell.refusal("skill", {"name": "linked"})
+    finally:
+        link.unlink()
+
+
 def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
     (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
     assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
