@@ -46,6 +46,7 @@ STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SLOWEST_START_S = 120.0  # of the workshop, on a machine that is busy
 LONG_START_S = 3.0
+MOST_NOTES = 100  # a second
 LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
 
 
@@ -92,6 +93,7 @@ class Daemon:
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._realtime, self._version = False, version("thirdhand")
         self._faults: deque[Event] = deque()
+        self._notes = (0, 0)  # second, and how many in it
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
         self._newest = -1  # tick
@@ -133,7 +135,20 @@ class Daemon:
         self._stop.set()
 
     def note(self, text: str) -> None:
-        """A line for the log and for the recording."""
+        """A line for the log and for the recording; of more than MOST_NOTES a second only the
+        number is told.
+        """
+        second = int(time.monotonic())
+        if second != self._notes[0]:
+            left_out = self._notes[1] - MOST_NOTES
+            self._notes = (second, 0)
+            if left_out > 0:
+                self._say(f"{left_out} more requests in a second, not noted one by one")
+        self._notes = (second, self._notes[1] + 1)
+        if self._notes[1] <= MOST_NOTES:
+            self._say(text)
+
+    def _say(self, text: str) -> None:
         log.info(text)
         self._scribe.note("requests", text, time.time_ns())
 
@@ -161,7 +176,7 @@ class Daemon:
     def _fail(self, what: str) -> None:
         """Says what of the service failed; the next tick is at fault for it."""
         self._faults.append(order("fault", what))
-        self.note(what)
+        self._say(what)
 
     def _fail_in_the_loop(self, what: str) -> None:
         """Lets the loop stop the arm. Raises LoopError where no tick came since it failed last."""

@@ -138,9 +138,11 @@ def _main(descriptor: int) -> None:
                 answer: Skill | str = _work(*request)
             except Exception as error:  # the asker is told, whatever it was
                 answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
-            _send(
-                channel, pickle.dumps(answer, protocol=5, buffer_callback=buffers.append), *(b.raw() for b in buffers)
-            )
+            skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+            try:
+                _send(channel, skill, *(b.raw() for b in buffers))
+            except BrokenPipeError:
+                return
 
 
 if __name__ == "__main__":

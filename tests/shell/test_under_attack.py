@@ -20,6 +20,7 @@ from tests_paths import ROOT
 
 from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
+from service.shell.daemon import MOST_NOTES
 from service.shell.door import MOST_SESSIONS
 
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
@@ -134,10 +135,13 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.mark.parametrize("kind", ["list", "add", "status", "resume", "nonsense"])
 def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kind: str) -> None:
+    begin, before = time.monotonic(), len(daemon.log.read_text().splitlines())
     with attack(FLOOD, daemon, kind) as said:
         assert said == "begun"
         assert slowest_hold_s(daemon) < SOON_S
     daemon.client.ask("hold")
+    noted = len(daemon.log.read_text().splitlines()) - before
+    assert noted < (MOST_NOTES + 5) * (time.monotonic() - begin + 2)
 
 
 def test_requests_beyond_the_bound_are_refused_at_once(daemon: Daemon) -> None:
