@@ -139,8 +139,13 @@ class Requests:
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
+        here = threading.local()  # Zenoh calls from a thread of its own for each queryable
+
         def come_in(query: zenoh.Query) -> None:
             try:
+                if not hasattr(here, "is_beside"):
+                    here.is_beside = True
+                    run_beside_real_time()
                 if suffix == "status" or self._is_list(suffix, query):
                     self._reply(suffix, query)
                 else:
