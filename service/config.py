@@ -20,6 +20,7 @@ from service.contract.explain import ExplainedError, explained
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
+RATES_HZ = (50, 1000)  # slowest and fastest
 FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
 NEAREST_POINT = 0.4
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -168,13 +169,17 @@ class Files(Section, frozen=True):
     state: str = "~/.local/state/thirdhand"
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # with each recording an .rrd file
+    segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
+    segment_minutes: Positive = 10.0
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # 0: no limit
 
 
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: Cell = "thirdhand"
-    rate_hz: Annotated[int, msgspec.Meta(ge=50, le=1000)] = 500
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)

@@ -117,9 +117,39 @@ def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Pa
                     lost=100 if tick.index == 500 else 0,
                 )
     result = replay(path)
-    assert result.exact
+    assert not result.exact
+    assert result.within_tolerance
     assert result.gaps == 1
-    assert result.ticks == 899
+    assert result.ticks == result.identical == 899
+    assert "gap after tick 399, before tick 500: 100 ticks not recorded; goes on after tick 500" in result.text()
+
+
+def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: Path) -> None:
+    data = bytearray(recorded.read_bytes())
+    path = tmp_path / "damaged.mcap"
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    result = replay(path)
+    assert result.gaps == 1
+    assert not result.truncated
+    assert result.identical == result.ticks > 500
+    (gap,) = result.missing
+    assert gap.resumed in (500, 750, 1000)
+    assert f"gap after tick {gap.after}, before tick {gap.before}: damage at byte" in result.text()
+    exact = command(str(path), "--exact")
+    assert (exact.returncode, "checksum" in exact.stdout or "damage" in exact.stdout) == (1, True)
+
+
+def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
+    data = recorded.read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[: len(data) * 2 // 3])
+    result = replay(path)
+    assert result.truncated
+    assert not result.exact
+    assert result.within_tolerance
+    assert "cut at byte" in result.text()
+    assert f"the last tick read is {result.ticks - 1}" in result.text()
 
 
 def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_path: Path) -> None:

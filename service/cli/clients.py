@@ -54,10 +54,11 @@ def status(args: argparse.Namespace) -> int:
         + (f"  {', '.join(now['flags'])}" if now["flags"] else ""),
         "skill": f"{now['skill']}; via-points: {', '.join(now['places']) or 'none'}",
         "loop": f"{now['rate_hz']:.2f} Hz, tick {now['tick']}, {now['missed']} missed",
-        "scheduling": "real time" if now["realtime"] else "ordinary: real time was not granted",
+        "scheduling": ("real time" if now["realtime"] else "ordinary: real time was not granted")
+        + (", memory locked" if now["memory_locked"] else ", memory not locked"),
         "hands": ", ".join(f"{side} {age:.0f} ms old" for side, age in now["hand_age_ms"].items()) or "none seen",
         "rejected": ", ".join(f"{count} {cause}" for cause, count in now["rejected"].items()) or "none",
-        "recording": now["scribe"].get("recording") or "none",
+        "recording": now["scribe"].get("recording") or f"none ({now['scribe'].get('state', 'off')})",
         **({"lost": f"{now['scribe']['lost']} ticks are not recorded"} if now["scribe"].get("lost") else {}),
         **({"trouble": "; ".join(now["scribe"]["errors"])} if now["scribe"].get("errors") else {}),
     }

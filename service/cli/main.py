@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 from service.cli.usage import UsageError
+from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
@@ -73,14 +74,21 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--scene", metavar="FILE", type=Path, help="TOML file with handover, glass and soldering as [x, y, z] in metres"
     )
-    c.add_argument("--rate", metavar="HZ", type=int, default=500, help="of the loop (default: %(default)s)")
+    c.add_argument("--rate", metavar="HZ", type=_rate, default=500, help="of the loop (default: %(default)s)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
     c.add_argument("--seconds", metavar="S", type=float, default=24.0, help="to measure for (default: %(default)g)")
-    c.add_argument("--rate", metavar="HZ", type=int, default=500, help="of the loop (default: %(default)s)")
+    c.add_argument("--rate", metavar="HZ", type=_rate, default=500, help="of the loop (default: %(default)s)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    c.add_argument("--output", metavar="DIR", type=Path, help="write bench.json there")
+    c.add_argument(
+        "--output", metavar="DIR", type=Path, help="write bench.json there, a picture, and what the whole recorded"
+    )
+    other = c.add_mutually_exclusive_group()
+    other.add_argument(
+        "--loads", action="store_true", help="what happens beside the loop instead, each for so many seconds"
+    )
+    other.add_argument("--soak", metavar="MIN", type=float, help="memory and open files over so many minutes instead")
 
     c = command(
         "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
@@ -96,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
         help=f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})",
     )
     c.add_argument("--connect", metavar="EP", action="append", help="Zenoh endpoint to connect to; may be repeated")
-    c.add_argument("--rate", metavar="HZ", type=int, help="of the loop (default: 500)")
+    c.add_argument("--rate", metavar="HZ", type=_rate, help="of the loop (default: 500)")
     c.add_argument(
         "--skill",
         metavar="FILE",
@@ -125,11 +133,14 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "replay",
-        "Runs the core on a recording and compares every frame.",
+        "Runs the core on a recording, or on several that follow each other, and compares every frame. What is missing "
+        "or damaged is said; only --exact fails for it.",
         "thirdhand replay recordings/golden.mcap --exact",
     )
-    c.add_argument("file", metavar="FILE", type=Path, help="a recording")
-    c.add_argument("--exact", action="store_true", help="forbid even differences below 10 µm and 10 µrad")
+    c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording, and those that follow it")
+    c.add_argument(
+        "--exact", action="store_true", help="forbid gaps, damage, a cut, and even differences below 10 µm and 10 µrad"
+    )
     c.add_argument(
         "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
     )
@@ -232,6 +243,13 @@ def parser() -> argparse.ArgumentParser:
         "--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)"
     )
     return top
+
+
+def _rate(given: str) -> int:
+    low, high = RATES_HZ
+    if given.isdecimal() and low <= int(given) <= high:
+        return int(given)
+    raise argparse.ArgumentTypeError(f"{given} given, {low} to {high} Hz needed")
 
 
 def _reach(sub: argparse.ArgumentParser) -> None:

@@ -54,12 +54,14 @@ def play(args: argparse.Namespace) -> int:
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Exit code 0 if every frame is identical, or close enough where that is allowed."""
+    """Exit code 0 if every frame that is there is close enough; with `--exact`, if every frame is
+    there and identical.
+    """
 
     def progress(ticks: int) -> None:
         print(f"\r{ticks} ticks", end="", file=sys.stderr, flush=True)
 
-    result = replayed(args.file, after=args.after, progress=progress if sys.stderr.isatty() else None)
+    result = replayed(*args.files, after=args.after, progress=progress if sys.stderr.isatty() else None)
     if sys.stderr.isatty():
         print("\r", end="", file=sys.stderr)
     print(result.text())

@@ -99,7 +99,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
     try:
         with ViewerClient.spawn(
-            headless=True, port=port, hide_welcome_screen=True, executable_path=str(_executable())
+            headless=True, port=port, hide_welcome_screen=True, executable_path=str(executable())
         ) as client:
             client.open(str(source if "://" in str(source) else Path(source).absolute()))
             _wait(lambda: _extent(client) is not None and ("://" in str(source) or not client.get_state().loading))
@@ -126,7 +126,7 @@ def show(source: str | Path) -> int:
     """
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
-    return subprocess.run([_executable(), "--bind", "127.0.0.1", str(source)], check=False).returncode
+    return subprocess.run([executable(), "--bind", "127.0.0.1", str(source)], check=False).returncode
 
 
 def _extent(client: Any) -> tuple[int, int] | None:
@@ -155,7 +155,7 @@ def _wait(done: Callable[[], bool], timeout_s: float = 30.0) -> None:
         clock.sleep(0.3)
 
 
-def _executable() -> Path:
+def executable() -> Path:
     """The Rerun program that came with the library: it need not be on the path."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:

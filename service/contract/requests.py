@@ -132,6 +132,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: float
     missed: int
     realtime: bool
+    memory_locked: bool
     skill: str
     places: tuple[str, ...]
     rejected: dict[str, int]

@@ -2,22 +2,22 @@
 
 The loop makes one non-blocking send a tick over a socket pair that keeps message boundaries. Slow,
 stuck or dead, the loop does not notice: what does not fit is counted as lost, the next message that
-does carries state and skill, so that a replay goes on behind the gap, and a dead scribe is started
-anew.
+does carries state and skill, so that a replay goes on behind the gap, and a scribe that is dead or
+silent is replaced. A scribe reports how many ticks it has on disk; what a dead one was told beyond
+that is lost too.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import time
 from collections import deque
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,13 @@ import msgspec
 from service import child
 from service.config import Settings
 from service.core.frame import Record, Tick
-from service.recorder.protocol import LARGEST_MESSAGE, Task, pack, pack_note
+from service.recorder.protocol import LARGEST_MESSAGE, Report, Task, pack, pack_note
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
 READY_TIMEOUT_S = 15.0
 RESTART_S = 1.0
+SILENT_S = 5.0  # a scribe reports twice a second
 
 
 class Scribe:
@@ -40,8 +41,9 @@ class Scribe:
     `send` and `skip` are for the loop, `start`, `supervise`, `status` and `close` for one other
     thread, `note` and `keep` for any.
 
-    In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`; `recording` and `rrd` are explicit
-    paths. With none of these and no `live_port` there is nothing to do and no process.
+    In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another; `recording` and
+    `rrd` are explicit paths. With none of these and no `live_port` there is nothing to do and no
+    process. One that has not reported for `silent_s` is replaced.
     """
 
     def __init__(
@@ -53,9 +55,10 @@ class Scribe:
         rrd: Path | None = None,
         live_port: int | None = None,
         restart_s: float = RESTART_S,
+        silent_s: float = SILENT_S,
     ) -> None:
         self._settings = settings
-        self._restart_s = restart_s
+        self._restart_s, self._silent_s = restart_s, silent_s
         self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
         self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
         self._socket: socket.socket | None = None  # of the child that is told; the loop reads it, the others set it
@@ -63,9 +66,11 @@ class Scribe:
         self._say_all = True
         self._gap = self._lost = self._sent = self._restarts = 0
         self._since_state = self._pause = 0
-        self._started = 0.0
+        self._owed = self._marked = 0  # ticks that scribes took along; how many of them the loop has told of
+        self._buried = self._sent_before = 0  # lost with scribes that are gone; ticks sent before the present one
+        self._started = self._heard = 0.0
         self._memory: dict[int, tuple[bytes, int]] = {}
-        self._report: dict[str, Any] = {"recording": None, "rrd": None, "live": None}
+        self._report = Report()
         self._errors: deque[str] = deque(maxlen=5)
 
     def start(self, *, skill: bytes, state: Record | None) -> None:
@@ -123,8 +128,9 @@ class Scribe:
         say_all = self._say_all
         self._since_state += 1
         with_state = say_all or self._since_state >= self._settings.rate_hz
-        after = state() if with_state else None
-        message = pack(tick, frame, timing, state=after, lost=self._gap, with_skill=say_all)
+        after, owed = state() if with_state else None, self._owed
+        lost = self._gap + owed - self._marked
+        message = pack(tick, frame, timing, state=after, lost=lost, with_skill=say_all)
         try:
             skills = [event.payload for event in tick.inbox if event.kind == "skill"]
             if say_all:
@@ -140,7 +146,7 @@ class Scribe:
             self._pause = self._settings.rate_hz // 10  # one gap rather than many
             return
         self._sent += 1
-        self._gap = 0
+        self._gap, self._marked = 0, owed
         if say_all:
             self._say_all = False
         if with_state:
@@ -162,85 +168,97 @@ class Scribe:
                 target.send(pack_note(key, text, time_ns))
 
     def supervise(self) -> None:
-        """Hears what the process has to say, and starts it anew if it died, with new files.
-
-        Ten times a second.
+        """Hears what the process has to say, and replaces it if it is dead or silent, with new
+        files. Ten times a second.
         """
         if not self._wanted or self._child is None:
             return
         self._listen(timeout_s=0.0)
-        process = self._child.process
+        process, now = self._child.process, time.monotonic()
         if process.poll() is None:
+            patience_s = READY_TIMEOUT_S if self._socket is None else self._silent_s
+            if now - self._heard > patience_s:
+                self._heard = now
+                self._errors.append(f"the scribe was silent for {patience_s:g} s and is replaced")
+                process.kill()
             return
-        if self._socket is not None:
-            self._errors.append(f"the scribe ended with code {process.returncode}")
-            self._socket = None
-        if time.monotonic() - self._started >= self._restart_s:
+        if now - self._started >= self._restart_s:
+            self._bury()
             self._child.socket.close()
             self._restarts += 1
             self._child = self._spawn(None, None)
+        elif self._socket is not None:
+            self._errors.append(f"the scribe ended with code {process.returncode}")
+            self._socket = None
+
+    def _bury(self) -> None:
+        """Counts what a process that is gone was told and has not on disk."""
+        if self._child is not None and self._socket is not None:
+            self._errors.append(f"the scribe ended with code {self._child.process.returncode}")
+        self._socket = None
+        self._listen(timeout_s=0.0)
+        self._socket, last = None, self._report
+        unsaid = max(0, self._sent - self._sent_before - last.kept - last.lost)
+        self._buried += last.lost + unsaid
+        self._owed += last.unmarked + unsaid
+        self._sent_before, self._report = self._sent, Report()
 
     def status(self) -> dict[str, Any]:
-        """What is known of the process: alive, ticks sent and lost, restarts, where it writes, the
-        latest errors.
+        """What is known of the process: alive, its state (`off`, `starting`, `recording`,
+        `drawing` where no recording is wanted, `interrupted` where none can be written), ticks sent
+        and lost, restarts, where it writes, the latest errors.
         """
         alive = self._socket is not None and self._child is not None and self._child.process.poll() is None
-        counts = {
+        report = self._report
+        return {
             "alive": alive,
+            "state": report.state if alive else "starting" if self._child is not None else "off",
             "pid": None if self._child is None else self._child.process.pid,
             "sent": self._sent,
-            "lost": self._lost,
+            "lost": self._lost + self._buried + report.lost,
             "restarts": self._restarts,
+            "recording": report.recording,
+            "rrd": report.rrd,
+            "live": report.live,
+            "errors": list(self._errors),
         }
-        return counts | self._report | {"errors": list(self._errors)}
 
-    def close(self, timeout_s: float = 20.0) -> None:
+    def close(self, timeout_s: float = 20.0) -> str:
         """Lets the process write what it was told and close its files; ends it if that takes longer
-        than `timeout_s`.
+        than `timeout_s`. What the recordings lack, in words; empty: nothing.
         """
         running, self._socket = self._child, None
-        if running is None:
-            return
-        with contextlib.suppress(OSError):
-            running.socket.shutdown(socket.SHUT_WR)  # also where a forked process still holds this end
-        try:
-            running.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            self._errors.append(f"the scribe was not done after {timeout_s:g} s: its last data are lost")
-            running.process.kill()
-            running.process.wait()
-        self._listen(timeout_s=0.0)
-        self._socket, self._child = None, None
-        running.socket.close()
-        for _, fd in self._memory.values():
-            os.close(fd)
-        self._memory = {}
-
-    def _paths(self) -> tuple[Path | None, Path | None]:
-        recording, rrd = self._recording, self._rrd
-        if self._restarts:
-            recording, rrd = (path and path.with_stem(f"{path.stem}-{self._restarts + 1}") for path in (recording, rrd))
-        if self._folder is not None:
-            stem = f"{self._settings.cell.replace('/', '-')}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-            while any((self._folder / (stem + suffix)).exists() for suffix in (".mcap", ".rrd")):
-                stem += "-2"
-            recording = recording or self._folder / f"{stem}.mcap"
-            if self._settings.files.rerun:
-                rrd = rrd or self._folder / f"{stem}.rrd"
-        return recording, rrd
+        if running is not None:
+            with contextlib.suppress(OSError):
+                running.socket.shutdown(socket.SHUT_WR)  # also where a forked process still holds this end
+            running.process.send_signal(signal.SIGCONT)  # where it was stopped
+            try:
+                running.process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                self._errors.append(f"the scribe was not done after {timeout_s:g} s: its last data are lost")
+                running.process.kill()
+                running.process.wait()
+            self._listen(timeout_s=0.0)
+            last, self._socket = self._report, None
+            self._bury()
+            self._report = msgspec.structs.replace(last, lost=0)
+            self._child = None
+            running.socket.close()
+            for _, fd in self._memory.values():
+                os.close(fd)
+            self._memory = {}
+        lost = self._lost + self._buried
+        return f"{lost} of {self._sent + self._lost} ticks are not recorded" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
         """A process that was given its task and is not told anything yet."""
-        recording, rrd = self._paths()
-        task = Task(
-            self._settings,
-            None if state is None else state.tobytes(),
-            None if recording is None else str(recording.absolute()),
-            None if rrd is None else str(rrd.absolute()),
-            self._live_port,
+        folder, recording, rrd = (
+            None if path is None else str(path.absolute()) for path in (self._folder, self._recording, self._rrd)
         )
+        begin = None if state is None else state.tobytes()
+        task = Task(self._settings, begin, folder, recording, rrd, self._live_port, self._restarts + 1)
         running = child.start("service.recorder.process", socket.SOCK_SEQPACKET)
-        self._started = time.monotonic()
+        self._started = self._heard = time.monotonic()
         ours = running.socket
         ours.setblocking(False)
         try:
@@ -263,11 +281,9 @@ class Scribe:
         poll.poll(1000 * timeout_s)
         with contextlib.suppress(OSError):
             while data := source.recv(LARGEST_MESSAGE):
-                report = json.loads(data)
-                if "error" in report:
-                    self._errors.append(report["error"])
-                else:
-                    self._report = report
-                    if self._socket is None:
-                        self._say_all = self._say_all or self._restarts > 0
-                        self._socket = source
+                self._report = msgspec.json.decode(data, type=Report)
+                self._heard = time.monotonic()
+                self._errors.extend(self._report.errors)
+                if self._socket is None:
+                    self._say_all = self._say_all or self._restarts > 0
+                    self._socket = source

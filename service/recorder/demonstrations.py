@@ -16,7 +16,8 @@ from service.contract import cdr
 from service.contract.channels import POSE, key
 from service.contract.messages import BASE, PoseStamped, WireError, finite
 from service.learning.demonstration import Demonstration
-from service.recorder.mcap_file import McapFile, Messages, RecordingError, ends_early, existing, next_whole
+from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing
+from service.recorder.mcap_reader import Messages, next_whole
 
 _STREAMS = ("hands/left", "hands/right", "tool/pose")
 
@@ -55,7 +56,8 @@ def read_demonstration(path: str | Path) -> Demonstration:
     path = existing(path)
     streams = PoseStreams(path, _STREAMS)
     rows: dict[str, list[PoseStamped]] = {name: [] for name in _STREAMS}
-    for schema, channel, message in Messages(path):
+    messages = Messages(path)
+    for schema, channel, message in messages:
         name = streams.name(schema, channel)
         if name:
             try:
@@ -65,6 +67,8 @@ def read_demonstration(path: str | Path) -> Demonstration:
             if not finite(pose.position + pose.orientation):
                 raise RecordingError(f"{path}: {channel.topic}: a pose that is not finite, at stamp {pose.stamp_ns} ns")
             rows[name].append(pose)
+    if damage := [str(fault) for fault in messages.faults if not fault.cut]:
+        raise RecordingError(f"{path}: {'; '.join(damage)}; nothing is learned from it")
     tracks = []
     for name, poses in rows.items():
         if not poses:
@@ -119,7 +123,7 @@ def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
     streams = PoseStreams(path, _STREAMS[:2])
     empty = True
     with path.open("rb") as stream:
-        messages = iter(Messages(path)) if ends_early(path) else make_reader(stream).iter_messages()
+        messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()
         while found := next_whole(messages, path):
             name = streams.name(found[0], found[1])
             if name:

@@ -1,45 +1,31 @@
-"""MCAP files as we write and read them: profile `ros2`, small chunks, and a reader that goes on up
-to where a file was cut.
+"""MCAP files as we write them: profile `ros2`, small chunks with checksums, and whole records even
+where the disk is full.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import os
 import platform
-import struct
-from collections.abc import Iterator
 from importlib import metadata as packages
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, DataEnd, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 
 CHUNK_BYTES = 128 * 1024  # what a kill can lose between two flushes, and what a reader must hold
-_CUT = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    UnicodeDecodeError,
-    ValueError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    MemoryError,
-)
 
 
 class RecordingError(ExplainedError, ValueError):
     """A file that is not the recording it should be: says which, why, and what would do."""
 
 
+@functools.cache
 def machine() -> dict[str, str]:
     """What the result of a tick may depend on besides its input: versions, CPU, BLAS."""
     found = {
@@ -61,21 +47,79 @@ def machine() -> dict[str, str]:
     return found
 
 
+class _WholeWrites:
+    """A file in which a piece that does not fit leaves nothing behind: it ends with the one before.
+
+    Unbuffered, so that what was written is with the system, and an error comes where it belongs.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._size = 0
+        self.closed = False
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self._size)
+            raise
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._size
+
+    def flush(self) -> None:
+        """All is written already."""
+
+    def links(self) -> tuple[int, tuple[int, int]]:
+        """How many names the file has, and which file it is."""
+        found = os.fstat(self._fd)
+        return found.st_nlink, (found.st_dev, found.st_ino)
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            os.close(self._fd)
+
+
 class McapFile:
     """An MCAP file being written: profile `ros2`, zstd, small chunks, channels made as they are
     needed.
+
+    Chunks end only where `part_ends` says that they may: what belongs together is kept or lost
+    together. Errors of the file system are raised; then the file holds what was written before.
     """
 
     def __init__(self, path: Path, *, joints: int) -> None:
         """`joints` is how many the arm has: the layouts of what is recorded of it depend on it."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._stream: IO[bytes] = path.open("wb")
-        self.writer = Writer(self._stream, chunk_size=CHUNK_BYTES)
-        self.writer.start(profile="ros2", library="thirdhand")
+        self._stream = _WholeWrites(path)
+        self.writer = Writer(self._stream, chunk_size=1 << 62, enable_data_crcs=True)  # type: ignore[arg-type]
         self._joints = joints
+        self._pending = 0  # bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        try:
+            self.writer.start(profile="ros2", library="thirdhand")
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing more can be written."""
+        return self._stream.closed
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far."""
+        return self._stream.tell()
 
     def put(self, topic: str, kind: str, data: bytes, time_ns: int, sequence: int, *, qos: str = "") -> None:
         """Writes one CDR message of the type `kind`."""
@@ -88,10 +132,30 @@ class McapFile:
             channel = self.writer.register_channel(topic, "cdr", self._schemas[kind], {"offered_qos_profiles": qos})
             self._channels[topic] = channel
         self.writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
+        self._pending += len(data)
+
+    def part_ends(self) -> bool:
+        """Says that a chunk may end here; whether it did, with all before it in the file."""
+        if self._pending < CHUNK_BYTES:
+            return False
+        self.flush()
+        return True
 
     def flush(self) -> None:
         """Ends the chunk in progress: what was written so far survives a kill of the process."""
         self.writer.flush()  # type: ignore[no-untyped-call]
+        self._pending = 0
+
+    def lost_name(self) -> str:
+        """Empty while the file is where it was made; else `removed`, or `moved` if it has another
+        name.
+        """
+        links, itself = self._stream.links()
+        with contextlib.suppress(OSError):
+            there = os.stat(self.path)
+            if (there.st_dev, there.st_ino) == itself:
+                return ""
+        return "moved" if links else "removed"
 
     def close(self) -> None:
         """Ends the file; it is closed even if its end cannot be written."""
@@ -100,6 +164,10 @@ class McapFile:
                 self.writer.finish()  # type: ignore[no-untyped-call]
             finally:
                 self._stream.close()
+
+    def abandon(self) -> None:
+        """Closes the file without an end: it holds what was written."""
+        self._stream.close()
 
 
 def existing(path: str | Path) -> Path:
@@ -126,57 +194,3 @@ def ends_early(path: Path) -> bool:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - len(MCAP0_MAGIC)))
         return stream.read() != MCAP0_MAGIC or size < 2 * len(MCAP0_MAGIC)
-
-
-class Messages:
-    """The schema, channel and message of every message of an MCAP file in file order, up to the end
-    or the cut; `.cut` tells which it was.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.cut = ""
-        self.attachments: dict[str, bytes] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-
-    def __iter__(self) -> Iterator[tuple[Schema | None, Channel, Message]]:
-        found: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        with self._path.open("rb") as stream:
-            records = iter(
-                StreamReader(stream, record_size_limit=self._path.stat().st_size, validate_crcs=True).records
-            )
-            while True:
-                try:
-                    record = next(records)
-                except StopIteration:
-                    return
-                except _CUT as error:
-                    self.cut = f"{type(error).__name__} {error}".strip()
-                    return
-                if isinstance(record, Message) and record.channel_id in channels:
-                    channel = channels[record.channel_id]
-                    yield found.get(channel.schema_id), channel, record
-                elif isinstance(record, Schema):
-                    found[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Attachment):
-                    self.attachments[record.name] = record.data
-                elif isinstance(record, Metadata):
-                    self.metadata[record.name] = record.metadata
-                elif isinstance(record, DataEnd):
-                    return
-
-
-def next_whole(
-    messages: Iterator[tuple[Schema | None, Channel, Message]], path: Path
-) -> tuple[Schema | None, Channel, Message] | None:
-    """The next message of an indexed file, None at its end.
-
-    Raises RecordingError where the file is damaged.
-    """
-    try:
-        return next(messages, None)
-    except _CUT as error:
-        raise RecordingError(f"{path} is damaged: {type(error).__name__} {error}".strip()) from None

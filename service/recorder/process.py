@@ -1,7 +1,8 @@
-"""The scribe's own process: takes messages from a socket, writes the recording, feeds the viewer.
+"""The scribe's own process: takes messages from a socket, writes the recordings, feeds the viewer.
 
 It ends when the other side of the socket is closed or dead, with everything written that it was
-told.
+told. It cannot stay behind: the death of its daemon wakes it where it was stopped, and where it
+hangs, an alarm that it no longer puts off ends it.
 """
 
 from __future__ import annotations
@@ -10,26 +11,28 @@ from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import contextlib
-import json
+import ctypes
 import os
 import signal
 import socket
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
 from service import child
 from service.config import urdf_path
-from service.core.frame import Record, state_layout
-from service.recorder.protocol import LARGEST_MESSAGE, Task, unpack, unpack_note
-from service.recorder.recording import Recorder
+from service.core.frame import state_layout
+from service.recorder.folder import Places
+from service.recorder.protocol import LARGEST_MESSAGE, Report, Task, unpack, unpack_note
+from service.recorder.segments import Segments
 
 if TYPE_CHECKING:
     from service.recorder.sinks import Viewer
@@ -39,7 +42,8 @@ FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 2.0
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
-CLOSING_S = 20.0  # that it may take to write the rest when the daemon was killed
+HUNG_S, END_S = 30, 20  # whole seconds without a turn of the main thread, and for ending; then it is killed
+_PR_SET_PDEATHSIG = 1  # of Linux; Python does not name it
 POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
 
 
@@ -51,23 +55,43 @@ class DrawingThread:
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
         self.dropped = 0
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._wanted_file: Path | None = None
+        self._waiting: deque[Callable[[], None] | Path] = deque()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._draw, name="drawing", daemon=True)
         self._thread.start()
+
+    @property
+    def rrd(self) -> str | None:
+        """The file drawn into, or about to be."""
+        return self.viewer.rrd if self._wanted_file is None else str(self._wanted_file)
 
     def put(self, act: Callable[[], None]) -> None:
         """Has something drawn, later; the oldest that waits too long is dropped."""
         self._waiting.append(act)
         if len(self._waiting) > DRAW_QUEUED:
-            self._waiting.popleft()
+            oldest = self._waiting.popleft()
+            if isinstance(oldest, Path) and self._waiting:  # the next file: what is drawn into it goes instead
+                self._waiting.popleft()
+                self._waiting.appendleft(oldest)
             self.dropped += 1
+
+    def draw_into(self, rrd: Path) -> None:
+        """Has the file end, and what is put from now on go into another."""
+        self._wanted_file = rrd
+        self._waiting.append(rrd)
 
     def _draw(self) -> None:
         flushed = time.monotonic()
         while not (self._ended.wait(POLL_S) and not self._waiting):
             while self._waiting:
-                self._waiting.popleft()()
+                next_ = self._waiting.popleft()
+                if isinstance(next_, Path):
+                    self.viewer.draw_into(next_)
+                    if self._wanted_file is next_:
+                        self._wanted_file = None
+                else:
+                    next_()
             if time.monotonic() - flushed > DRAW_FLUSH_S:
                 self.viewer.flush()
                 flushed = time.monotonic()
@@ -86,112 +110,83 @@ class ScribeProcess:
     """
 
     def __init__(self, task: Task, skill: bytes | None, source: socket.socket) -> None:
-        self._task, self._source = task, source
+        self._source = source
         self._joints = len(task.settings.joints.names)
-        self._recorder: Recorder | None = None
-        self._record_to = task.recording
+        self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
         self._said_dropped = 0
-        if task.rrd is not None or task.live_port is not None:
+        drawn = task.rrd is not None or (task.folder is not None and task.settings.files.rerun)
+        if drawn or task.live_port is not None:
             from service.recorder.sinks import Viewer  # half a second that a scribe without viewer need not spend
 
-            rrd = None if task.rrd is None else Path(task.rrd)
             urdf = urdf_path(task.settings)
-            self._drawing = DrawingThread(Viewer(urdf=urdf, rrd=rrd, live_port=task.live_port, settings=task.settings))
-        if skill is not None:
-            self._begin(skill, None if task.state is None else np.frombuffer(task.state, state_layout(self._joints))[0])
-        self._report()
+            self._drawing = DrawingThread(Viewer(urdf=urdf, live_port=task.live_port, settings=task.settings))
+        places = Places(task.settings, task.folder, task.recording, task.rrd, attempt=task.attempt)
+        self._segments = Segments(task.settings, places, say=self._errors.append, draw=self._draw_into)
+        state = None if task.state is None else np.frombuffer(task.state, state_layout(self._joints))[0]
+        self._segments.begin(skill, state)
+        self.report()
 
-    def _tell(self, report: dict[str, Any]) -> None:
-        with contextlib.suppress(OSError):
-            self._source.send(json.dumps(report).encode(), socket.MSG_DONTWAIT)
+    def _draw_into(self, rrd: Path) -> None:
+        assert self._drawing is not None
+        self._drawing.draw_into(rrd)
 
-    def _report(self) -> None:
-        """Says what went wrong and where things are written."""
+    def report(self) -> None:
+        """Says what went wrong, where things are written, and how much is."""
         viewer = None if self._drawing is None else self._drawing.viewer
         while viewer is not None and viewer.problems:
-            self._tell({"error": viewer.problems.pop(0)})
-        self._tell({"recording": self._record_to, "rrd": viewer and viewer.rrd, "live": viewer and viewer.url})
-
-    def _record(self, act: Callable[[], None]) -> None:
-        """Does one thing for the recording, which ends at the first failure."""
-        try:
-            act()
-        except OSError as error:
-            self._tell({"error": f"recording to {self._record_to} ended: {error}"})
-            recorder, self._recorder, self._record_to = self._recorder, None, None
-            if recorder is not None:
-                with contextlib.suppress(OSError):
-                    recorder.close()
-            self._report()
-
-    def _begin(self, skill: bytes, state: Record | None) -> None:
-        if self._record_to is not None:
-            self._record(lambda: self._open(skill, state))
-
-    def _open(self, skill: bytes, state: Record | None) -> None:
-        self._recorder = Recorder(
-            str(self._record_to), settings=self._task.settings, skill=skill, state=state, time_ns=time.time_ns()
+            self._errors.append(viewer.problems.pop(0))
+        if self._drawing is not None and self._drawing.dropped > self._said_dropped:
+            self._said_dropped = self._drawing.dropped
+            self._errors.append(f"the drawing cannot keep up: {self._said_dropped} of its entries dropped")
+        segments = self._segments
+        report = Report(
+            state=segments.state,
+            recording=None if segments.path is None else str(segments.path),
+            rrd=None if self._drawing is None else self._drawing.rrd,
+            live=None if viewer is None else viewer.url,
+            kept=segments.kept,
+            lost=segments.lost,
+            unmarked=segments.unmarked,
+            errors=tuple(self._errors),
         )
+        with contextlib.suppress(OSError):
+            self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)
+            self._errors.clear()
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
         """Writes and draws one message."""
         if (note := unpack_note(message)) is not None:
-            self._note(*note)
+            key, text, time_ns = note
+            self._segments.note(key, text, time_ns)
+            if key != "status":
+                self._show(text, "WARN" if key == "log" else "INFO", time_ns)
             return
         told = unpack(message, skills, joints=self._joints)
         time_ns = int(told.timing["time_ns"])
-        if self._recorder is None and told.skill is not None:
-            self._begin(told.skill, None)
-        if told.lost:
-            self._note("log", f"{told.lost} ticks before tick {told.tick.index} are not recorded", time_ns)
-        recorder = self._recorder
-        if recorder is not None:
-            self._record(
-                lambda: recorder.write(
-                    told.tick,
-                    told.frame,
-                    time_ns=time_ns,
-                    timing=told.timing,
-                    state=told.state,
-                    skill=told.skill,
-                    lost=told.lost,
-                )
-            )
+        if missing := self._segments.write(told):
+            self._show(f"{missing} ticks before tick {told.tick.index} are not recorded", "WARN", time_ns)
         if self._drawing is not None:
             viewer = self._drawing.viewer
             self._drawing.put(lambda: viewer.add(told.frame, time_ns, told.timing))
 
-    def _note(self, key: str, text: str, time_ns: int) -> None:
-        recorder = self._recorder
-        if recorder is not None:
-            self._record(lambda: recorder.note(key, text, time_ns))
-        if self._drawing is not None and key != "status":
+    def _show(self, text: str, level: str, time_ns: int) -> None:
+        if self._drawing is not None:
             viewer = self._drawing.viewer
-            self._drawing.put(lambda: viewer.log(text, "WARN" if key == "log" else "INFO", time_ns))
+            self._drawing.put(lambda: viewer.log(text, level, time_ns))
 
-    def flush_recording(self) -> None:
-        """Hands what was recorded to the system."""
-        if self._recorder is not None:
-            self._record(self._recorder.flush)
-
-    def watch_drawing(self) -> None:
-        """Says what went wrong with the drawing, and how much is not in it."""
-        if self._drawing is None:
-            return
-        if self._drawing.viewer.problems:
-            self._report()
-        if self._drawing.dropped > self._said_dropped:
-            self._said_dropped = self._drawing.dropped
-            self._tell({"error": f"the drawing cannot keep up: {self._drawing.dropped} of its entries dropped"})
+    def flush(self) -> None:
+        """Hands what was recorded to the system, and says so."""
+        self._segments.flush()
+        self.report()
 
     def close(self) -> None:
-        """Ends both files."""
-        if self._recorder is not None:
-            self._record(self._recorder.close)
+        """Ends the files."""
+        self._segments.close()
+        self.report()
         if self._drawing is not None:
             self._drawing.close()
-        self._report()
+        self.report()
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
@@ -215,28 +210,31 @@ def _work(source: socket.socket) -> None:
     ended = threading.Event()
 
     def read() -> None:
-        with contextlib.suppress(ConnectionError):
+        try:
             while (received := _receive(source, buffer))[0]:
                 waiting.append(received)
                 while len(waiting) >= QUEUED:
                     time.sleep(POLL_S)
-        ended.set()
+        except ConnectionError:
+            pass  # as good as its end
+        finally:
+            ended.set()  # whatever happened: without a reader there is nothing to wait for
 
     scribe = ScribeProcess(task, skills[0] if skills else None, source)
     threading.Thread(target=read, name="socket", daemon=True).start()
-    flushed = drawn = time.monotonic()
+    flushed = time.monotonic()
     over = False
     while not over:
         over = ended.wait(0.05) and not waiting
+        if not ended.is_set():
+            signal.alarm(HUNG_S)
         now = time.monotonic()
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
         if now - flushed > FLUSH_S:
-            scribe.flush_recording()
+            scribe.flush()
             flushed = now
-        if now - drawn > DRAW_FLUSH_S:
-            scribe.watch_drawing()
-            drawn = now
+    signal.alarm(END_S)
     scribe.close()
 
 
@@ -244,13 +242,23 @@ def main() -> None:
     """Serves the socket whose descriptor is the only argument."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends when the socket does, with all that was told
-    child.end_with_parent(CLOSING_S)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(HUNG_S)
+    # Its daemon's death makes it go on where it was stopped, and then it sees the socket's end. The
+    # signal comes also when only the thread that started it ends: so it must be a harmless one.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(5)
-    with socket.socket(fileno=int(sys.argv[1])) as source:
-        _work(source)
-    os._exit(0)  # without waiting for a drawing that hangs
+    code = 1
+    try:
+        with socket.socket(fileno=int(sys.argv[1])) as source:
+            _work(source)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)  # without waiting for a drawing that hangs
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -91,11 +91,30 @@ def unpack_note(message: bytes) -> tuple[str, str, int] | None:
 class Task(msgspec.Struct, frozen=True):
     """What a scribe is started with; the skill comes as a file in memory.
 
-    Without state it begins with the first message that has one.
+    Without state it begins with the first message that has one. `recording` and `rrd` are explicit
+    paths instead of names in `folder`; the `attempt` counts the scribes of one daemon.
     """
 
     settings: Settings
     state: bytes | None
+    folder: str | None
     recording: str | None
     rrd: str | None
     live_port: int | None
+    attempt: int
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What a scribe says of itself, twice a second: where it writes, and of the ticks it was told
+    how many are on disk (`kept`), how many are not and will not be (`lost`), and how many of these
+    no recording says yet (`unmarked`).
+    """
+
+    state: Literal["starting", "recording", "interrupted", "drawing"] = "starting"
+    recording: str | None = None
+    rrd: str | None = None
+    live: str | None = None
+    kept: int = 0
+    lost: int = 0
+    unmarked: int = 0
+    errors: tuple[str, ...] = ()  # new ones

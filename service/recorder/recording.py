@@ -12,17 +12,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import msgspec
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Transform, Vector3, WireError
+from service.contract.messages import BASE, Transform, Vector3
 from service.contract.records import SIDES
-from service.core.frame import TIMING, Record, Tick, decode, encode, frame_layout, state_layout
+from service.core.frame import Record, Tick, encode
 from service.core.outputs import outgoing
-from service.recorder.mcap_file import McapFile, Messages, RecordingError, ends_early, existing, machine
+from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing, machine
+from service.recorder.mcap_reader import Fault, Messages
+from service.recorder.steps import REPLAYED, Step, steps
 from service.urdf import Urdf
 
 FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
@@ -60,11 +62,30 @@ class Recorder:
         self._file = McapFile(Path(path), joints=len(settings.joints.names))
         self.path = self._file.path
         about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
+        self.kept = self.pending = 0  # ticks in the file, ticks that wait for the end of their chunk
         writer = self._file.writer
-        writer.add_metadata("thirdhand", about)
-        writer.add_attachment(time_ns, time_ns, "settings.json", "application/json", msgspec.json.encode(settings))
-        writer.add_attachment(time_ns, time_ns, "skill.npz", "application/octet-stream", skill)
-        writer.add_attachment(time_ns, time_ns, "arm.urdf", "application/xml", self._urdf.encode())
+        try:
+            writer.add_metadata("thirdhand", about)
+            writer.add_attachment(time_ns, time_ns, "settings.json", "application/json", msgspec.json.encode(settings))
+            writer.add_attachment(time_ns, time_ns, "skill.npz", "application/octet-stream", skill)
+            writer.add_attachment(time_ns, time_ns, "arm.urdf", "application/xml", self._urdf.encode())
+        except OSError:
+            self._file.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._file.size
+
+    @property
+    def skill(self) -> bytes:
+        """The file of the skill in force."""
+        return self._skill
+
+    def lost_name(self) -> str:
+        """Empty while the file is where it was made; else `removed` or `moved`."""
+        return self._file.lost_name()
 
     def _begin(self, time_ns: int) -> None:
         """The initial state and the robot's description carry the time of the first thing written.
@@ -102,6 +123,7 @@ class Recorder:
         if not self._begun:
             self._begin(time_ns)
         put, self._sequence = self._put, tick.index
+        self.pending += 1
         kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
         put("tick", cdr.encode_tick(tick.index, kinds, lost), time_ns)
         for event in tick.inbox:
@@ -122,6 +144,11 @@ class Recorder:
             put(channel.key, payload, time_ns)
         if tick.index % channels.BY_KEY["/tf"].every == 0:
             put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
+        if self._file.part_ends():
+            self._keep()
+
+    def _keep(self) -> None:
+        self.kept, self.pending = self.kept + self.pending, 0
 
     def _transforms(self, frame: Record) -> list[Transform]:
         """Where everything is, for viewers: the arm's links, tool, setpoint, target and hands."""
@@ -142,7 +169,7 @@ class Recorder:
         """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`; replay ignores
         it.
         """
-        if key in _REPLAYED:
+        if key in REPLAYED:
             raise ValueError(f"a note under {key!r}: that topic holds what a replay needs")
         if not self._begun:
             self._begin(time_ns)
@@ -152,12 +179,23 @@ class Recorder:
     def flush(self) -> None:
         """Ends the chunk in progress: what was written so far survives a kill of the process."""
         self._file.flush()
+        self._keep()
 
     def close(self) -> None:
-        """Ends the file. A second call does nothing."""
+        """Ends the file; it is closed even where that fails. A second call does nothing."""
+        if self._file.closed:
+            return
         if not self._begun and self._state is not None:
             self._begin(0)
-        self._file.close()
+        try:
+            self.flush()
+            self._file.close()
+        finally:
+            self._file.abandon()
+
+    def abandon(self) -> None:
+        """Closes the file as it is, without what is pending."""
+        self._file.abandon()
 
     def __enter__(self) -> Self:
         return self
@@ -168,32 +206,9 @@ class Recorder:
         self.close()
 
 
-_RECORDS = ("frame", "timing", "state")
-_REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
-
-
 def _point(position: Any) -> Vector3:
     x, y, z = position.tolist()
     return x, y, z
-
-
-class Step(NamedTuple):
-    """One recorded tick: what it consumed, what it decided, and the state after it where that was
-    recorded.
-
-    The first step may hold the state before the first tick and nothing else: its `frame` is None.
-    Where ticks were `lost` before this one, replay continues from its `state`, with the skill in
-    force, which is told where it may have changed meanwhile.
-    """
-
-    tick: int
-    events: tuple[tuple[str, bytes], ...]
-    frame: Record | None
-    timing: Record | None
-    state: Record | None
-    skill: bytes | None = None
-    lost: int = 0
-    time_ns: int = 0
 
 
 class Recording:
@@ -205,7 +220,8 @@ class Recording:
         self, path: Path, settings: Settings, skill: bytes, urdf: str, metadata: dict[str, str], *, truncated: bool
     ) -> None:
         self.path, self.settings, self.skill, self.urdf, self.metadata = path, settings, skill, urdf, metadata
-        self.truncated = truncated  # its end is missing; also set when reading meets damage
+        self.truncated = truncated  # its end is missing
+        self.faults: list[Fault] = []  # known once all steps are read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -214,9 +230,15 @@ class Recording:
         messages = Messages(path)
         next(iter(messages), None)
         about, parts = messages.metadata.get("thirdhand"), messages.attachments
-        if about is None or "settings.json" not in parts or "skill.npz" not in parts:
-            if messages.cut:
-                raise RecordingError(f"{path} is cut before its first message ({messages.cut})")
+        needed = ["settings.json", "skill.npz", *(["arm.urdf"] if messages.faults else [])]
+        if about is None or any(name not in parts for name in needed):
+            if any(fault.cut for fault in messages.faults):
+                raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
+            if messages.faults:
+                raise RecordingError(
+                    f"{path} lacks settings, skill or arm, which a replay starts from: "
+                    + "; ".join(map(str, messages.faults))
+                )
             raise RecordingError(
                 f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
             )
@@ -239,37 +261,10 @@ class Recording:
         Without `outputs` only what went in: a recording of a version with other frames and states
         can be read so.
         """
-        names = {channels.key(self.settings.cell, name): name for name in _REPLAYED}
-        joints = len(self.settings.joints.names)
-        layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
         messages = Messages(self.path)
-        step: dict[str, Any] | None = None
-        try:
-            for schema, channel, message in messages:
-                name = names.get(channel.topic)
-                if name is None or schema is None or (name in _RECORDS and not outputs):
-                    continue
-                data = message.data
-                if name == "tick":
-                    if step is not None:
-                        yield _finished(step, outputs=outputs)
-                    index, kinds, lost = cdr.decode_tick(data)
-                    step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
-                elif step is None:
-                    if name == "state":
-                        initial = decode(data, layouts["state"])
-                        yield Step(int(initial["tick"]), (), None, None, initial)
-                elif name in _RECORDS:
-                    step[name] = decode(data, layouts[name])
-                elif name == "skill_in_force":
-                    step["skill"] = cdr.decode_skill(data)
-                else:
-                    step["events"].append((name, cdr.decode_skill(data) if name == "skill" else data))
-            if step is not None and ("frame" in step or not outputs):
-                yield _finished(step, outputs=outputs)
-        except WireError as error:
-            raise RecordingError(f"{self.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
-        self.truncated = self.truncated or bool(messages.cut)
+        yield from steps(messages, self.settings, outputs=outputs)
+        self.faults = messages.faults
+        self.truncated = any(fault.cut for fault in messages.faults)
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
         """Key, text and time [ns] of the notes under the keys, in order."""
@@ -277,20 +272,3 @@ class Recording:
         for _, channel, message in Messages(self.path):
             if channel.topic in topics:
                 yield topics[channel.topic], cdr.decode_string(message.data), message.log_time
-
-
-def _finished(step: dict[str, Any], *, outputs: bool) -> Step:
-    kinds, events = [_kind(number) for number in step["kinds"]], step["events"]
-    if [kind for kind, _ in events] != kinds or (outputs and "frame" not in step):
-        raise WireError(
-            f"tick {step['tick']} lists {kinds}; "
-            f"{[kind for kind, _ in events]} and {'a' if 'frame' in step else 'no'} frame follow"
-        )
-    timing, state, skill = (step.get(name) for name in ("timing", "state", "skill"))
-    return Step(step["tick"], tuple(events), step.get("frame"), timing, state, skill, step["lost"], step["time_ns"])
-
-
-def _kind(number: int) -> str:
-    if number not in channels.EVENT_KINDS:
-        raise WireError(f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known")
-    return channels.EVENT_KINDS[number]

@@ -187,6 +187,10 @@ class Chunks:
         self._missed = 0
         self._scene_at = self._trail_at = -1
 
+    def begin_anew(self) -> None:
+        """What comes goes into another file: the mode in force is said again."""
+        self._shown = None
+
     def of(self, batch: Batch) -> Iterator[rr.chunk.Chunk]:
         """The chunks that show a batch."""
         frames = np.array([frame for frame, _, _ in batch])

@@ -38,17 +38,23 @@ class _Destination:
     def __init__(
         self, name: str, sink: Any, *, live: bool, urdf: Path, settings: Settings, recording_id: str, batch_s: float
     ) -> None:
-        self.name = name
         self._batch_ns = round(batch_s * 1e9)
         self._pending: Batch = []
-        tree = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
-        self._chunks = Chunks(tree, settings)
+        self._live, self._settings = live, settings
+        self._tree = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+        self._chunks = Chunks(self._tree, settings)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
-        arrangement = blueprint(live=live)
-        self._stream.set_sinks(sink, default_blueprint=arrangement)
-        self._stream.send_recording_name(settings.cell)
-        self._stream.send_blueprint(arrangement)
-        log_fixed(self._stream, tree, settings)
+        self.turn(name, sink)
+
+    def turn(self, name: str, sink: Any) -> None:
+        """From now on the scene goes elsewhere: what never changes is sent there first."""
+        self.send()
+        self.name = name
+        self._chunks.begin_anew()
+        self._stream.set_sinks(sink)
+        self._stream.send_recording_name(self._settings.cell)
+        self._stream.send_blueprint(blueprint(live=self._live))  # once: Rerun keeps 1.5 MB of each for good
+        log_fixed(self._stream, self._tree, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     def add(self, frame: Record, time_ns: int, timing: Record | None) -> None:
@@ -139,24 +145,37 @@ class Viewer:
         self.url: str | None = None
         self.rrd: str | None = None
         self._destinations: list[_Destination] = []
-        common: dict[str, Any] = {
+        self._file: _Destination | None = None
+        self._common: dict[str, Any] = {
             "urdf": urdf,
             "settings": settings,
             "recording_id": f"{settings.cell}-{uuid.uuid4().hex[:12]}",
         }
         if rrd is not None:
-            with self._sparing(f"the drawing in {rrd}", None):
-                rrd.parent.mkdir(parents=True, exist_ok=True)
-                rrd.open("wb").close()
-                self._destinations.append(
-                    _Destination(f"the drawing in {rrd}", rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **common)
-                )
-                self.rrd = str(rrd)
+            self.draw_into(rrd)
         if live_port is not None:
             with self._sparing("the live view", None):
-                live = _Live(live_port, **common)
+                live = _Live(live_port, **self._common)
                 self._destinations.append(live)
                 self.url = live.url
+
+    def draw_into(self, rrd: Path) -> None:
+        """Ends the file drawn into, if there is one, and goes on in another.
+
+        Each shows its part of the scene by itself; one endless file would fill the memory, which
+        holds a list of all that was sent.
+        """
+        name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
+        self.rrd = None
+        with self._sparing(name, drawn):
+            rrd.parent.mkdir(parents=True, exist_ok=True)
+            rrd.open("wb").close()
+            if drawn is None:
+                self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
+                self._destinations.append(self._file)
+            else:
+                drawn.turn(name, rr.FileSink(rrd))
+            self.rrd = str(rrd)
 
     @contextlib.contextmanager
     def _sparing(self, name: str, destination: _Destination | None) -> Iterator[None]:
@@ -167,6 +186,8 @@ class Viewer:
             self.problems.append(f"{name} ended: {error}")
             if destination in self._destinations:
                 self._destinations.remove(destination)
+            if destination is not None and destination is self._file:
+                self.rrd = None
 
     def _each(self, act: Callable[[_Destination], None]) -> None:
         for destination in list(self._destinations):

@@ -5,11 +5,13 @@ figures that tell how well they are kept.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import sys
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +23,7 @@ PREPARE_NS = 450_000  # before a deadline the next tick is prepared
 STEP_NS = 20_000_000  # by so much the system clock is not off unless it was set
 DRAW = 256  # deadlines in which a smaller difference goes down to a third
 CREEP_NS = 1_000  # from stamp to stamp while time catches up
+_LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
 
 
@@ -88,18 +91,38 @@ class Deadlines:
         return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
 
 
-def ask_for_real_time() -> bool:
-    """Whether this thread was granted real-time scheduling; the garbage collector leaves what is
-    there alone in any case.
+class Granted(NamedTuple):
+    """What the operating system granted of what a loop asks for."""
+
+    realtime: bool
+    """The thread runs before all that have no real-time scheduling."""
+    locked: bool
+    """The process's memory stays where it is once it was touched."""
+
+
+def ask_for_real_time() -> Granted:
+    """What was granted of real-time scheduling for this thread and of memory that is not paged out;
+    the garbage collector leaves what is there alone in any case.
     """
     gc.collect()
     gc.freeze()
     sys.setswitchinterval(0.0005)
+    return Granted(_scheduled(), _locked())
+
+
+def _scheduled() -> bool:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (PermissionError, AttributeError, OSError):
         return False
     return True
+
+
+def _locked() -> bool:
+    try:
+        return bool(ctypes.CDLL(None).mlockall(_LOCK_WHAT_IS_TOUCHED) == 0)
+    except (OSError, AttributeError):
+        return False
 
 
 def run_beside_real_time() -> None:

@@ -33,7 +33,7 @@ from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
 from service.shell import watch
-from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Window, ask_for_real_time, run_beside_real_time
+from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Granted, Window, ask_for_real_time, run_beside_real_time
 from service.shell.door import BOUNDS, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
 from service.shell.roles import access_control
@@ -91,7 +91,7 @@ class Daemon:
         self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
-        self._realtime, self._version = False, version("thirdhand")
+        self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._faults: deque[Event] = deque()
         self._notes = (0, 0)  # second, and how many in it
         self._failed_at: int | None = None
@@ -161,8 +161,8 @@ class Daemon:
             self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
             reporter = watch.start("status thread", self._report, self._fail)
             announce(self)
-            self._realtime = ask_for_real_time()
-            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._realtime else 0)
+            self._granted = ask_for_real_time()
+            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             watch.watched("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
             self._ended.set()
@@ -171,7 +171,8 @@ class Daemon:
                 reporter.join(2)
             self._requests.close()
             self._session.close()  # type: ignore[no-untyped-call]
-            self._scribe.close(timeout_s=20)
+            if missing := self._scribe.close(timeout_s=20):
+                log.warning("%s", missing)
 
     def _fail(self, what: str) -> None:
         """Says what of the service failed; the next tick is at fault for it."""
@@ -307,7 +308,8 @@ class Daemon:
             tick=int(frame["tick"]),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
-            realtime=self._realtime,
+            realtime=self._granted.realtime,
+            memory_locked=self._granted.locked,
             skill=skill.name,
             places=tuple(point.name for point in skill.via_points),
             rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},

@@ -32,6 +32,7 @@ from service.learning.skill_file import decoded
 from service.shell.clock import SPIN_NS, Deadlines, ask_for_real_time
 
 SHARES = (50.0, 99.0, 99.9, 100.0)
+EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms
 TRACKER_HZ, SWAY_M, SWAY_HZ = 487.3, 0.03, 0.3  # a rate that no loop's divides
 HANDS_EVERY_S = 0.01
 PING_EVERY = 20  # samples
@@ -43,6 +44,15 @@ def percentiles(values: Any) -> dict[str, float]:
     """The SHARES of some values, by name; zeros where there are none."""
     found = np.percentile(values, SHARES).round(2).tolist() if len(values) else [0.0] * len(SHARES)
     return dict(zip(("p50", "p99", "p99.9", "max"), found, strict=True))
+
+
+def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
+    """What a report says of a loop's lateness and work [us]: SHARES, counts between EDGES_US."""
+    found: dict[str, Any] = {}
+    for name, values in (("lateness", lateness_us), ("work", work_us)):
+        found[f"{name}_us"] = percentiles(values)
+        found[f"{name}_counts"] = np.histogram(np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US)[0].tolist()
+    return found
 
 
 def fixed_work(array: Vector) -> float:
@@ -59,7 +69,7 @@ def fixed_work(array: Vector) -> float:
 
 def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[str, Any]:
     """Missed deadlines, lateness and work [us] of a loop."""
-    realtime = ask_for_real_time()
+    realtime = ask_for_real_time().realtime
     clock = Deadlines(rate_hz, spin_ns=SPIN_NS if realtime else 0)
     late_us, work_us = [], []
     first = missed = 0
@@ -79,8 +89,7 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
         "realtime": realtime,
         "ticks": index - first,
         "missed": clock.missed - missed,
-        "lateness_us": percentiles(late_us),
-        "work_us": percentiles(work_us),
+        **figures(late_us, work_us),
     }
 
 

@@ -8,9 +8,11 @@ import os
 import signal
 import socket
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -136,13 +138,13 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp
         tell(one, 30, first=25, skill=b"another skill")
         status = one.status()
         assert status["pid"] != killed
-        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 5)
+        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 25)  # 20 were not yet on disk
         assert status["errors"] == ["the scribe ended with code -9"]
     recording = Recording.open(tmp_path / "a-2.mcap")
     steps = list(recording.steps())
     assert recording.skill == b"another skill"
     assert [step.tick for step in steps] == list(range(25, 55))
-    assert steps[0].lost == 5
+    assert steps[0].lost == 25
     assert encode(steps[0].state) == encode(state_after(25))
 
 
@@ -160,6 +162,72 @@ def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Pat
     recording = Recording.open(tmp_path / "a.mcap")
     assert len(list(recording.steps())) == 301
     assert not recording.truncated
+
+
+def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_path: Path) -> None:
+    with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as one:
+        tell(one, 100)
+        time.sleep(1.2)  # two flushes
+        stopped = one.status()["pid"]
+        os.kill(stopped, signal.SIGSTOP)
+        told = 100
+
+        def replaced() -> bool:
+            nonlocal told
+            tell(one, 2, first=told)
+            told += 2
+            one.supervise()
+            time.sleep(0.01)
+            status = one.status()
+            return status["pid"] != stopped and status["sent"] > 300 and status["state"] == "recording"
+
+        until(replaced)
+        status = one.status()
+        assert "the scribe was silent for 1 s and is replaced" in status["errors"]
+        assert status["restarts"] == 1
+        with pytest.raises(ProcessLookupError):
+            os.kill(stopped, 0)
+    first, second = (Recording.open(path) for path in sorted(tmp_path.glob("*.mcap")))
+    kept = [step.tick for step in first.steps() if step.frame is not None]
+    start, *rest = second.steps()
+    assert kept == list(range(100))
+    assert start.lost == start.tick - 100 == status["lost"]
+    assert [step.tick for step in rest] == list(range(start.tick + 1, told))
+
+
+DAEMON = """
+import os, signal, sys, time
+sys.path[:0] = sys.argv[3:]
+from pathlib import Path
+from test_scribe import SETTINGS, SKILL, Scribe, state_after, tell
+one = Scribe(SETTINGS, folder=Path(sys.argv[1]))
+one.start(skill=SKILL, state=state_after(-1))
+pid = one.status()["pid"]
+if sys.argv[2] == "stopped":
+    os.kill(pid, signal.SIGSTOP)
+tell(one, 300)
+print(pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("how", ["running", "stopped"])
+def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(tmp_path: Path, how: str) -> None:
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    command = [sys.executable, "-c", DAEMON, str(tmp_path), how, *paths]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGKILL
+    until(lambda: not Path(f"/proc/{int(done.stdout)}").exists() or _is_dead(int(done.stdout)))
+    (path,) = tmp_path.glob("*.mcap")
+    recording = Recording.open(path)
+    assert len(list(recording.steps())) == 301
+    assert not recording.truncated
+
+
+def _is_dead(pid: int) -> bool:
+    with suppress(FileNotFoundError):
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(") ", 1)[1][0] == "Z"
+    return True
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])

@@ -60,6 +60,7 @@ class Cell:
             "rate_hz": 500.0,
             "missed": 0,
             "realtime": False,
+            "memory_locked": False,
             "rejected": {},
             "hand_age_ms": {},
             "scribe": {},

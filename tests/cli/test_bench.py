@@ -1,0 +1,70 @@
+"""`thirdhand bench`: its report, its picture, what happens beside the loop, and the soak."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cell import thirdhand
+
+from service.cli import loads, soak
+from service.recorder.replay import replay
+
+pytestmark = pytest.mark.timeout(180)
+QUIET = {"say": lambda line: None}
+
+
+def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
+    done = thirdhand("bench", "--seconds", "3", "--json", "--output", str(tmp_path), timeout=150)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report == json.loads((tmp_path / "bench.json").read_text())
+    assert report["whole"]["ticks"] == pytest.approx(500, abs=50)
+    assert sum(report["whole"]["work_counts"]) == pytest.approx(500, abs=50)
+    stages = sum(one["p50"] for one in report["whole"]["stages_us"].values())
+    assert 0.2 < stages / report["whole"]["work_us"]["p50"] < 1.1
+    assert {"daemon", "scribe", "workshop"} == set(report["whole"]["processes"])
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert replay(next(tmp_path.glob("*.mcap"))).exact
+    assert next(tmp_path.glob("*.rrd")).stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("what", ["scribe killed", "disk full", "taught each 100 ms"])
+def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == what))
+    monkeypatch.setattr(loads, "_large", bytes)
+    (row,) = loads.run(500, 1.0, **QUIET)
+    assert row["mode"] == "follow"
+    assert row["ticks"] == pytest.approx(500, abs=150)
+    assert row["identical"] == row["recorded"] > 0
+    assert (row["scribe"]["restarts"] > 0) == (what == "scribe killed")
+    assert bool(row["scribe"]["errors"]) == (what != "taught each 100 ms")
+    assert ("here" in row["places"]) == (what == "taught each 100 ms")
+
+
+def test_a_leak_is_told_from_noise() -> None:
+    rng = np.random.default_rng(0)
+    at = np.arange(0.0, 1800.0, 5.0)
+    files = np.full_like(at, 40)
+    flat = np.column_stack([at, 250 + rng.normal(scale=0.3, size=len(at)), files])
+    leaking = flat + np.column_stack([0 * at, 5 * at / 3600, 0 * at])
+    found, leak = soak.judged(flat), soak.judged(leaking)
+    assert abs(found["slope_mb_per_h"]) < 2 * found["interval_mb_per_h"] < 1.5
+    assert leak["slope_mb_per_h"] == pytest.approx(5, abs=2 * leak["interval_mb_per_h"])
+
+
+def test_soak_reports_each_process() -> None:
+    report = soak.run(0.2, 500, **QUIET)
+    assert set(report["processes"]) == {"daemon", "scribe", "workshop"}
+    assert report["lost"] == report["restarts"] == 0
+    assert "MB/h" in soak.text(report)
+
+
+@pytest.mark.parametrize("rate", ["49", "1001", "fast"])
+@pytest.mark.parametrize("command", ["demo", "bench", "serve"])
+def test_a_rate_out_of_range_is_bad_usage(command: str, rate: str) -> None:
+    done = thirdhand(command, "--rate", rate)
+    assert done.returncode == 2
+    assert f"{rate} given, 50 to 1000 Hz needed" in done.stderr
