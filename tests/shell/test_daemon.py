@@ -207,7 +207,7 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (("serve", "--rate", "7"), 2, "$.rate_hz"),
+        (("serve", "--rate", "7"), 2, "50 to 1000 Hz"),
         (("serve", "--config", "missing.toml"), 1, "missing.toml"),
         (("serve", "--skill", "missing.npz"), 1, "missing.npz"),
         (("serve", "--arm", "left"), 2, "invalid choice"),
