@@ -4,12 +4,16 @@ through the socket.
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
+import select
 import socket
 import struct
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,6 +47,22 @@ def start(module: str, kind: socket.SocketKind) -> Child:
             start_new_session=True,
         )
     return Child(process, ours)
+
+
+def end_with_parent(grace_s: float = 0.0) -> None:
+    """For the child: ends it `grace_s` [s] after its parent ended, whatever it does then.
+
+    Most end before, with their socket. The kernel's own signal for it (PR_SET_PDEATHSIG) goes by
+    the thread that started the child, which may end long before its process.
+    """
+
+    def wait(parent: int) -> None:
+        select.select([parent], [], [])
+        time.sleep(grace_s)
+        os._exit(1)
+
+    with contextlib.suppress(OSError, AttributeError):  # an older kernel: then its socket must do
+        threading.Thread(target=wait, args=(os.pidfd_open(os.getppid()),), name="parent", daemon=True).start()
 
 
 def in_memory(*parts: Any) -> int:

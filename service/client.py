@@ -5,15 +5,20 @@ plain calls.
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from service.contract import channels, requests
 from service.contract.explain import ExplainedError
+
+CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
+ENDPOINTS_TIMEOUT_S = 30.0  # a machine that is busy answers late
 
 
 class UnreachableError(ExplainedError, OSError):
@@ -24,10 +29,19 @@ class RefusedError(ExplainedError, ValueError):
     """The daemon's answer to a request that it did not carry out."""
 
 
-def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), timeout_s: float = 10.0) -> zenoh.Session:
-    """An open Zenoh session between named endpoints, without scouting.
+def open_session(
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    timeout_s: float = 10.0,
+    certificate: str | Path | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> zenoh.Session:
+    """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
 
-    Close it. Raises UnreachableError.
+    `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
+    begin with `tls/`; where it is None, the one that $THIRDHAND_CERTIFICATE names is taken. Close
+    the session. Raises UnreachableError.
     """
     config = zenoh.Config()
     settings: dict[str, Any] = {
@@ -40,6 +54,9 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
         "connect/exit_on_failure": True,
         "listen/exit_on_failure": True,
         "adminspace/enabled": bool(listen),
+        "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in
+        **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
+        **(more or {}),
     }
     try:
         for name, value in settings.items():
@@ -61,15 +78,35 @@ def open_session(*, connect: Sequence[str] = (), listen: Sequence[str] = (), tim
                 f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed"
             ) from None
         if connect and "connect" in reason:
+            secured = any(endpoint.startswith("tls/") for endpoint in connect)
             raise UnreachableError(
-                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there?"
+                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there, and not overrun?"
+                + " And is the certificate that was given, if any, of the daemon's authority?" * secured
             ) from None
         raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
 
 
+def _tls(folder: str | Path | None) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS by the certificate in a folder, if there is one.
+
+    Raises UnreachableError where it is incomplete.
+    """
+    if not folder:
+        return {}
+    own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+    for path in (own, key, authority):
+        if not os.access(path, os.R_OK):
+            raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
+    settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
+    for side in ("listen", "connect"):
+        settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
+    settings |= {"verify_name_on_connect": True, "close_link_on_expiration": True}
+    return {f"transport/link/tls/{name}": value for name, value in settings.items()}
+
+
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:
     """The endpoints at which a session really listens, with the ports that it was given."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=5.0):
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=ENDPOINTS_TIMEOUT_S):
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
     return ()
@@ -89,6 +126,8 @@ class Client:
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
         """The reply to one request; `request` is anything that becomes JSON."""
         payload = requests.encode_json({} if request is None else request)
+        if len(payload) > channels.LARGEST_REQUEST:
+            raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
         for reply in self._session.get(channels.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
             if reply.ok is not None:
                 answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())

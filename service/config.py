@@ -5,7 +5,9 @@ Units stand in the names or beside them, defaults are safe.
 
 from __future__ import annotations
 
+import ipaddress
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -127,11 +129,38 @@ class Table(Section, frozen=True):
     half_size: tuple[Positive, Positive] = (0.45, 0.60)
 
 
+def is_local(endpoint: str) -> bool:
+    """Whether only processes of this machine reach a Zenoh endpoint."""
+    protocol, _, address = endpoint.partition("/")
+    host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
+    try:
+        return protocol == "unixsock-stream" or host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 class Network(Section, frozen=True):
-    """Zenoh endpoints. Nothing is announced by multicast; peers are named."""
+    """Zenoh endpoints. Nothing is announced by multicast; peers are named.
+
+    With a certificate all endpoints are TLS, and each role may do its own only.
+    """
 
     listen: tuple[str, ...] = (ENDPOINT,)
     connect: tuple[str, ...] = ()
+    certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
+    allow_insecure: bool = False  # listen for other machines without TLS: whoever reaches it moves the arm
+
+    def __post_init__(self) -> None:
+        for i, endpoint in enumerate(self.listen):
+            if self.certificate and not endpoint.startswith("tls/"):
+                raise ValueError(f"$.network.listen[{i}]: {endpoint} given; with a certificate tls/... needed")
+            if not self.certificate and endpoint.startswith("tls/"):
+                raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
+            if not (self.certificate or self.allow_insecure or is_local(endpoint)):
+                raise ValueError(
+                    f"$.network.listen[{i}]: {endpoint} given; other machines could move the arm: an address like "
+                    "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
+                )
 
 
 class Files(Section, frozen=True):
@@ -322,15 +351,16 @@ def _check_against_urdf(settings: Settings) -> None:
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from TOML text; `origin` names it in errors. Raises SettingsError.
 
-    Where the arm's URDF is not an absolute path it lies in `folder`.
+    Where URDF and certificate are not absolute paths they lie in `folder`.
     """
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{origin}: {error}") from None
-    arm = given.get("arm")
-    if folder is not None and isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-        arm["urdf"] = str(folder / Path(arm["urdf"]).expanduser())
+    for section, name in (("arm", "urdf"), ("network", "certificate")):
+        table = given.get(section)
+        if folder is not None and isinstance(table, dict) and isinstance(table.get(name), str) and table[name]:
+            table[name] = str(folder / Path(table[name]).expanduser())
     return converted(given, origin=origin)
 
 

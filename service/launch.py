@@ -50,20 +50,21 @@ def launched(
     record: Path | None = None,
     skills: Path | None = None,
     program: tuple[str, ...] = ("-m", "service"),
+    network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
     Raises LaunchError.
 
-    Its configuration, log and saved via-points are in `folder`, its recordings in `record` and its
-    skills in `skills` where those are given.
+    Its configuration (with `network` for its door), log and saved via-points are in `folder`, its
+    recordings in `record` and its skills in `skills` where those are given.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
     config.write_text(
         "# A cell with a free port and its own files.\n"
-        '[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\n'
+        f"{network}[files]\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
     command = [sys.executable, *program, "serve", "--config", str(config), *arguments]

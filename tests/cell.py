@@ -33,6 +33,7 @@ class Daemon:
 
     def __init__(self, service: Launched, session: zenoh.Session) -> None:
         self.process, self.endpoint, self.session = service.process, service.endpoint, session
+        self.log = service.log
         self.client = Client(session)
         self.end = service.stop  # the exit code after being asked to stop
 
@@ -45,9 +46,19 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *arguments: str) -> Iterator[Daemon]:
-    """A daemon of its own, with its files in a folder, on a free port."""
-    with launched(folder, *arguments) as service, open_session(connect=[service.endpoint]) as session:
+def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]:
+    """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
+    process runs that Python.
+    """
+    program = (
+        ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
+        if before
+        else ("-m", "service")
+    )
+    with (
+        launched(folder, *arguments, program=program) as service,
+        open_session(connect=[service.endpoint]) as session,
+    ):
         yield Daemon(service, session)
 
 

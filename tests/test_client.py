@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -64,6 +65,21 @@ def test_the_endpoint_is_told_with_the_port_that_was_given(daemon: zenoh.Session
 def test_a_session_that_does_not_listen_has_no_endpoints() -> None:
     with open_session() as alone:
         assert endpoints(alone) == ()
+
+
+def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: zenoh.Session) -> None:
+    """No scouting: who was not told where another listens does not meet it."""
+    told = {str(zid) for zid in daemon.info.peers_zid()}
+    with open_session(listen=["tcp/127.0.0.1:0"]) as stranger:
+        time.sleep(0.5)
+        assert str(session.zid()) in told
+        assert list(stranger.info.peers_zid()) + list(stranger.info.routers_zid()) == []
+        assert stranger.zid() not in list(daemon.info.peers_zid())
+
+
+def test_a_certificate_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UnreachableError, match=r"cannot read .*certificate\.pem: a folder made by"):
+        open_session(connect=["tls/127.0.0.1:1"], certificate=tmp_path)
 
 
 def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:

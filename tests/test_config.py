@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.config import Settings, SettingsError, load, parse
+from service.config import Settings, SettingsError, is_local, load, parse
 
 
 def refusal(text: str) -> str:
@@ -98,6 +98,10 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[arm]\nsource = 'guess'", "$.arm.source", "assumed"),
         ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "`array`"),
         ("[files]\nrecord = 3", "$.files.record", "a text needed"),
+        ("[network]\nlisten = ['tcp/0.0.0.0:7447']", "$.network.listen[0]", "or else allow_insecure = true needed"),
+        ("[network]\nlisten = ['tcp/127.0.0.1:1', 'udp/[::]:1']", "$.network.listen[1]", "or else allow_insecure"),
+        ("[network]\nlisten = ['tls/127.0.0.1:1']", "$.network.certificate", "the folder of one needed"),
+        ("[network]\ncertificate = 'x'\nlisten = ['tcp/127.0.0.1:1']", "$.network.listen[0]", "tls/... needed"),
     ],
 )
 def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, accepted: str) -> None:
@@ -141,3 +145,37 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
         load(file)
     with pytest.raises(SettingsError, match=r"nowhere\.toml"):
         load(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.3.2.1:0?x=1", True),
+        ("tcp/[::1]:7447#iface=lo", True),
+        ("udp/localhost:1", True),
+        ("unixsock-stream/tmp/socket", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/192.168.1.5:7447", False),
+        ("ws/bench.local:80", False),
+        ("tcp/127.0.0.1.evil.example:7447", False),
+        ("serial//dev/ttyUSB0", False),
+        ("nothing", False),
+    ],
+)
+def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, local: bool) -> None:
+    assert is_local(endpoint) == local
+
+
+def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
+    network = Settings().network
+    assert [is_local(endpoint) for endpoint in network.listen] == [True]
+    assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
+    insecure = parse("[network]\nlisten = ['tcp/0.0.0.0:1']\nallow_insecure = true", origin="cell.toml")
+    assert insecure.network.listen == ("tcp/0.0.0.0:1",)
+
+
+def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:
+    text = "[network]\nlisten = ['tls/0.0.0.0:1']\ncertificate = 'secrets/daemon'"
+    assert parse(text, origin="cell.toml", folder=tmp_path).network.certificate == str(tmp_path / "secrets/daemon")

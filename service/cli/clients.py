@@ -89,5 +89,7 @@ def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str,
         converted({"cell": args.cell}, origin="--cell")
     except SettingsError as error:
         raise UsageError(str(error)) from None
-    with open_session(connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S) as session:
+    with open_session(
+        connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
+    ) as session:
         return Client(session, args.cell).ask(suffix, request)

@@ -32,6 +32,7 @@ RUN_BY = {
     "resume": "clients",
     "reset": "clients",
     "view": "view",
+    "certificates": "certificates",
     "bench": "bench",
 }
 FORMATTER = argparse.RawDescriptionHelpFormatter
@@ -220,6 +221,17 @@ def parser() -> argparse.ArgumentParser:
     client("resume", "Ends an operator's hold.", "thirdhand resume")
     client("reset", "Ends a fault.", "thirdhand reset")
 
+    c = command(
+        "certificates",
+        "Makes an authority, and a certificate for the daemon and for each role on a network.",
+        "thirdhand certificates secrets --host bench.local",
+    )
+    c.add_argument("folder", metavar="DIR", type=Path, help="a new folder, private to its user")
+    c.add_argument(
+        "--host", metavar="NAME", action="append", help="or address at which clients reach the daemon; may be repeated"
+    )
+    c.add_argument("--days", metavar="N", type=int, default=3650, help="that they are valid (default: %(default)s)")
+
     c = client(
         "view",
         "Shows a recording, or a running daemon, in Rerun.",
@@ -245,6 +257,12 @@ def _reach(sub: argparse.ArgumentParser) -> None:
         "--connect", metavar="EP", action="append", help=f"Zenoh endpoint of the daemon (default: {channels.ENDPOINT})"
     )
     sub.add_argument("--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    sub.add_argument(
+        "--certificate",
+        metavar="DIR",
+        type=Path,
+        help="of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)",
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -25,7 +25,9 @@ def play(args: argparse.Namespace) -> int:
     except WireError as error:
         raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
     start_ns, last_ns = hands[0][0], hands[-1][0]
-    with open_session(connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S) as session:
+    with open_session(
+        connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
+    ) as session:
         publishers = {
             side: session.declare_publisher(channels.key(args.cell, f"hands/{side}")) for side in ("left", "right")
         }

@@ -19,6 +19,7 @@ from service.shell import daemon
 
 def serve(args: argparse.Namespace) -> int:
     """Exit code 0 once it was asked to stop and has closed everything."""
+    os.umask(0o077)  # what it writes is its user's
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(load(args.config) if args.config else Settings(), args)
     skills = Path(settings.files.skills).expanduser() if settings.files.skills else recordings()

@@ -22,7 +22,7 @@ from service.contract.messages import (
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
-_STAMP = struct.Struct("<iI")
+_STAMP = struct.Struct("<II")  # ROS 2 calls the seconds signed: as unsigned ones they last until 2106
 _LENGTH = struct.Struct("<I")
 _POSE = struct.Struct("<7d")
 _COVARIANCE = struct.Struct("<36d")
@@ -33,10 +33,15 @@ _MOST_LAYOUTS = 16
 _LONGEST = 8192  # bytes of what the loop reads: the time it takes is bounded
 
 
+def _stamp(stamp_ns: int) -> bytes:
+    """A time that does not fit loses its upper bits: no clock, however wrong, stops the loop."""
+    seconds, nanoseconds = divmod(stamp_ns, _NS)
+    return _STAMP.pack(seconds & 0xFFFFFFFF, nanoseconds)
+
+
 def _header(stamp_ns: int, frame: str) -> bytearray:
-    sec, nanosec = divmod(stamp_ns, _NS)
     out = bytearray(CDR_HEADER)
-    out += _STAMP.pack(sec, nanosec)
+    out += _stamp(stamp_ns)
     _put_string(out, frame)
     return out
 
@@ -118,9 +123,7 @@ def encode_command(
     in a tenth of its time.
     """
     prefix, layout = _command_layout(names)
-    return b"".join(
-        (CDR_HEADER, _STAMP.pack(*divmod(stamp_ns, _NS)), prefix, layout.pack(*position, len(names), *velocity, 0))
-    )
+    return b"".join((CDR_HEADER, _stamp(stamp_ns), prefix, layout.pack(*position, len(names), *velocity, 0)))
 
 
 def encode_string(text: str) -> bytes:
@@ -133,7 +136,7 @@ def encode_string(text: str) -> bytes:
 def encode_transforms(stamp_ns: int, transforms: Sequence[Transform]) -> bytes:
     """CDR bytes of a `tf2_msgs/msg/TFMessage`."""
     out = bytearray(CDR_HEADER + _LENGTH.pack(len(transforms)))
-    stamp = _STAMP.pack(*divmod(stamp_ns, _NS))
+    stamp = _stamp(stamp_ns)
     for item in transforms:
         _align(out, 4)
         out += stamp

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 from service.contract import cdr, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
+LARGEST_REQUEST = 256 * 1024  # bytes
 
 
 class Codec(NamedTuple):
@@ -100,6 +101,7 @@ CHANNELS = (
     Channel("resume", _request(requests.Nothing), "request", "end an operator's hold",
             event=EventKind(5, STRING), queryable=True),
     Channel("reset", _request(requests.Nothing), "request", "end a fault", event=EventKind(6, STRING), queryable=True),
+    Channel("fault", STRING, "recording", "what of the service itself failed", event=EventKind(7, STRING)),
     Channel("tick", TICK, "recording", "index and event kinds", rate="every tick", every=1),
     Channel("frame", FRAME, "recording", "all that the tick decided", rate="every tick", every=1),
     Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="every tick", every=1),

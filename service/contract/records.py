@@ -39,6 +39,7 @@ class Reason(enum.IntEnum):
     TOOL_SPEED = 8  # measured, or commanded in spite of all bounds
     SETPOINT = 9  # passed a bound of its own, which cannot be
     TWO_SOURCES = 10  # of one hand or of the arm, which contradict each other
+    SERVICE = 11  # a part of the service failed; the log says which
 
 
 class Flag(enum.IntFlag):

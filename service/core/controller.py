@@ -159,6 +159,9 @@ class Controller:
                 case "reset":
                     if state["mode"] == FAULT:
                         state["mode"], state["arm_ready"] = HOLD, 0
+                case "fault":
+                    if state["mode"] != FAULT:
+                        state["mode"], state["reason"] = FAULT, Reason.SERVICE
                 case _:
                     raise ValueError(f"tick {tick.index}: nothing is done with an event of kind {event.kind!r}")
 

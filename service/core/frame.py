@@ -39,9 +39,9 @@ class Event:
     value: Any
 
 
-def order(kind: str) -> Event:
-    """A hold, resume or reset as an event."""
-    return Event(kind, cdr.encode_string("{}"), None)
+def order(kind: str, text: str = "{}") -> Event:
+    """A hold, resume, reset or fault as an event, and what a recording keeps of it."""
+    return Event(kind, cdr.encode_string(text), None)
 
 
 @dataclass(frozen=True, slots=True)

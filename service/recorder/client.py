@@ -38,8 +38,8 @@ SILENT_S = 5.0  # a scribe reports twice a second
 class Scribe:
     """Starts the scribe process, and sends it ticks and notes.
 
-    `send` is for the loop, `start`, `supervise`, `status` and `close` for one other thread, `note`
-    and `keep` for any.
+    `send` and `skip` are for the loop, `start`, `supervise`, `status` and `close` for one other
+    thread, `note` and `keep` for any.
 
     In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another; `recording` and
     `rrd` are explicit paths. With none of these and no `live_port` there is nothing to do and no
@@ -151,6 +151,12 @@ class Scribe:
             self._say_all = False
         if with_state:
             self._since_state = 0
+
+    def skip(self) -> None:
+        """Counts a tick that cannot be told of, as one that was lost; for the loop."""
+        self._gap += 1
+        self._lost += 1
+        self._say_all = True
 
     def note(self, key: str, text: str, time_ns: int) -> None:
         """A text for the recording, under `<cell>/<key>`; those under `requests` and `log` are
@@ -270,7 +276,9 @@ class Scribe:
         """Takes in the reports that have come; the first makes the process the one that is told."""
         assert self._child is not None
         source = self._child.socket
-        select.select([source], [], [], timeout_s)
+        poll = select.poll()  # select() knows no descriptor above 1023
+        poll.register(source, select.POLLIN)
+        poll.poll(1000 * timeout_s)
         with contextlib.suppress(OSError):
             while data := source.recv(LARGEST_MESSAGE):
                 self._report = msgspec.json.decode(data, type=Report)

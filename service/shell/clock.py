@@ -20,6 +20,9 @@ from service.core.frame import Vector
 
 SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
 PREPARE_NS = 450_000  # before a deadline the next tick is prepared
+STEP_NS = 20_000_000  # by so much the system clock is not off unless it was set
+DRAW = 256  # deadlines in which a smaller difference goes down to a third
+CREEP_NS = 1_000  # from stamp to stamp while time catches up
 _LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
 
@@ -27,7 +30,10 @@ FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
 class Deadlines:
     """Deadlines at a fixed rate since start.
 
-    Those that have passed are skipped and counted, never made up for in a burst.
+    Those that have passed are skipped and counted, never made up for in a burst. `stamp_ns` is the
+    newest one's time on the system clock [ns], and always grows: from one deadline to the next by
+    what lies between them, drawn slowly to the system clock; where that was set ahead it follows at
+    once, where it was set back it all but stands until time has caught up.
     """
 
     def __init__(
@@ -36,15 +42,17 @@ class Deadlines:
         *,
         spin_ns: int = 0,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        wall_ns: Callable[[], int] = time.time_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.period_ns = 1_000_000_000 // rate_hz
         self.missed = 0
         self._spin_ns = spin_ns
         self._now_ns = now_ns
+        self._wall_ns = wall_ns
         self._sleep = sleep
         self._start_ns = now_ns()
-        self._wall_ns = time.time_ns()
+        self.stamp_ns = wall_ns() - self.period_ns
         self._index = -1
 
     def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
@@ -53,7 +61,8 @@ class Deadlines:
         `prepare` is called shortly before it, where there is time.
         """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
-        self.missed += index - self._index - 1
+        passed = index - self._index
+        self.missed += passed - 1
         self._index = index
         deadline = self._start_ns + index * self.period_ns
         if prepare is not None and self._sleep_until(deadline - PREPARE_NS):
@@ -61,6 +70,12 @@ class Deadlines:
         self._sleep_until(deadline - self._spin_ns)
         while (late := self._now_ns() - deadline) < 0:
             pass
+        due = self.stamp_ns + passed * self.period_ns
+        off = self._wall_ns() - late - due
+        if -STEP_NS < off < STEP_NS:
+            self.stamp_ns = due + off // DRAW
+        else:
+            self.stamp_ns = due + off if off > 0 else self.stamp_ns + CREEP_NS
         return index, late
 
     def _sleep_until(self, at_ns: int) -> bool:
@@ -74,10 +89,6 @@ class Deadlines:
         """Ticks a second since start, as achieved."""
         elapsed = self._now_ns() - self._start_ns
         return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
-
-    def time_ns(self, index: int) -> int:
-        """A deadline on the wall clock as it was at start [ns]."""
-        return self._wall_ns + index * self.period_ns
 
 
 class Granted(NamedTuple):

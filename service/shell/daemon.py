@@ -22,6 +22,7 @@ from zenoh.handlers import RingChannel
 from service.client import endpoints, open_session
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
+from service.contract.explain import ExplainedError
 from service.contract.messages import Attachment, WireError
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
@@ -31,16 +32,26 @@ from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
+from service.shell import watch
 from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Granted, Window, ask_for_real_time, run_beside_real_time
+from service.shell.door import BOUNDS, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
+from service.shell.roles import access_control
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 STOP_TIMEOUT_S = 3.0
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SLOWEST_START_S = 120.0  # of the workshop, on a machine that is busy
 LONG_START_S = 3.0
+MOST_NOTES = 100  # a second
 LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
+
+
+class LoopError(ExplainedError, RuntimeError):
+    """A control loop that cannot go on, not even to stop the arm."""
 
 
 class Daemon:
@@ -55,6 +66,19 @@ class Daemon:
         self._stop = threading.Event()
         self._ended = threading.Event()
         urdf = robot_description(settings)
+        allow_descriptors()
+        network = settings.network
+        self._session = open_session(
+            connect=network.connect,
+            listen=network.listen,
+            certificate=network.certificate,
+            more=BOUNDS | (access_control(settings.cell) if network.certificate else {}),
+        )
+        try:
+            self._token = occupy(self._session, settings.cell)
+        except OccupiedError:
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise
         slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
         slow.start()
         try:
@@ -68,10 +92,12 @@ class Daemon:
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
-        self._status: Status | None = None
+        self._faults: deque[Event] = deque()
+        self._notes = (0, 0)  # second, and how many in it
+        self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
+        self._newest = -1  # tick
         self._laps: list[tuple[str, int]] = []
-        self._session = open_session(connect=settings.network.connect, listen=settings.network.listen)
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         self._subscribers = [
             (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
@@ -89,24 +115,40 @@ class Daemon:
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
+        self._clock = Deadlines(settings.rate_hz)
+        self._status = encode_json(self._survey())
         self._requests = Requests(
             self._session,
             settings,
             skill,
             workshop=workshop,
             skills=skills,
-            status=self.status,
+            status=lambda: self._status,
+            tick=lambda: int(self._frame["tick"]),
             note=self.note,
             keep=scribe.keep,
+            failed=self._fail,
         )
-        self._clock = Deadlines(settings.rate_hz)
 
     def stop(self, *_: Any) -> None:
         """Asks the loop to stop the arm and end. Safe in a signal handler."""
         self._stop.set()
 
     def note(self, text: str) -> None:
-        """A line for the log and for the recording."""
+        """A line for the log and for the recording; of more than MOST_NOTES a second only the
+        number is told.
+        """
+        second = int(time.monotonic())
+        if second != self._notes[0]:
+            left_out = self._notes[1] - MOST_NOTES
+            self._notes = (second, 0)
+            if left_out > 0:
+                self._say(f"{left_out} more requests in a second, not noted one by one")
+        self._notes = (second, self._notes[1] + 1)
+        if self._notes[1] <= MOST_NOTES:
+            self._say(text)
+
+    def _say(self, text: str) -> None:
         log.info(text)
         self._scribe.note("requests", text, time.time_ns())
 
@@ -114,25 +156,42 @@ class Daemon:
         """Runs the loop until `stop`, `announce`d once requests are answered; then everything is
         flushed and closed.
         """
-        reporter = threading.Thread(target=self._report, name="status", daemon=True)
+        reporter: threading.Thread | None = None
         try:
             self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
-            reporter.start()
+            reporter = watch.start("status thread", self._report, self._fail)
             announce(self)
             self._granted = ask_for_real_time()
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
-            run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
+            watch.watched("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
             self._ended.set()
             gc.unfreeze()  # what was kept from the collector may go
-            if reporter.is_alive():
+            if reporter is not None:
                 reporter.join(2)
             self._requests.close()
             self._session.close()  # type: ignore[no-untyped-call]
             if missing := self._scribe.close(timeout_s=20):
                 log.warning("%s", missing)
 
+    def _fail(self, what: str) -> None:
+        """Says what of the service failed; the next tick is at fault for it."""
+        self._faults.append(order("fault", what))
+        self._say(what)
+
+    def _fail_in_the_loop(self, what: str) -> None:
+        """Lets the loop stop the arm. Raises LoopError where no tick came since it failed last."""
+        self._scribe.skip()
+        tick = int(self._frame["tick"])
+        if tick == self._failed_at:
+            raise LoopError(f"{what}, and again at once: the arm is commanded no more")
+        self._failed_at = tick
+        self._fail(what)
+
     # --- the loop: every line below costs each tick ---
+
+    def _run(self) -> None:
+        run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
 
     def _ticks(self) -> Iterator[Tick]:
         inbox: list[Event] = []
@@ -141,6 +200,7 @@ class Daemon:
         prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
         while True:
             index, self._late_ns = self._clock.wait(prepare)
+            self._newest = index
             self._began_ns = time.perf_counter_ns()
             self._laps = []
             inbox = [
@@ -149,6 +209,8 @@ class Daemon:
             while self._requests.inbox:
                 if (event := self._requests.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
+            while self._faults:
+                inbox.append(self._faults.popleft())
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + STOP_TIMEOUT_S
@@ -160,17 +222,17 @@ class Daemon:
     def _warm_up(self) -> None:
         """Steps a twin through what the next tick may be: so it finds code and numbers near."""
         self._twin.imitate(self._controller)
-        self._twin.step(Tick(int(self._frame["tick"]) + 1, tuple(self._seen.values())))
+        self._twin.step(Tick(self._newest + 1, tuple(self._seen.values())))
 
     def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
         """The newest message on one channel, if it is one."""
         sample = subscriber.try_recv()
         if sample is None:
             return None
-        payload = sample.payload.to_bytes()
         try:
-            if len(payload) > LARGEST_MESSAGE:
-                raise WireError(f"{len(payload)} bytes")
+            if len(sample.payload) > LARGEST_MESSAGE:
+                raise WireError(f"{len(sample.payload)} bytes")
+            payload = sample.payload.to_bytes()
             event = self._seen[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
             return event
         except WireError:
@@ -183,7 +245,7 @@ class Daemon:
     def _publish(self, tick: Tick, frame: Frame) -> None:
         now_ns = time.time_ns()
         attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
-        for channel, payload in outgoing(frame, self._clock.time_ns(tick.index), self._settings.joints.names):
+        for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
             self._publishers[channel.key].put(payload, attachment=attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
@@ -199,7 +261,7 @@ class Daemon:
             else:
                 latency_ms = 0.0
         late_us, work_us = self._late_ns / 1e3, (time.perf_counter_ns() - self._began_ns) / 1e3
-        time_ns, missed = self._clock.time_ns(tick.index), self._clock.missed
+        time_ns, missed = self._clock.stamp_ns, self._clock.missed
         timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
         self._lateness.add(late_us)
         self._work.add(work_us)
@@ -207,25 +269,25 @@ class Daemon:
 
     # --- beside the loop ---
 
-    def status(self) -> Status:
-        """The newest status, at most a tenth of a second old."""
-        return self._status or self._survey()
-
     def _report(self) -> None:
         """Publishes the status, logs what changed, keeps the scribe alive: ten times a second."""
         run_beside_real_time()
         said: tuple[str, str] | None = None
         told: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
-            status = self._status = self._survey()
-            payload = encode_json(status)
+            status = self._survey()
+            errors = list(status.scribe["errors"])
+            payload = self._status = encode_json(status)
             self._publishers["status"].put(payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
-            self._scribe.supervise()
-            for error in status.scribe["errors"]:
-                if error not in told:
-                    told.append(error)
-                    log.warning("%s", error)
+            try:
+                self._scribe.supervise()
+            except OSError as error:  # a want of descriptors or memory passes
+                errors.append(f"the scribe cannot be seen to: {error}")
+            for error_text in errors:
+                if error_text not in told:
+                    told.append(error_text)
+                    log.warning("%s", error_text)
             if status.tick >= 0 and (status.mode, status.reason) != said:
                 said = (status.mode, status.reason)
                 log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
@@ -267,7 +329,7 @@ class Daemon:
 
 def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
     """The skill in a file, with the via-points that were taught to it before. Raises SkillError."""
-    skill, saved = workshop.load(path), SavedViaPoints(settings)
+    skill, saved = workshop.load(path, timeout_s=SLOWEST_START_S), SavedViaPoints(settings)
     try:
         found = saved.read(skill)
     except SkillError as error:
@@ -278,7 +340,7 @@ def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
         return skill
     if found is None or found[0] == skill.via_points:
         return skill
-    return workshop.adapt(skill, found[0], tolerance=found[1])
+    return workshop.adapt(skill, found[0], tolerance=found[1], timeout_s=SLOWEST_START_S)
 
 
 def serve(
@@ -286,10 +348,11 @@ def serve(
 ) -> None:
     """The daemon from start to end:
 
-    SIGINT and SIGTERM ask it to stop. Raises SkillError and UnreachableError before it starts.
+    SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError, OccupiedError and UnreachableError
+    before it starts, LoopError where it ends by itself.
     """
     workshop = Workshop()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in STOPPING}
     try:
         daemon = Daemon(
             settings, load_skill(workshop, skill_path, settings), workshop=workshop, skills=skills, scribe=scribe

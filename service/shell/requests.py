@@ -1,6 +1,4 @@
-"""Requests of clients: validated and answered on their own threads, carried out by the loop through
-its inbox.
-"""
+"""Requests of clients: validated and answered beside the loop, carried out through its inbox."""
 
 from __future__ import annotations
 
@@ -9,7 +7,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zenoh
@@ -25,7 +22,6 @@ from service.contract.requests import (
     Reply,
     RequestError,
     SkillRequest,
-    Status,
     ViaPoint,
     encode_json,
 )
@@ -34,14 +30,17 @@ from service.core.skill import Skill
 from service.core.workspace import is_reachable
 from service.learning.skill_file import SkillError
 from service.learning.via_points import in_force, points_made_of
+from service.shell import watch
 from service.shell.clock import run_beside_real_time
 from service.shell.saved_via_points import SavedViaPoints
 from service.shell.workshop import Workshop
 
 ADOPTION_TIMEOUT_S = 2.0
 MOST_POINTS = 400  # that all via-points come to, with their neighbours
-LARGEST_REQUEST = 256 * 1024  # bytes
-SLOW = ("via_points", "skill")  # what is computed before it is answered
+MOST_WAITING = 16  # requests in a line
+LONGEST_LIST = 100  # bytes
+ORDERS = ("hold", "resume", "reset")
+COMPUTED = "teaching"  # the line of what the workshop computes for
 
 
 class Pending:
@@ -76,9 +75,39 @@ class Pending:
         return self._tick
 
 
+class Line:
+    """Requests that wait for a thread of their own; beyond MOST_WAITING they are refused."""
+
+    def __init__(self, name: str, answer: Callable[[str, zenoh.Query], None], failed: Callable[[str], None]) -> None:
+        self._name, self._answer = name, answer
+        self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(MOST_WAITING)
+        self._thread = watch.start(f"thread of {name} requests", self._serve, failed)
+
+    def enqueue(self, suffix: str, query: zenoh.Query) -> None:
+        """Never waits."""
+        try:
+            self._waiting.put_nowait((suffix, query))
+        except queue.Full:
+            with query:
+                query.reply_err(f"busy: {MOST_WAITING} {self._name} requests wait already; try again later".encode())
+
+    def close(self) -> None:
+        """Ends the thread; what waits is answered first."""
+        self._waiting.put(None)
+        self._thread.join(ADOPTION_TIMEOUT_S + 1)
+
+    def _serve(self) -> None:
+        run_beside_real_time()
+        while (item := self._waiting.get()) is not None:
+            self._answer(*item)
+            item = None  # the asker is told of the end where its query is let go
+
+
 class Requests:
-    """The queryables of one cell. Two threads: one for what is answered at once, one for what the
-    workshop computes, so that `hold` never waits behind teaching.
+    """The queryables of one cell.
+
+    What is known is answered where it comes in. Each of hold, resume and reset has a line of its
+    own, and so have all that the workshop computes for: none waits behind another.
     """
 
     def __init__(
@@ -89,93 +118,88 @@ class Requests:
         *,
         workshop: Workshop,
         skills: Path,
-        status: Callable[[], Status],
+        status: Callable[[], bytes],
+        tick: Callable[[], int],
         note: Callable[[str], None],
         keep: Callable[[bytes], object],
+        failed: Callable[[str], None],
     ) -> None:
         self.inbox: deque[Pending] = deque()
         self._settings = settings
-        self._skill = skill
+        self._skill, self._in_force = skill, in_force(skill)
         self._workshop = workshop
         self._skills = skills
         self._status = status
+        self._tick = tick
         self._note = note
         self._keep = keep
+        self._failed = failed
         self._saved = SavedViaPoints(settings)
-        self._quick: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._slow: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._lines = {name: Line(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
-        self._threads = [
-            threading.Thread(target=self._serve, args=(source,), name="requests", daemon=True)
-            for source in (self._quick, self._slow)
-        ]
-        for thread in self._threads:
-            thread.start()
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
-        def enqueue(query: zenoh.Query) -> None:
-            self._quick.put((suffix, query))
+        here = threading.local()  # Zenoh calls from a thread of its own for each queryable
 
-        return session.declare_queryable(channels.key(self._settings.cell, suffix), enqueue)
+        def come_in(query: zenoh.Query) -> None:
+            try:
+                if not hasattr(here, "is_beside"):
+                    here.is_beside = True
+                    run_beside_real_time()
+                if suffix == "status" or self._is_list(suffix, query):
+                    self._reply(suffix, query)
+                else:
+                    self._lines[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
+            except Exception as error:
+                self._failed(f"the way in of {suffix} requests failed: {error!r}")
+
+        return session.declare_queryable(channels.key(self._settings.cell, suffix), come_in)
 
     def close(self) -> None:
-        """Ends both threads; requests still waiting are answered first."""
+        """Ends all threads; requests still waiting are answered first."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for source, thread in zip((self._quick, self._slow), self._threads, strict=True):
-            source.put(None)
-            thread.join(ADOPTION_TIMEOUT_S + 1)
+        for line in self._lines.values():
+            line.close()
 
-    def _serve(self, source: queue.SimpleQueue[Any]) -> None:
-        run_beside_real_time()
-        while (item := source.get()) is not None:
-            suffix, query = item
-            try:
-                if source is self._quick and suffix in SLOW and not self._is_list(query):
-                    self._slow.put(item)
-                    continue
-                with query:  # its end tells the asker that no more replies come
-                    self._reply(suffix, query)
-            except Exception as error:  # no request may end the thread that answers all others
-                self._note(f"{suffix} could not be answered: {error!r}")
-            item = query = None
-
-    def _is_list(self, query: zenoh.Query) -> bool:
-        payload = b"" if query.payload is None else query.payload.to_bytes()
+    @staticmethod
+    def _is_list(suffix: str, query: zenoh.Query) -> bool:
+        if suffix != "via_points" or query.payload is None or len(query.payload) > LONGEST_LIST:
+            return False
         try:
-            return len(payload) < 100 and isinstance(channels.BY_KEY["via_points"].codec.decode(payload), List)
+            return isinstance(channels.BY_KEY[suffix].codec.decode(query.payload.to_bytes()), List)
         except RequestError:
             return False
 
     def _reply(self, suffix: str, query: zenoh.Query) -> None:
-        payload = b"" if query.payload is None else query.payload.to_bytes()
         key = channels.key(self._settings.cell, suffix)
-        try:
-            if str(query.key_expr) != key and suffix != "status":
-                raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
-            if len(payload) > LARGEST_REQUEST:
-                raise RequestError(f"a request of {len(payload)} bytes, at most {LARGEST_REQUEST} accepted")
-            answer = encode_json(self._answer(suffix, payload))
-        except (RequestError, SkillError) as error:
-            self._note(f"{suffix} refused: {error}")
-            query.reply_err(str(error).encode())
-        except Exception as error:  # one request that fails must not end all others
-            self._note(f"{suffix} failed: {error!r}")
-            query.reply_err(f"{type(error).__name__}: {error}".encode())
-        else:
-            if suffix != "status":
-                self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
-            query.reply(key, answer)
+        with query:  # its end tells the asker that no more replies come
+            try:
+                if str(query.key_expr) != key and suffix != "status":
+                    raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
+                size = 0 if query.payload is None else len(query.payload)
+                if size > channels.LARGEST_REQUEST:
+                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
+            except (RequestError, SkillError) as error:
+                self._note(f"{suffix} refused: {error}")
+                query.reply_err(str(error).encode())
+            except Exception as error:  # one request that fails must not end all others
+                self._note(f"{suffix} failed: {error!r}")
+                query.reply_err(f"{type(error).__name__}: {error}".encode())
+            else:
+                if suffix != "status" and not self._is_list(suffix, query):
+                    self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
+                query.reply(key, answer)
 
-    def _answer(self, suffix: str, payload: bytes) -> Reply | Status:
-        if suffix == "status":
-            return self._status()
+    def _answer(self, suffix: str, payload: bytes) -> Reply:
         request = channels.BY_KEY[suffix].codec.decode(payload)
         match request:
             case SkillRequest(name):
                 return self._load(name)
             case List():
-                return Reply(self._status().tick, in_force(self._skill))
+                return Reply(self._tick(), self._in_force)
             case Add() | Remove() | Clear():
                 return self._teach(request)
             case Nothing():
@@ -195,13 +219,14 @@ class Requests:
             draft.replace(self._saved.path)
         finally:
             draft.unlink(missing_ok=True)
-        self._skill = skill
-        return Reply(tick, in_force(skill))
+        self._skill, self._in_force = skill, in_force(skill)
+        return Reply(tick, self._in_force)
 
     def _load(self, name: str) -> Reply:
         path = self._skills / (name if name.endswith(".npz") else f"{name}.npz")
-        if not path.is_file():
-            there = ", ".join(sorted(p.stem for p in self._skills.glob("*.npz"))) or "none"
+        folder = self._skills.resolve()
+        if not path.is_file() or path.resolve().parent != folder:
+            there = ", ".join(sorted(p.stem for p in folder.glob("*.npz") if p.resolve().parent == folder)) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {there}")
         skill = self._workshop.load(path)
         if (

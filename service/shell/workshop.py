@@ -38,13 +38,18 @@ class Workshop:
         self._busy = threading.Lock()
         self._child: child.Child | None = None
 
-    def load(self, path: Path) -> Skill:
-        """The skill in a file. Raises SkillError."""
-        return self._ask("load", path, None, 0.0)
+    def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> Skill:
+        """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
+        return self._ask(timeout_s, "load", path, None, 0.0)
 
-    def adapt(self, skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
-        """The skill that goes through these via-points and no others. Raises SkillError."""
-        return self._ask("adapt", skill.file, tuple(via_points), tolerance)
+    def adapt(
+        self, skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
+    ) -> Skill:
+        """The skill that goes through these via-points and no others.
+
+        Raises SkillError, also after `timeout_s` [s].
+        """
+        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance)
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -60,19 +65,19 @@ class Workshop:
             self._child.process.wait()
             self._child = None
 
-    def _ask(self, *request: Any) -> Skill:
+    def _ask(self, timeout_s: float, *request: Any) -> Skill:
         with self._busy:
             if self._child is None or self._child.process.poll() is not None:
                 self._end()
                 self._child = child.start("service.shell.workshop", socket.SOCK_STREAM)
-                self._child.socket.settimeout(TIMEOUT_S)
             try:
+                self._child.socket.settimeout(timeout_s)
                 _send(self._child.socket, pickle.dumps(request))
                 answer = _receive(self._child.socket)
             except TimeoutError:
                 self._end()
                 raise SkillError(
-                    f"the workshop process did not answer within {TIMEOUT_S:g} s; nothing was changed"
+                    f"the workshop process did not answer within {timeout_s:g} s; nothing was changed"
                 ) from None
             except (OSError, EOFError):
                 self._end()
@@ -120,6 +125,7 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
 def _main(descriptor: int) -> None:
     """The child: one request after the other until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    child.end_with_parent()
     os.nice(10)
     with socket.socket(fileno=descriptor) as channel:
         while True:
@@ -132,9 +138,11 @@ def _main(descriptor: int) -> None:
                 answer: Skill | str = _work(*request)
             except Exception as error:  # the asker is told, whatever it was
                 answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
-            _send(
-                channel, pickle.dumps(answer, protocol=5, buffer_callback=buffers.append), *(b.raw() for b in buffers)
-            )
+            skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+            try:
+                _send(channel, skill, *(b.raw() for b in buffers))
+            except BrokenPipeError:
+                return
 
 
 if __name__ == "__main__":

@@ -82,7 +82,9 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
             joints = messages.JointState(at_ns(i), JOINT_NAMES, tuple(frame["joints"].tolist()), ())
             inbox.append(Event("joints/state", cdr.encode_joints(joints), None))
         if i % 100 == 50:
-            inbox += [Event(kind, cdr.encode_string("{}"), None) for kind in ("reset", "hold", "resume", "hold")]
+            inbox += [
+                Event(kind, cdr.encode_string("{}"), None) for kind in ("fault", "reset", "hold", "resume", "hold")
+            ]
             inbox.insert(1, Event("skill", random.bytes(2000), None))
         yield Tick(i, tuple(inbox)), frame, timing
 

@@ -11,9 +11,10 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.requests import Percentiles
-from service.shell.clock import PREPARE_NS, Deadlines, Window
+from service.shell.clock import CREEP_NS, PREPARE_NS, STEP_NS, Deadlines, Window
 
 PERIOD_NS = 2_000_000
+WALL_NS = 1_800_000_000_000_000_000
 
 
 class FakeClock:
@@ -26,6 +27,10 @@ class FakeClock:
         self.oversleep_ns = oversleep_ns
         self.look_ns = look_ns
         self.slept_s: list[float] = []
+        self.set_by_ns = 0  # of the system clock
+
+    def wall_ns(self) -> int:
+        return WALL_NS + self.now + self.set_by_ns
 
     def now_ns(self) -> int:
         self.now += self.look_ns
@@ -36,7 +41,7 @@ class FakeClock:
         self.now += round(seconds * 1e9) + self.oversleep_ns
 
     def deadlines(self, *, rate_hz: int = 500, spin_ns: int = 0) -> Deadlines:
-        return Deadlines(rate_hz, spin_ns=spin_ns, now_ns=self.now_ns, sleep=self.sleep)
+        return Deadlines(rate_hz, spin_ns=spin_ns, now_ns=self.now_ns, wall_ns=self.wall_ns, sleep=self.sleep)
 
 
 def test_the_first_deadline_is_the_start() -> None:
@@ -115,10 +120,56 @@ def test_the_rate_is_that_achieved() -> None:
     assert deadlines.rate_hz() == pytest.approx(250, rel=0.01)
 
 
-def test_the_wall_time_of_ticks_grows_by_a_period_whatever_is_missed() -> None:
-    deadlines = FakeClock().deadlines()
-    times = [deadlines.time_ns(index) for index in (0, 1, 2, 100)]
-    assert np.diff(times).tolist() == [PERIOD_NS, PERIOD_NS, 98 * PERIOD_NS]
+def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
+    """What so many deadlines are stamped with."""
+    found = []
+    for _ in range(count):
+        deadlines.wait()
+        found.append(deadlines.stamp_ns)
+    return found
+
+
+def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None:
+    clock = FakeClock(oversleep_ns=300_000)
+    deadlines = clock.deadlines()
+    assert set(np.diff(stamps(clock, deadlines, 10))) == {PERIOD_NS}
+    clock.now += 98 * PERIOD_NS
+    before = deadlines.stamp_ns
+    deadlines.wait()
+    assert deadlines.stamp_ns - before == 98 * PERIOD_NS
+    assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000  # the deadline's time, not that of waking
+
+
+def test_stamps_follow_a_system_clock_that_is_set_ahead_at_once() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    stamps(clock, deadlines, 5)
+    clock.set_by_ns += 3_600_000_000_000
+    assert stamps(clock, deadlines, 1) == [clock.wall_ns()]
+
+
+def test_stamps_grow_while_a_system_clock_that_was_set_back_catches_up() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    before = stamps(clock, deadlines, 5)[-1]
+    clock.set_by_ns -= 1_000_000_000
+    after = stamps(clock, deadlines, 600)
+    steps = np.diff([before, *after])
+    assert (steps > 0).all()
+    assert (steps[:480] == CREEP_NS).all()
+    assert abs(after[-1] - clock.wall_ns()) < STEP_NS
+
+
+def test_stamps_are_drawn_to_a_system_clock_that_drifts_without_a_jump() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    stamps(clock, deadlines, 5)
+    for _ in range(3000):
+        clock.set_by_ns += 1_000  # 500 parts in a million, the most that it is ever slewed by
+        before = deadlines.stamp_ns
+        deadlines.wait()
+        assert abs(deadlines.stamp_ns - before - PERIOD_NS) <= 1_000
+    assert abs(deadlines.stamp_ns - clock.wall_ns()) < 1_000_000
 
 
 def test_an_empty_window_tells_zeros() -> None:

@@ -211,7 +211,7 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (("serve", "--rate", "7"), 2, "$.rate_hz"),
+        (("serve", "--rate", "7"), 2, "50 to 1000 Hz"),
         (("serve", "--config", "missing.toml"), 1, "missing.toml"),
         (("serve", "--skill", "missing.npz"), 1, "missing.npz"),
         (("serve", "--arm", "left"), 2, "invalid choice"),
@@ -231,7 +231,21 @@ def test_bad_usage_and_failures_are_told_on_standard_error(arguments: tuple[str,
 
 
 @pytest.mark.parametrize(
-    "name", ["demo", "serve", "play", "replay", "learn", "via-points", "status", "hold", "resume", "reset", "view"]
+    "name",
+    [
+        "demo",
+        "serve",
+        "play",
+        "replay",
+        "learn",
+        "via-points",
+        "status",
+        "hold",
+        "resume",
+        "reset",
+        "view",
+        "certificates",
+    ],
 )
 def test_every_command_has_help_with_an_example(name: str) -> None:
     done = thirdhand(name, "--help")

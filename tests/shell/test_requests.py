@@ -43,7 +43,9 @@ class Cell:
         self.running = True
         self._tick = 0
         self._end = threading.Event()
-        tell = {"status": self.status, "note": self.notes.append, "keep": self.kept.append}
+        self.failures: list[str] = []
+        tell = {"status": lambda: requests.encode_json(self.status()), "tick": lambda: self._tick}
+        tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
         self.requests = Requests(near, self.settings, skill, workshop=workshop, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
@@ -222,7 +224,9 @@ class SlowWorkshop(Workshop):
         super().__init__()
         self.begun, self.let = threading.Event(), threading.Event()
 
-    def adapt(self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float) -> Skill:
+    def adapt(
+        self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float, timeout_s: float = 0.0
+    ) -> Skill:
         self.begun.set()
         assert self.let.wait(20)
         return adapted(skill, places, tolerance=tolerance)
@@ -329,7 +333,7 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
         (b"\xff\xfe", "not JSON: JSON is malformed"),
         (b"[" * 100_000, "not JSON: maximum recursion depth"),
-        (b" " * 20_000_000, "a request of 20000000 bytes, at most 262144 accepted"),
+        (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
     ],
     ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
 )
@@ -373,6 +377,16 @@ def test_a_plain_request_with_something_in_it_is_refused(
     taught_cell: Cell, suffix: str, request_: Any, message: str
 ) -> None:
     assert taught_cell.refusal(suffix, request_).startswith(message)
+
+
+def test_a_link_does_not_lead_out_of_the_skill_folder(taught_cell: Cell, skill: Skill, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.npz").write_bytes(skill.file)
+    link = taught_cell.folder / "linked.npz"
+    link.symlink_to(tmp_path / "elsewhere.npz")
+    try:
+        assert "no skill 'linked' in the skill folder" in taught_cell.refusal("skill", {"name": "linked"})
+    finally:
+        link.unlink()
 
 
 def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
