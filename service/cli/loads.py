@@ -7,6 +7,9 @@ its own.
 
 from __future__ import annotations
 
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
 import contextlib
 import os
 import resource
