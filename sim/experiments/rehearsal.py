@@ -40,6 +40,7 @@ class Rehearsed:
     frames: NDArray[np.void] = field(default_factory=lambda: np.empty(0, np.void))
     time_s: Array = field(default_factory=lambda: np.empty(0))  # of the script; 0 before it begins
     hands: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # as they are, without noise [m]
+    joints: Array = field(default_factory=lambda: np.empty((0, 2, 0)))  # as measured [rad, rad/s]
     tool: Array = field(default_factory=lambda: np.empty((0, 3)))  # as measured in the simulation [m]
     axis: Array = field(default_factory=lambda: np.empty((0, 3)))  # the tool's +z, as measured
 
@@ -55,19 +56,21 @@ def rehearse(
     *,
     rate_hz: int = 500,
     keep: bool = False,
+    given: Settings | None = None,
     look: Callable[[Bench], None] = lambda bench: None,
     more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
 ) -> Rehearsed:
-    """One run of a script through core and physics.
+    """One run of a script through core and physics, with settings that are `given` or the default.
 
     `look` is shown the bench after each tick; `keep` keeps what was seen.
 
     `more` makes further events of the newest frame, as often as hands are seen.
     """
-    settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
+    settings = msgspec.structs.replace(given or Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
+    joints: list[tuple[tuple[float, ...], ...]] = []
     tool: list[tuple[float, ...]] = []
     axes: list[tuple[float, float, float]] = []
     held = 0
@@ -81,6 +84,7 @@ def rehearse(
                 frames.append(frame)
                 times.append(bench.time_s)
                 hands.append(np.stack([seen.hands.left.position, seen.hands.right.position]))
+                joints.append((seen.joints, seen.joint_velocities))
                 tool.append(seen.tool.position)
                 x, y, z, w = seen.tool.orientation
                 axes.append((2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)))
@@ -96,7 +100,7 @@ def rehearse(
             np.array(hands),
             np.array(tool),
         )
-        result.axis = np.array(axes)
+        result.axis, result.joints = np.array(axes), np.array(joints)
     return result
 
 
