@@ -19,6 +19,7 @@ from service.core.rotation import rotation
 from service.urdf import Joint, Shape, Urdf
 
 LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
+UNMOVED = 1e-9  # [m]
 FITS = 101  # lengths tried for a capsule
 
 
@@ -41,8 +42,9 @@ class Body(NamedTuple):
 def body_of(settings: Settings, description: str) -> Body:
     """The body of the arm that a URDF describes, with the tool on its plate.
 
-    Kept apart are capsules of links that do not follow each other. Those that are nearer than the
-    clearance in the configured posture belong together, and are not.
+    Kept apart are capsules of links that do not follow each other, but for those that cannot move
+    against each other, and those that belong together: they are nearer than the clearance in the
+    configured posture.
     """
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
@@ -73,13 +75,15 @@ def body_of(settings: Settings, description: str) -> Body:
         radii,
         np.empty((0, 2), np.int64),
     )
-    placed, near = np.empty((len(links), 2, 3)), np.empty(9)
-    place(np.array(settings.arm.posture), body.frames, body.axes, links, body.ends, placed)
+    postures = np.array([settings.arm.posture, settings.joints.lower, settings.joints.upper])
+    placed, near = np.empty((len(postures), len(links), 2, 3)), np.empty(9)
+    for q, ends in zip(postures, placed, strict=True):
+        place(q, body.frames, body.axes, links, body.ends, ends)
     pairs = []
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
-            apart = between_segments(placed[i], placed[j], near) - radii[i] - radii[j]
-            if apart > settings.obstacles.clearance:
+            apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
+            if apart[0] > settings.obstacles.clearance and np.ptp(apart) > UNMOVED:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 

@@ -247,7 +247,7 @@ class Controller:
     def _lead(self, target: Target, here: Kinematics) -> bool:
         """Moves the setpoint on; whether a limit was met. One that passes a bound is a fault."""
         state, box = self._state, self._skill.workspace
-        slow = slow_down(state["setpoint"], here.position)
+        slow = slow_down(state["setpoint"], here.position, self._apart.told[2], self._settings.tool.max_speed)
         met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
         if met == WRONG:
             state["mode"], state["reason"] = FAULT, Reason.SETPOINT

@@ -51,16 +51,20 @@ def measured_error(q: Vector, tasks: Vector, measured: Vector, velocities: Vecto
 
 
 @compiled
-def slow_down(setpoint: Vector, tool: Vector) -> float:
-    """Share of its speed for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1 where it comes
-    back.
+def slow_down(setpoint: Vector, tool: Vector, share: float, fastest: float) -> float:
+    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
+    where it comes back; and for one that may keep only a share of its own speed.
     """
     along = gap = 0.0
     for i in range(3):
         ahead = setpoint[0, i] - tool[i]
         along += ahead * setpoint[1, i]
         gap += ahead * ahead
-    return 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
+    if share < 1.0:
+        speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
+        slow = min(slow, share * speed / fastest)
+    return slow
 
 
 @compiled

@@ -35,7 +35,8 @@ class Separation:
     """What the rule says at a tick: `rows` (K, J) of which the first `count` are in force, times
     joint velocities at most `plan` (K,) [m/s] where motion is planned and `allowed` (K,) at all.
 
-    `told` (2,): distance of the nearest hand [m], and the least speed that is allowed toward one.
+    `told` (3,): distance of the nearest hand [m], the least speed that is allowed toward one, and
+    the greatest share of the setpoint's speed at which the tool could go along.
     """
 
     def __init__(self, settings: Settings, urdf: str) -> None:
@@ -57,7 +58,7 @@ class Separation:
         count, joints = len(self._body.links), len(settings.joints.names)
         most = 2 * count + 3 * count * len(boxes) + len(self._body.pairs)
         self.rows, self.plan, self.allowed = np.zeros((most, joints)), np.zeros(most), np.zeros(most)
-        self.told, self.count = np.zeros(2), 0
+        self.told, self.count = np.array([FARTHEST, IRRELEVANT, 1.0]), 0
         self._placed = np.zeros((count, 2, 3))
         self._contacts = np.empty((0, 8))
 
@@ -65,9 +66,7 @@ class Separation:
         """From now on the tool may touch a hand at those of the taught places where it goes with
         that hand.
         """
-        found = [
-            [*p.left, *p.right, p.radius, ("left", "right").index(p.follow)] for p in places if p.follow != "none"
-        ]
+        found = [[*p.left, *p.right, p.radius, ("left", "right").index(p.follow)] for p in places if p.follow != "none"]
         self._contacts = np.array(found).reshape(-1, 8)
 
     def look(self, state: Record, q: Vector, tool: Vector, jacobian: Vector) -> None:
@@ -102,9 +101,7 @@ class Separation:
 
 
 @compiled
-def allowed_speed(
-    distance: float, hand_speed: float, brake: float, reaction: float, clearance: float
-) -> float:
+def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
     """Speed [m/s] toward something `distance` [m] away that comes at `hand_speed` [m/s] all the
     time, from which a stop that begins a reaction time [s] late and brakes so [m/s²] ends
     `clearance` away.
@@ -140,7 +137,7 @@ def _look(
     """`Separation.look`: rows that were found."""
     state, near, forearm, count = states[0], np.empty(9), np.empty((2, 3)), 0
     place(q, frames, axes, links, ends, placed)
-    told[0], told[1] = FARTHEST, IRRELEVANT
+    told[0], told[1], told[2] = FARTHEST, IRRELEVANT, 1.0
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
@@ -162,6 +159,8 @@ def _look(
             told[0], told[1] = min(told[0], distance), min(told[1], most)
             if _add(near, distance, coming, least, people, PEOPLE_ROOM, plan, allowed, count):
                 _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                if links[capsule] == len(q):
+                    told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
                 count += 1
     for capsule in range(first, len(links)):
         for box in range(len(boxes)):
@@ -172,6 +171,8 @@ def _look(
                 known = where > 0 and share == inner
                 if not known and _add(near, distance, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
                     _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                    if links[capsule] == len(q):
+                        told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
                     count += 1
     for pair in range(len(pairs)):
         one, other = pairs[pair, 0], pairs[pair, 1]
@@ -181,6 +182,13 @@ def _look(
             _bring_together(rows[count], near, 3, tool, jacobian, links[other], -1.0)
             count += 1
     return count
+
+
+@compiled
+def _share(near: Vector, limit: float, velocity: Vector) -> float:
+    """How much of a velocity (3,) stays under a limit along the normal."""
+    along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    return limit / along if along > limit else 1.0
 
 
 @compiled
@@ -221,9 +229,7 @@ def _add(
 
 
 @compiled
-def _bring_together(
-    row: Vector, near: Vector, at: int, tool: Vector, jacobian: Vector, link: int, sign: float
-) -> None:
+def _bring_together(row: Vector, near: Vector, at: int, tool: Vector, jacobian: Vector, link: int, sign: float) -> None:
     """Adds to row (J,) the speed along the normal, times the sign, of the point near[at:at + 3] of
     a link that the first joints move.
     """

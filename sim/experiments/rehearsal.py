@@ -56,17 +56,16 @@ def rehearse(
     *,
     rate_hz: int = 500,
     keep: bool = False,
-    given: Settings | None = None,
     look: Callable[[Bench], None] = lambda bench: None,
     more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
 ) -> Rehearsed:
-    """One run of a script through core and physics, with settings that are `given` or the default.
+    """One run of a script through core and physics.
 
     `look` is shown the bench after each tick; `keep` keeps what was seen.
 
     `more` makes further events of the newest frame, as often as hands are seen.
     """
-    settings = msgspec.structs.replace(given or Settings(), rate_hz=rate_hz)
+    settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
