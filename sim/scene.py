@@ -26,8 +26,8 @@ Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 
 TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] where the tool holds the glass, seen from the soldering place
-# Where the tool offers the board, seen from the hand that takes it: the arm stays 4 cm away from the
-# hand, and the board's edge lies in it.
+# Where the tool offers the board, seen from the hand that takes it: the arm stays 4 cm away, the
+# board's edge lies in the hand.
 TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
 RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] where the right hand holds the iron, seen from the soldering place
 GRASP_DISTANCE = 0.03  # [m] within it, a thing can be taken over or is held where it is wanted

@@ -134,6 +134,7 @@ class Arm:
         position: Vector,
         velocity: Vector,
         direction: Vector,
+        *,
         here: Kinematics | None = None,
         apart: Separation | None = None,
     ) -> Solution:

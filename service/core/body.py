@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Body(NamedTuple):
     links: Vector
     ends: Vector
     radii: Vector
-    pairs: Vector
+    pairs: Any
 
 
 def body_of(settings: Settings, description: str) -> Body:

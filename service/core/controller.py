@@ -128,7 +128,7 @@ class Controller:
             met = self._lead(target, here)
             lap("setpoint")
             setpoint = state["setpoint"]
-            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here, self._apart)
+            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here=here, apart=self._apart)
             lap("arm")
             limited, stopped = self._move(wanted.velocity)
             flags |= CLAMPED * target.clamped

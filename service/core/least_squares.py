@@ -1,5 +1,5 @@
-"""Damped least squares within bounds and under linear inequalities, compiled: the numbers of one
-step of inverse kinematics, by active-set methods of bounded length, with an answer that keeps what is asked for.
+"""Damped least squares within bounds and under linear inequalities, compiled: active-set methods of
+bounded length, whose answer keeps bounds and limits whatever happens.
 """
 
 from __future__ import annotations
@@ -244,13 +244,13 @@ def _constraint(number: int, bounds: Vector, rows: Vector, limits: Vector, norma
     joints = len(normal)
     if number >= 2 * joints:
         normal[:] = rows[number - 2 * joints]
-        return limits[number - 2 * joints]
+        return float(limits[number - 2 * joints])
     normal[:] = 0.0
     if number >= joints:
         normal[number - joints] = -1.0
-        return -bounds[0, number - joints]
+        return -float(bounds[0, number - joints])
     normal[number] = 1.0
-    return bounds[1, number]
+    return float(bounds[1, number])
 
 
 @compiled

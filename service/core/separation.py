@@ -73,13 +73,12 @@ class Separation:
         """Finds what the rule says at joints q (J,) [rad], where the tool is at `tool` (3,) [m] and
         has this Jacobian (6, J), for the state's hands.
         """
-        body = self._body
         self.count = _look(
             as_array(state),
             q,
             tool,
             jacobian,
-            *body,
+            *self._body,
             self._first,
             self._boxes,
             self._hand,
@@ -194,13 +193,13 @@ def _share(near: Vector, limit: float, velocity: Vector) -> float:
 @compiled
 def _receives(contacts: Vector, hands: Vector, side: int) -> bool:
     """Whether the hands are at a taught place where the tool goes with this one."""
-    for place in range(len(contacts)):
-        if contacts[place, 7] == side:
+    for at in range(len(contacts)):
+        if contacts[at, 7] == side:
             far = 0.0
             for hand in range(2):
                 for i in range(3):
-                    far = max(far, abs(hands[hand, 0, i] - contacts[place, 3 * hand + i]))
-            if far <= contacts[place, 6] + NEAR_PLACE:
+                    far = max(far, abs(hands[hand, 0, i] - contacts[at, 3 * hand + i]))
+            if far <= contacts[at, 6] + NEAR_PLACE:
                 return True
     return False
 
