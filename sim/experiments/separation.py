@@ -226,7 +226,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     count = max(1, round(SCENES * options.share))
     found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
-    tasks = [(kind, n) for kind in KINDS for n in range(count) if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+    tasks = [(kind, n) for n in range(count) for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
     for one in outcomes(tasks, options.workers):
         found[one.kind].append(one)
         if len(found[one.kind]) % max(1, count // 5) == 0:
