@@ -175,8 +175,8 @@ def joint_step(
     count: int,
     out: Vector,
 ) -> int:
-    """`Arm.step` into out (J,) [rad/s], of which the first `count` rows (K, J) stay under limits
-    (K,); what is to be said of it.
+    """`Arm.step` into out (J,) [rad/s], with the first `count` of rows (K, J) times out at most
+    limits (K,) [m/s]; what is to be said of it.
     """
     joints = len(q)
     period, braking, closing_speed, far_damping, most = closing
