@@ -35,6 +35,7 @@ REACH_S, STAY_S = (0.35, 0.7), 0.6  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
+HURRY = 0.05  # [m/s] by which a hand is faster than was assumed
 UNHEEDED_EVERY = 4  # scenes: only to tell what it costs to heed anyone
 
 
@@ -92,6 +93,7 @@ class Outcome(NamedTuple):
     pushed_mm: float  # that a part of the arm went toward a hand that it touched
     excess_at_once: float  # [m/s] over the rule, the most
     excess_after_reaction: float  # over the most that the rule allowed within the reaction time
+    excess_hurried: float  # the same at hands that were faster meanwhile than the rule had assumed
     fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
     limited_s: float  # in which separation held the arm back
     self_mm: float  # nearest that links come to each other, which are kept apart
@@ -142,8 +144,9 @@ def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list
     tool = body.links[moving:] == len(settings.joints.names)
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
-    lately = maximum_filter1d(allowed, size=2 * half + 1, axis=0)
-    lately = np.concatenate([np.repeat(lately[:1], half, axis=0), lately])[: len(lately)]  # the past only
+    lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
+    assumed = hurried <= _later_by(2 * half, coming) + HURRY
+    over = speed - lately
     began = np.flatnonzero(done.time_s > 0)
     pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
     worst = np.argmax((speed - allowed).reshape(len(speed), -1), axis=1)
@@ -158,13 +161,19 @@ def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list
         1000 * min(map(min, nearest)),
         1000 * float(pushed.max()),
         float((speed - allowed)[began].max()),
-        float((speed - lately)[began].max()),
+        float(np.where(assumed, over, -1.0)[began].max()),
+        float(np.where(assumed, -1.0, over)[began].max()),
         float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
         1000 * float(own.min()),
         1000 * float(table.min()),
         picked[began][::10],
     )
+
+
+def _later_by(ticks: int, values: Array) -> Array:
+    """Values (T, ...) so many ticks later, the first ones repeated."""
+    return np.concatenate([np.repeat(values[:1], ticks, axis=0), values])[: len(values)]
 
 
 @compiled
@@ -253,6 +262,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "pushed_mm": max(one.pushed_mm for one in rows),
         "excess_at_once": max(one.excess_at_once for one in rows),
         "excess_after_reaction": max(one.excess_after_reaction for one in rows),
+        "excess_hurried": max(one.excess_hurried for one in rows),
         "above_after_reaction": sum(one.excess_after_reaction > SLIP for one in rows),
         "fastest_hand": max(one.fastest_hand for one in rows),
         "limited_s": float(np.mean([one.limited_s for one in rows])),
