@@ -37,7 +37,7 @@ from service.core.frame import (
 )
 from service.core.intake import Intake
 from service.core.inverse_kinematics import measured_error, slow_down
-from service.core.limiter import Limiter
+from service.core.limiter import Limited, Limiter
 from service.core.rotation import rotation
 from service.core.separation import Separation
 from service.core.setpoint import WRONG, SetpointGenerator
@@ -84,6 +84,7 @@ class Controller:
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._jerk = np.array(settings.joints.jerk)
+        self._still = np.zeros(len(self._jerk))
         self._apart = Separation(settings, urdf)
         self._apart.expect(skill.via_points)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
@@ -136,7 +137,7 @@ class Controller:
             flags |= NEAR_LIMIT * wanted.near_limit
             flags |= APART * (wanted.apart or stopped)
         else:
-            state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
+            state["joints"] = self._brake()[:3]
             self._setpoint.begin(state, self._at_rest())
         lap("limiter")
         return self._frame(prediction, target, flags, moving=moving)
@@ -266,7 +267,7 @@ class Controller:
         limited, excess = moved.limited, self._apart.excess(*moved[1:3], self._jerk)
         stopped = excess > 0.0
         if stopped:
-            stop = self._limiter.stop(q, dq, ddq)
+            stop = self._brake()
             stopped = self._apart.excess(*stop[1:3], self._jerk) < excess
             moved, limited = (stop, True) if stopped else (moved, limited)
         if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
@@ -275,6 +276,18 @@ class Controller:
                 state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
         return limited, stopped
+
+    def _brake(self) -> Limited:
+        """The joints one period on their way to rest, together; or each as it can, where that
+        approaches things less.
+        """
+        q, dq, ddq = self._state["joints"]
+        stop = self._limiter.stop(q, dq, ddq)
+        excess = self._apart.excess(*stop[1:3], self._jerk)
+        if excess <= 0.0:
+            return stop
+        other = self._limiter.step(q, dq, ddq, self._still)
+        return other if self._apart.excess(*other[1:3], self._jerk) < excess else stop
 
     def _arm_at(self, joints: Vector) -> Kinematics:
         """The arm at joints (J,) [rad]; asked again for the same ones, it is not computed again."""
