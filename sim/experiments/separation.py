@@ -248,8 +248,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "slip_m_per_s": SLIP,
         **{kind: _summary(rows) for kind, rows in found.items()},
         "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
-        "worst": {kind: max(rows, key=lambda one: one.excess_after_reaction)[:-1] for kind, rows in found.items()},
-        "by_scene": {kind: [one[:-1] for one in rows] for kind, rows in found.items()},
+        "worst_scene": {
+            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
+        },
+        "failed_scenes": {kind: [one.number for one in rows if not one.success] for kind, rows in found.items()},
     }
 
 
