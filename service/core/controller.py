@@ -267,7 +267,7 @@ class Controller:
         limited, excess = moved.limited, self._apart.excess(*moved[1:3], self._jerk)
         stopped = excess > 0.0
         if stopped:
-            stop = self._brake()
+            stop = self._limiter.stop(q, dq, ddq)
             stopped = self._apart.excess(*stop[1:3], self._jerk) < excess
             moved, limited = (stop, True) if stopped else (moved, limited)
         if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
