@@ -65,6 +65,7 @@ class ToolSettings(Section, frozen=True):
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
+    radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk², beside error²
 
 
@@ -85,6 +86,7 @@ class ArmSettings(Section, frozen=True):
         -1.0823,
         0.0,
     )  # [rad] the null space's and the assumed one
+    link_radius: Positive = 0.07  # [m] of links whose shapes are meshes, which are not read
     fault_error_rad: Positive = 0.1
     silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
@@ -122,8 +124,44 @@ class Reach(Section, frozen=True):
     min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02
 
 
+class People(Section, frozen=True):
+    """How near the arm may come to people, and how fast: speed and separation as in ISO/TS 15066.
+
+    A hand is a capsule from where it is tracked toward the elbow. A part of the arm may approach it
+    as fast as it can still stop `clearance` away, if the hand comes on as fast as now and the stop
+    begins `hands.stale_ms` (so long a hand may move unseen) and `reaction_ms` late.
+    """
+
+    radius: Positive = 0.04  # [m] of hand and forearm
+    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] from the tracked point toward the elbow
+    toward_elbow: Point = (1.0, 0.0, 0.0)  # frame base: the user sits at +x
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] errors of tracker and arm are mm; fingers reach out
+    brake: Positive = 3.0  # [m/s²] the slowest joint of the shipped arm brakes its stretched tool by 5
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] of the tool to a hand that receives
+    unknown_speed: Positive = 1.6  # [m/s] of a hand that has only just been seen
+
+
+class Box(Section, frozen=True):
+    """Something that stands around, parallel to the axes of frame base [m]."""
+
+    centre: Point
+    half_size: tuple[Positive, Positive, Positive]
+
+
+class Obstacles(Section, frozen=True):
+    """What the arm keeps away from besides people: the table, itself, and boxes."""
+
+    boxes: tuple[Box, ...] = ()
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m]
+    brake: Positive = 2.0  # [m/s²] toward them
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
+
+
 class Table(Section, frozen=True):
-    """The table top, where pictures and the simulated bench have it [m]."""
+    """The table: its top [m], in pictures, in the simulated bench, and for the arm, which keeps
+    away from it and all below.
+    """
 
     centre: Point = (0.80, 0.0, 0.0)
     half_size: tuple[Positive, Positive] = (0.45, 0.60)
@@ -187,6 +225,8 @@ class Settings(Section, frozen=True):
     joints: JointSettings = msgspec.field(default_factory=JointSettings)
     reach: Reach = msgspec.field(default_factory=Reach)
     table: Table = msgspec.field(default_factory=Table)
+    people: People = msgspec.field(default_factory=People)
+    obstacles: Obstacles = msgspec.field(default_factory=Obstacles)
     network: Network = msgspec.field(default_factory=Network)
     files: Files = msgspec.field(default_factory=Files)
 
@@ -203,6 +243,8 @@ class Settings(Section, frozen=True):
             norm = math.hypot(*pose[3:])
             if abs(norm - 1.0) > 1e-3:
                 raise ValueError(f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)")
+        if not math.hypot(*self.people.toward_elbow) > 1e-6:
+            raise ValueError(f"$.people.toward_elbow: {list(self.people.toward_elbow)} given; a direction needed")
         if self.tool.fault_speed < self.tool.max_speed:
             raise ValueError(
                 f"$.tool.fault_speed: {self.tool.fault_speed} given; "

@@ -1,5 +1,5 @@
-"""What a URDF says of an arm: its joints along the chain to the tool, their limits, and where its
-links are.
+"""What a URDF says of an arm: its joints along the chain to the tool, their limits, where its links
+are and what shape they have.
 """
 
 from __future__ import annotations
@@ -34,6 +34,16 @@ class Joint(NamedTuple):
     velocity: float
 
 
+class Shape(NamedTuple):
+    """A collision shape of a link, and where it sits in that link's frame."""
+
+    link: str
+    kind: str  # box, cylinder, sphere, capsule, mesh
+    size: tuple[float, ...]  # [m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: none
+    translation: Vector3
+    rotation: Quaternion
+
+
 class Urdf:
     """A robot description, read. Raises UrdfError."""
 
@@ -42,6 +52,9 @@ class Urdf:
         try:
             root = ElementTree.fromstring(text)
             self.joints = tuple(_joint(element) for element in root.iter("joint") if element.find("parent") is not None)
+            self.shapes = tuple(
+                _shape(link.get("name", ""), one) for link in root.iter("link") for one in link.iter("collision")
+            )
         except (ElementTree.ParseError, ValueError) as error:
             raise UrdfError(f"{origin}: not a robot description: {error}") from None
         if root.tag != "robot" or not self.joints:
@@ -62,6 +75,10 @@ class Urdf:
             found.insert(0, self._above[link])
             link = found[0].parent
         return tuple(found)
+
+    def above(self, link: str) -> Joint | None:
+        """The joint whose child a link is; None for the root."""
+        return self._above.get(link)
 
     def movable(self, tip: str) -> tuple[Joint, ...]:
         """The revolute joints from the root to link `tip`, in order.
@@ -95,7 +112,6 @@ class Urdf:
 
 def _joint(element: ElementTree.Element) -> Joint:
     origin, limit = element.find("origin"), element.find("limit")
-    roll, pitch, yaw = _three(origin, "rpy", "0 0 0")
     x, y, z = _three(element.find("axis"), "xyz", "1 0 0")
     norm = math.sqrt(x * x + y * y + z * z) or math.nan
     return Joint(
@@ -104,10 +120,29 @@ def _joint(element: ElementTree.Element) -> Joint:
         _link(element, "parent"),
         _link(element, "child"),
         _three(origin, "xyz", "0 0 0"),
-        multiply(about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll))),
+        _turn(origin),
         (x / norm, y / norm, z / norm),
         *(float("nan" if limit is None else limit.get(name, "nan")) for name in ("lower", "upper", "velocity")),
     )
+
+
+SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+
+
+def _shape(link: str, element: ElementTree.Element) -> Shape:
+    geometry, origin = element.find("geometry"), element.find("origin")
+    if geometry is None or not len(geometry):
+        raise ValueError(f"a collision of link {link!r} without geometry")
+    kind, given = geometry[0].tag, geometry[0]
+    size = tuple(float(number) for name in SIZES.get(kind, ()) for number in given.get(name, "nan").split())
+    if not all(0.0 < number < math.inf for number in size):
+        raise ValueError(f"the {kind} of link {link!r} has no size")
+    return Shape(link, kind, size, _three(origin, "xyz", "0 0 0"), _turn(origin))
+
+
+def _turn(origin: ElementTree.Element | None) -> Quaternion:
+    roll, pitch, yaw = _three(origin, "rpy", "0 0 0")
+    return multiply(about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll)))
 
 
 def _link(element: ElementTree.Element, which: str) -> str:

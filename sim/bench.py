@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from service.config import Settings
-from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION
+from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import HandMotions, HandScript
-from sim.world import BOARD_FROM_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
+from sim.world import BOARD_IN_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
 STILL_S = 0.25  # of rest is settled
@@ -127,7 +127,7 @@ class Bench:
         world.put(world.glass, Pose(scene.glass, LEVEL))
         world.put(world.iron, Pose(scene.iron, LEVEL))
         # What is held: by which holder, and how it lies in its hand.
-        self._held: dict[int, tuple[int, Pose]] = {world.board: (world.arm, Pose(BOARD_FROM_TOOL, LEVEL))}
+        self._held: dict[int, tuple[int, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
 
     def begin(self) -> None:
         """Start the script: hands move from the next step on."""
@@ -234,7 +234,8 @@ class Bench:
         tool = np.array(seen.tool.position)
         first, second, third = scene.dwells
         handover, grasp, carry = self._watches
-        if first[0] <= script_s <= first[1] and handover.see(_distance(tool, seen.hands.left.position), seen.time_s):
+        offered = _distance(tool, np.add(seen.hands.left.position, TOOL_FROM_HAND))
+        if first[0] <= script_s <= first[1] and handover.see(offered, seen.time_s):
             self._take(world.board, world.left)
         if second[0] <= script_s <= second[1]:
             if grasp.see(_distance(tool, scene.glass), seen.time_s):

@@ -26,6 +26,9 @@ Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 
 TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] where the tool holds the glass, seen from the soldering place
+# Where the tool offers the board, seen from the hand that takes it: the arm stays 4 cm away, the
+# board's edge lies in the hand.
+TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
 RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] where the right hand holds the iron, seen from the soldering place
 GRASP_DISTANCE = 0.03  # [m] within it, a thing can be taken over or is held where it is wanted
 # The tool's +z points 45° forward and down, its y axis stays level: a turn of 135° about y (x y z
@@ -55,7 +58,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """One soldering scene: places [m, frame `base`] and durations [s]."""
 
     robot_start: Point = (0.45, -0.05, 0.35)
-    handover: Point = (0.62, -0.28, 0.30)
+    handover: Point = (0.62, -0.28, 0.30)  # of the left hand
     glass: Point = (0.50, 0.38, 0.16)  # the handle of the magnifying glass
     soldering: Point = (0.75, 0.0, 0.06)  # where the board is soldered
     iron: Point = (0.90, 0.42, 0.10)
@@ -92,6 +95,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return _add(self.soldering, RIGHT_FROM_OBJECT)
 
     @property
+    def offer(self) -> Point:
+        """Where the tool offers the board to the left hand [m]."""
+        return _add(self.handover, TOOL_FROM_HAND)
+
+    @property
     def carry(self) -> Point:
         """Where the tool holds the glass over the board [m]."""
         return _add(self.soldering, TOOL_FROM_OBJECT)
@@ -121,7 +129,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """
         s = self
         return (
-            _via_point("handover", left=s.handover, right=s.right_start, tool=s.handover, follow="left"),
+            _via_point("handover", left=s.handover, right=s.right_start, tool=s.offer, follow="left"),
             _via_point("glass", left=s.soldering, right=s.iron, tool=s.glass),
             _via_point("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
         )

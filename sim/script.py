@@ -199,7 +199,7 @@ class Teacher:
         ends = np.random.default_rng([seed, 1])
         points = [
             np.array(point) + offset_std * ends.standard_normal(3)
-            for point in (scene.robot_start, scene.handover, scene.glass, scene.carry)
+            for point in (scene.robot_start, scene.offer, scene.glass, scene.carry)
         ]
         self._clock = clock or Clock()
         self._path = Path(points, scene.segments, arcs=TOOL_ARCS)

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pybullet
 
-from service.config import Settings, Table, urdf_path
+from service.config import People, Settings, Table, urdf_path
 from sim.scene import HAND_ORIENTATION, Scene
 
 Floats = tuple[float, ...]
 ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule's own axis is z
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 TABLE_THICKNESS = 0.04  # [m]
-BOARD_FROM_TOOL = (0.0, 0.0, 0.03)  # [m] in front of the tool plate
 GREEN, STEEL, WOOD, SKIN, BLUE = (
     (0.1, 0.5, 0.2, 1.0),
     (0.7, 0.7, 0.75, 1.0),
@@ -36,6 +35,9 @@ class Pose(NamedTuple):
 
     position: Floats
     orientation: Floats
+
+
+BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))  # held by its edge
 
 
 class World:
@@ -66,9 +68,9 @@ class World:
         for joint, angle in zip(self._joints, posture, strict=True):
             pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self._id)
         self.follow(posture, (0.0,) * len(names))
-        self._furnish(scene, settings.table)
+        self._furnish(scene, settings.table, settings.people)
 
-    def _furnish(self, scene: Scene, table: Table) -> None:
+    def _furnish(self, scene: Scene, table: Table, people: People) -> None:
         x, y, top = table.centre
         self._box((*table.half_size, TABLE_THICKNESS / 2), (x, y, top - TABLE_THICKNESS / 2), WOOD, solid=True)
         for at in (scene.soldering, scene.glass, scene.iron):  # what things rest on
@@ -77,8 +79,8 @@ class World:
         self.glass = self._cylinder(0.05, 0.006, scene.glass, STEEL)
         self.iron = self._cylinder(0.008, 0.18, scene.iron, BLUE)
         self.solder = self._cylinder(0.02, 0.03, scene.solder, STEEL)
-        self.left = self._hand(scene.left_start)
-        self.right = self._hand(scene.right_start)
+        self.left = self._hand(scene.left_start, people)
+        self.right = self._hand(scene.right_start, people)
 
     def _box(self, half: Floats, at: Floats, colour: Floats, *, solid: bool = False) -> int:
         look = pybullet.createVisualShape(
@@ -97,14 +99,14 @@ class World:
         )
         return self._body(look, -1, Pose(at, LEVEL))
 
-    def _hand(self, at: Floats) -> int:
+    def _hand(self, at: Floats, people: People) -> int:
         # A capsule from the palm back along the forearm; its shape is there to measure distances,
         # and pushes nothing.
-        back = (-0.12, 0.0, 0.0)
+        back = (-people.length / 2, 0.0, 0.0)
         look = pybullet.createVisualShape(
             pybullet.GEOM_CAPSULE,
-            radius=0.04,
-            length=0.24,
+            radius=people.radius,
+            length=people.length,
             rgbaColor=SKIN,
             visualFramePosition=back,
             visualFrameOrientation=ALONG_X,
@@ -112,8 +114,8 @@ class World:
         )
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_CAPSULE,
-            radius=0.04,
-            height=0.24,
+            radius=people.radius,
+            height=people.length,
             collisionFramePosition=back,
             collisionFrameOrientation=ALONG_X,
             physicsClientId=self._id,

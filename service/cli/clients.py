@@ -57,6 +57,8 @@ def status(args: argparse.Namespace) -> int:
         "scheduling": ("real time" if now["realtime"] else "ordinary: real time was not granted")
         + (", memory locked" if now["memory_locked"] else ", memory not locked"),
         "hands": ", ".join(f"{side} {age:.0f} ms old" for side, age in now["hand_age_ms"].items()) or "none seen",
+        "nearest": f"{100 * now['hand_distance_m']:.1f} cm to a hand, toward which {now['hand_limit_m_s']:.2f} m/s "
+        "are allowed",
         "rejected": ", ".join(f"{count} {cause}" for cause, count in now["rejected"].items()) or "none",
         "recording": now["scribe"].get("recording") or f"none ({now['scribe'].get('state', 'off')})",
         **({"lost": f"{now['scribe']['lost']} ticks are not recorded"} if now["scribe"].get("lost") else {}),

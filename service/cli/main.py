@@ -168,7 +168,7 @@ def parser() -> argparse.ArgumentParser:
     nothing = "example:\n  thirdhand via-points "
     a = actions.add_parser(
         "add", help="teach via-points, all or nothing", formatter_class=FORMATTER,
-        epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .62 -.28 .30 "
+        epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
         "--radius .03 --follow left --std .001",
     )  # fmt: skip
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")

@@ -48,6 +48,7 @@ class Flag(enum.IntFlag):
     TARGET_CLAMPED = 1
     SPEED_LIMITED = 2
     NEAR_JOINT_LIMIT = 4
+    SEPARATION = 8  # a hand, the table, a thing or the arm itself is near
 
 
 class Cause(enum.IntEnum):
@@ -99,6 +100,8 @@ FRAME = (
     Field("joints", "float64", (PER_JOINT,)),  # the command [rad]
     Field("joint_velocities", "float64", (PER_JOINT,)),
     Field("joint_accelerations", "float64", (PER_JOINT,)),
+    Field("hand_distance", "float64"),  # from the nearest hand to the arm, before this tick's motion; 3 at most [m]
+    Field("hand_limit", "float64"),  # least speed toward a hand that is allowed at some part of the arm [m/s]
     Field("hand_ages", "int32", (2,)),  # ticks since the newest sample; -1: none yet
     Field("rejected", "uint32", (len(Cause),)),
     Field("mode", "uint8"),

@@ -137,6 +137,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     places: tuple[str, ...]
     rejected: dict[str, int]
     hand_age_ms: dict[str, float]
+    hand_distance_m: float  # of the nearest hand from the arm; 3 at most, and where none is seen
+    hand_limit_m_s: float  # least speed toward a hand that is allowed at some part of the arm
     lateness_us: Percentiles
     work_us: Percentiles
     latency_ms: Percentiles  # hand stamp to command published; tells of clocks too, where they are not one

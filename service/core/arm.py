@@ -16,8 +16,9 @@ import pinocchio as pin
 
 from service.config import Settings
 from service.core.frame import Vector
-from service.core.inverse_kinematics import NEAR, SPEED, joint_costs, joint_step, tool_speeds, tool_tasks
+from service.core.inverse_kinematics import APART, NEAR, SPEED, joint_costs, joint_step, tool_speeds, tool_tasks
 from service.core.limiter import MARGIN, approach_gain
+from service.core.separation import Separation
 
 # As those of `inverse_kinematics` chosen on the WAM, and tried on a Panda and a UR5.
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large one's
@@ -33,12 +34,13 @@ class Solution(NamedTuple):
     """Joint velocities (J,) [rad/s].
 
     Whether they were scaled down to the speed limits; whether a joint is within 0.1 rad of a
-    position limit.
+    position limit; whether something is so near that they are others for it.
     """
 
     velocity: Vector
     speed_limited: bool
     near_limit: bool
+    apart: bool
 
 
 class Closing(NamedTuple):
@@ -55,7 +57,7 @@ class Kinematics(NamedTuple):
     """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
 
     The tasks (5, J): the tool's velocity by the joints', and what turns its direction, times
-    DIRECTION_LEVER; their damping [m²].
+    DIRECTION_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
     """
 
     joints: Vector
@@ -63,6 +65,7 @@ class Kinematics(NamedTuple):
     rotation: Vector
     tasks: Vector
     damping: float
+    jacobian: Vector
 
 
 class Arm:
@@ -88,6 +91,7 @@ class Arm:
         limits = settings.joints
         self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
         self._velocity = np.array(limits.velocity)
+        self._nothing, self._none = np.empty((0, len(limits.velocity))), np.empty(0)
         self._jerk = np.array(limits.jerk)
         self._gain = approach_gain(limits)
         self._posture = np.array(settings.arm.posture)
@@ -104,8 +108,9 @@ class Arm:
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
         rotation, tasks = placement.rotation.copy(), np.empty((5, len(q)))
-        damping = tool_tasks(np.ascontiguousarray(jacobian), rotation, tasks)
-        return Kinematics(q, placement.translation.copy(), rotation, tasks, damping)
+        jacobian = np.ascontiguousarray(jacobian)
+        damping = tool_tasks(jacobian, rotation, tasks)
+        return Kinematics(q, placement.translation.copy(), rotation, tasks, damping, jacobian)
 
     def costs(self, here: Kinematics) -> Vector:
         """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
@@ -124,14 +129,22 @@ class Arm:
         return found
 
     def step(
-        self, q: Vector, position: Vector, velocity: Vector, direction: Vector, here: Kinematics | None = None
+        self,
+        q: Vector,
+        position: Vector,
+        velocity: Vector,
+        direction: Vector,
+        *,
+        here: Kinematics | None = None,
+        apart: Separation | None = None,
     ) -> Solution:
         """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
         `velocity` (3,) [m/s].
 
         The tool's +z turns to `direction` (3,), at any angle about it. Position goes before
-        direction, both before the posture. `here` is the arm at q, where that is known. Never
-        raises nor returns NaN for finite arguments.
+        direction, both before the posture. `here` is the arm at q, where that is known; `apart` has
+        looked at it and says what goes before all. Never raises nor returns NaN for finite
+        arguments.
         """
         here = self.at(q) if here is None else here
         out = np.empty(len(here.joints))
@@ -150,10 +163,13 @@ class Arm:
             self._scale,
             self._velocity,
             self._closing,
+            self._nothing if apart is None else apart.rows,
+            self._none if apart is None else apart.plan,
+            0 if apart is None else apart.count,
             out,
         )
         out.setflags(write=False)
-        return Solution(out, bool(said & SPEED), bool(said & NEAR))
+        return Solution(out, bool(said & SPEED), bool(said & NEAR), bool(said & APART))
 
 
 def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:

@@ -37,8 +37,9 @@ from service.core.frame import (
 )
 from service.core.intake import Intake, rest_ticks
 from service.core.inverse_kinematics import measured_error, slow_down
-from service.core.limiter import Limiter
+from service.core.limiter import Limited, Limiter
 from service.core.rotation import rotation
+from service.core.separation import Separation
 from service.core.setpoint import WRONG, SetpointGenerator
 from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp
@@ -53,6 +54,7 @@ HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 FAR, CONTESTED = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 NOT_READY = int(Reason.ARM_NOT_READY)
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
+APART = int(Flag.SEPARATION)
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
@@ -84,6 +86,10 @@ class Controller:
         self._setpoint = SetpointGenerator(settings)
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
+        self._jerk = np.array(settings.joints.jerk)
+        self._still = np.zeros(len(self._jerk))
+        self._apart = Separation(settings, urdf)
+        self._apart.expect(skill.via_points)
         self._direction = rotation(tuple(skill.orientation))[:, 2]
         self._orientation = np.ascontiguousarray(skill.orientation)
         self._nothing = np.zeros((3, 3))
@@ -120,23 +126,25 @@ class Controller:
         self._decide(prediction)
         flags = 0
         joints, moving = state["joints"], self._is_moving()
+        here = self._arm_at(joints[0])
+        self._apart.look(state, here.joints, here.position, here.jacobian)
         if state["mode"] == FOLLOW and target is not None:
-            here = self._arm_at(joints[0])
             met = self._lead(target, here)
             lap("setpoint")
             setpoint = state["setpoint"]
-            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here)
+            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here=here, apart=self._apart)
             lap("arm")
-            limited = self._move(wanted.velocity)
+            limited, stopped = self._move(wanted.velocity)
             flags |= CLAMPED * target.clamped
             flags |= LIMITED * (met or wanted.speed_limited or limited)
             flags |= NEAR_LIMIT * wanted.near_limit
+            flags |= APART * (wanted.apart or stopped)
         else:
             inwards = self._inwards()
             if inwards is None:
-                state["joints"] = self._limiter.stop(joints[0], joints[1], joints[2])[:3]
+                state["joints"] = self._brake()[:3]
             else:
-                state["joints"] = self._limiter.step(joints[0], joints[1], joints[2], inwards)[:3]
+                self._move(inwards)
             self._setpoint.begin(state, self._at_rest())
         lap("limiter")
         return self._frame(prediction, target, flags, moving=moving)
@@ -171,6 +179,7 @@ class Controller:
         self._orientation = np.ascontiguousarray(skill.orientation)
         self._state["skill"] = np.frombuffer(skill.digest, np.uint8)
         self._state["covariance"] = 0.0
+        self._apart.expect(skill.via_points)
 
     def _predict(self) -> Prediction | None:
         """The prediction, if both hands are known.
@@ -269,29 +278,46 @@ class Controller:
     def _lead(self, target: Target, here: Kinematics) -> bool:
         """Moves the setpoint on; whether a limit was met. One that passes a bound is a fault."""
         state, box = self._state, self._skill.workspace
-        slow = slow_down(state["setpoint"], here.position)
+        slow = slow_down(state["setpoint"], here.position, self._apart.told[2], self._settings.tool.max_speed)
         met = self._setpoint.step(state, target, box, self._arm.costs(here), slow)
         if met == WRONG:
             state["mode"], state["reason"] = FAULT, Reason.SETPOINT
         return bool(met)
 
-    def _move(self, wanted: Vector) -> bool:
+    def _move(self, wanted: Vector) -> tuple[bool, bool]:
         """Moves the joints on toward wanted velocities (J,) [rad/s]; whether a limit kept them from
-        those.
+        those, and whether it was that of separation.
 
-        They brake where the tool would pass its greatest speed; one that does all the same is a
-        fault.
+        They brake where the tool would pass its greatest speed, and one that does all the same is a
+        fault; and where they would approach something too fast, unless that brakes less.
         """
         state, fastest = self._state, self._settings.tool.max_speed
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted)
-        limited = moved.limited
+        limited, excess = moved.limited, self._apart.excess(*moved[1:3], self._jerk)
+        stopped = excess > 0.0
+        if stopped:
+            stop = self._limiter.stop(q, dq, ddq)
+            stopped = self._apart.excess(*stop[1:3], self._jerk) < excess
+            moved, limited = (stop, True) if stopped else (moved, limited)
         if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0] > fastest:
                 state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
-        return limited
+        return limited, stopped
+
+    def _brake(self) -> Limited:
+        """The joints one period on their way to rest, together; or each as it can, where that
+        approaches things less.
+        """
+        q, dq, ddq = self._state["joints"]
+        stop = self._limiter.stop(q, dq, ddq)
+        excess = self._apart.excess(*stop[1:3], self._jerk)
+        if excess <= 0.0:
+            return stop
+        other = self._limiter.step(q, dq, ddq, self._still)
+        return other if self._apart.excess(*other[1:3], self._jerk) < excess else stop
 
     def _arm_at(self, joints: Vector) -> Kinematics:
         """The arm at joints (J,) [rad]; asked again for the same ones, it is not computed again."""
@@ -321,6 +347,7 @@ class Controller:
             target.acceleration if target else self._nothing[0],
             prediction.covariance if prediction else self._nothing,
             prediction.deviation if prediction else 0.0,
+            self._apart.told,
         )
         frame["flags"] = flags
         frame["commanded"] = moving or (state["arm_ready"] and state["mode"] != FAULT)

@@ -148,6 +148,7 @@ def fill(
     acceleration: Vector,
     covariance: Vector,
     deviation: float,
+    told: Vector,
 ) -> None:
     """Into the memory of a blank frame what the state's memory holds, and what was predicted."""
     frame, state = frames[0], states[0]
@@ -169,3 +170,4 @@ def fill(
     frame.joints[:], frame.joint_velocities[:] = state.joints[0], state.joints[1]
     frame.joint_accelerations[:] = state.joints[2]
     frame.rejected[:] = state.rejected
+    frame.hand_distance, frame.hand_limit = told[0], told[1]

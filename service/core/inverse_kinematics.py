@@ -13,6 +13,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Vector
+from service.core.least_squares import TASKS, factorise, keep_under, least_squares, substitute
 
 # Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.
 NEAR_LIMIT = 0.1  # [rad]
@@ -28,12 +29,9 @@ SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
 SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the table
 FAR_SPEED = 0.15  # [m/s]
 GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
-TASKS = 5  # three of the tool's velocity, two of its direction
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
-LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
-BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
 STEPS = 1e9  # [s/rad] of the result: rounded so that a replay on another kind of CPU agrees
-SPEED, NEAR = 1, 2  # what a step says: the joints' speed is limited; one is near its position limit
+SPEED, NEAR, APART = 1, 2, 4  # what a step says: a limit of speed met; of position near; of separation met
 
 
 @compiled
@@ -53,16 +51,20 @@ def measured_error(q: Vector, tasks: Vector, measured: Vector, velocities: Vecto
 
 
 @compiled
-def slow_down(setpoint: Vector, tool: Vector) -> float:
-    """Share of its speed for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1 where it comes
-    back.
+def slow_down(setpoint: Vector, tool: Vector, share: float, fastest: float) -> float:
+    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
+    where it comes back; and for one that may keep only a share of its own speed.
     """
     along = gap = 0.0
     for i in range(3):
         ahead = setpoint[0, i] - tool[i]
         along += ahead * setpoint[1, i]
         gap += ahead * ahead
-    return 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
+    if share < 1.0:
+        speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
+        slow = min(slow, share * speed / fastest)
+    return slow
 
 
 @compiled
@@ -109,43 +111,17 @@ def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> N
     limits (3, J).
     """
     root, right = np.empty((TASKS, TASKS)), np.empty(TASKS)
-    _factorise(tasks, damping, root)
+    factorise(tasks, damping, root)
     for axis in range(3):
         right[:] = 0.0
         right[axis] = 1.0
-        _substitute(root, right)
+        substitute(root, right)
         for joint in range(tasks.shape[1]):
             speed = 0.0
             for i in range(TASKS):
                 speed += tasks[i, joint] * right[i]
             for order in range(3):
                 out[order, axis, joint] = speed / limits[order, joint]
-
-
-@compiled
-def _factorise(tasks: Vector, damping: float, root: Vector) -> None:
-    """The lower Cholesky factor of tasks tasks^T + damping I."""
-    for i in range(TASKS):
-        for j in range(i + 1):
-            total = damping if i == j else 0.0
-            for k in range(tasks.shape[1]):
-                total += tasks[i, k] * tasks[j, k]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            root[i, j] = math.sqrt(max(total, LEAST_SQUARE)) if i == j else total / root[j, j]
-
-
-@compiled
-def _substitute(root: Vector, right: Vector) -> None:
-    """Solves the equations of a Cholesky factor, in place."""
-    for i in range(TASKS):
-        for k in range(i):
-            right[i] -= root[i, k] * right[k]
-        right[i] /= root[i, i]
-    for i in range(TASKS - 1, -1, -1):
-        for k in range(i + 1, TASKS):
-            right[i] -= root[k, i] * right[k]
-        right[i] /= root[i, i]
 
 
 @compiled
@@ -194,9 +170,14 @@ def joint_step(
     scale: Vector,
     fastest: Vector,
     closing: Vector,
+    rows: Vector,
+    limits: Vector,
+    count: int,
     out: Vector,
 ) -> int:
-    """`Arm.step` into out (J,) [rad/s]; what is to be said of it."""
+    """`Arm.step` into out (J,) [rad/s], with the first `count` of rows (K, J) times out at most
+    limits (K,) [m/s]; what is to be said of it.
+    """
     joints = len(q)
     period, braking, closing_speed, far_damping, most = closing
     wanted, error, linear, turn = np.empty(TASKS), np.empty(3), np.empty(3), np.empty(3)
@@ -234,6 +215,12 @@ def joint_step(
         for i in range(TASKS):
             scaled[i, j] = tasks[i, j] * scale[j]
     least_squares(scaled, wanted, home, damping, bounds, out)
+    scaled_rows = np.empty((count, joints))
+    for k in range(count):
+        for j in range(joints):
+            scaled_rows[k, j] = rows[k, j] * scale[j]
+    if keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, out):
+        said |= APART
     excess = 0.0
     for j in range(joints):
         out[j] *= scale[j]
@@ -267,79 +254,3 @@ def _turn(rotation: Vector, direction: Vector, out: Vector) -> None:
         return  # there already, or exactly opposite, where no way is nearer
     speed = min(DIRECTION_GAIN * math.atan2(sine, cosine), DIRECTION_SPEED) / sine
     out[0], out[1], out[2] = speed * x, speed * y, speed * z
-
-
-@compiled
-def least_squares(
-    tasks: Vector, wanted: Vector, posture: Vector, damping: float, bounds: Vector, result: Vector
-) -> None:
-    """Into result the x (J,) in bounds (2, J) with least |tasks x - wanted|² + damping |x -
-    posture|², by an active-set method.
-    """
-    joints = len(posture)
-    free, best = np.ones(joints), np.empty(joints)
-    _solve(tasks, wanted, posture, damping, free, posture, result)
-    inside = True
-    for j in range(joints):
-        if not bounds[0, j] <= result[j] <= bounds[1, j]:
-            inside, free[j] = False, 0.0
-            result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
-    if inside:
-        return
-    rest = np.empty(TASKS)
-    for _ in range(BOUND_ROUNDS):
-        _solve(tasks, wanted, posture, damping, free, result, best)
-        blocked, least = -1, 1.0
-        for j in range(joints):
-            step = best[j] - result[j]
-            if step != 0.0:
-                fraction = ((bounds[1, j] if step > 0.0 else bounds[0, j]) - result[j]) / step
-                if fraction < least:
-                    blocked, least = j, fraction
-        for j in range(joints):
-            result[j] += least * (best[j] - result[j])
-        if blocked >= 0:
-            for j in range(joints):
-                result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
-            free[blocked] = 0.0
-            continue
-        result[:] = best
-        for i in range(TASKS):
-            rest[i] = -wanted[i]
-            for j in range(joints):
-                rest[i] += tasks[i, j] * result[j]
-        leaving, most = -1, LEAST_GAIN  # the bound whose inside is better by most
-        for j in range(joints):
-            if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
-                continue
-            slope = damping * (result[j] - posture[j])
-            for i in range(TASKS):
-                slope += tasks[i, j] * rest[i]
-            gained = slope if result[j] >= bounds[1, j] else -slope
-            if gained > most:
-                leaving, most = j, gained
-        if leaving < 0:
-            return
-        free[leaving] = 1.0
-
-
-@compiled
-def _solve(
-    tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
-) -> None:
-    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of five
-    equations.
-    """
-    joints = len(posture)
-    part, root, right = np.empty((TASKS, joints)), np.empty((TASKS, TASKS)), np.empty(TASKS)
-    for i in range(TASKS):
-        right[i] = wanted[i]
-        for j in range(joints):
-            part[i, j] = tasks[i, j] * free[j]
-            right[i] -= tasks[i, j] * (posture[j] if free[j] > 0.0 else held[j])
-    _factorise(part, damping, root)
-    _substitute(root, right)
-    for j in range(joints):
-        out[j] = posture[j] if free[j] > 0.0 else held[j]
-        for i in range(TASKS):
-            out[j] += part[i, j] * right[i]

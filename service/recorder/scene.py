@@ -69,7 +69,11 @@ def blueprint(*, live: bool) -> rrb.Blueprint:
                 scene,
                 rrb.Vertical(
                     curves("/accuracy", "Target: how sure, how closely followed [mm]"),
-                    curves("/speed", "Speed [m/s]"),
+                    rrb.Tabs(
+                        curves("/speed", "Speed [m/s]"),
+                        curves("/separation", "Nearest hand: distance [m], speed allowed toward it [m/s]"),
+                        active_tab=0,
+                    ),
                     rrb.Tabs(
                         curves("/joints/velocity", "Joint velocities [rad/s]"),
                         curves("/joints/position", "Joint positions [rad]"),
@@ -159,6 +163,8 @@ def log_fixed(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, settings: Sett
         ("/speed/tool", "tool", GREEN),
         ("/speed/left", "left hand", BLUE),
         ("/speed/right", "right hand", ORANGE),
+        ("/separation/distance", "nearest hand's distance", BLUE),
+        ("/separation/limit", "speed allowed toward it", MAGENTA),
         ("/latency/hand", "hand's stamp to command", MAGENTA),
         ("/timing/lateness", "late by", ORANGE),
         ("/timing/work", "work", BLUE),
@@ -221,6 +227,10 @@ class Chunks:
             rows = np.flatnonzero(seen[:, side])
             if len(rows):
                 yield scalars(f"/speed/{name}", rows, np.linalg.norm(frames["hand_velocities"][:, side], axis=1))
+        near = np.flatnonzero(seen.any(axis=1))
+        if len(near):
+            yield scalars("/separation/distance", near, frames["hand_distance"])
+            yield scalars("/separation/limit", near, frames["hand_limit"])
         aimed = np.flatnonzero(seen.all(axis=1))
         if len(aimed):
             yield scalars("/accuracy/deviation", aimed, frames["deviation"] * 1e3)

@@ -318,6 +318,8 @@ class Daemon:
                 for side, age in zip(SIDES, frame["hand_ages"], strict=True)
                 if age >= 0
             },
+            hand_distance_m=round(float(frame["hand_distance"]), 4),
+            hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             lateness_us=self._lateness.percentiles(),
             work_us=self._work.percentiles(),
             latency_ms=self._latency.percentiles(),

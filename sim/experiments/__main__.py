@@ -19,6 +19,7 @@ ABOUT = {
     "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
     "statistics": "100 random scenes, side by side with GMR, a Gaussian process, ProMP and the paper's own numbers",
     "motion": "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
+    "separation": "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
     "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",

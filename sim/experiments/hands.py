@@ -133,7 +133,7 @@ def _draw_traces(results: Results, demonstrations: list[Demonstration], runs: di
         everything += list(runs[name])
         _trace(right, runs[name], style, width)
     right.set_title("(b) through the service: as learned (dotted), adapted (solid)", loc="left")
-    for place in (MOVED.scene.handover, MOVED.scene.glass, MOVED.scene.carry):
+    for place in (MOVED.scene.offer, MOVED.scene.glass, MOVED.scene.carry):
         right.scatter(*place, s=70, facecolors="none", edgecolors="black", linewidths=1.2)
     for axes in (left, right):
         equal_box(axes, np.concatenate(everything))

@@ -40,6 +40,7 @@ class Rehearsed:
     frames: NDArray[np.void] = field(default_factory=lambda: np.empty(0, np.void))
     time_s: Array = field(default_factory=lambda: np.empty(0))  # of the script; 0 before it begins
     hands: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # as they are, without noise [m]
+    joints: Array = field(default_factory=lambda: np.empty((0, 2, 0)))  # as measured [rad, rad/s]
     tool: Array = field(default_factory=lambda: np.empty((0, 3)))  # as measured in the simulation [m]
     axis: Array = field(default_factory=lambda: np.empty((0, 3)))  # the tool's +z, as measured
 
@@ -68,6 +69,7 @@ def rehearse(
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
+    joints: list[tuple[tuple[float, ...], ...]] = []
     tool: list[tuple[float, ...]] = []
     axes: list[tuple[float, float, float]] = []
     held = 0
@@ -81,6 +83,7 @@ def rehearse(
                 frames.append(frame)
                 times.append(bench.time_s)
                 hands.append(np.stack([seen.hands.left.position, seen.hands.right.position]))
+                joints.append((seen.joints, seen.joint_velocities))
                 tool.append(seen.tool.position)
                 x, y, z, w = seen.tool.orientation
                 axes.append((2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)))
@@ -96,7 +99,7 @@ def rehearse(
             np.array(hands),
             np.array(tool),
         )
-        result.axis = np.array(axes)
+        result.axis, result.joints = np.array(axes), np.array(joints)
     return result
 
 

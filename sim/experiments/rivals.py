@@ -185,7 +185,7 @@ def promp(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
         conditioned = learned
-        for (begin, end), place in zip(scene.dwells, (scene.handover, scene.glass, scene.carry), strict=True):
+        for (begin, end), place in zip(scene.dwells, (scene.offer, scene.glass, scene.carry), strict=True):
             conditioned = conditioned.condition_position(
                 np.array(place), EXACT_STD_M**2 * np.eye(3), t=(begin + end) / 2, t_max=lasts_s
             )

@@ -18,7 +18,7 @@ from service.core.frame import Event, Tick, order
 from service.core.outputs import outgoing
 from service.core.skill import Skill
 from service.learning.via_points import adapted
-from sim.scene import Scene
+from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 
 PERIOD_S = 0.002
@@ -70,7 +70,7 @@ def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Ski
     time_s = np.arange(len(seen)) * PERIOD_S - 1.5
     for (begin, end), goal in zip(script.scene.dwells, (None, script.scene.glass, script.scene.carry), strict=True):
         rest = seen[(time_s >= begin) & (time_s <= end)]
-        at = script.truth(begin).left.position if goal is None else np.array(goal)
+        at = script.truth(begin).left.position + TOOL_FROM_HAND if goal is None else np.array(goal)
         assert np.linalg.norm(rest["tool"] - at, axis=1).min() < 0.03
 
 

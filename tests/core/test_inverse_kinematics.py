@@ -60,6 +60,7 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
 def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
     setpoint, tool = np.zeros((3, 3)), np.zeros(3)
     setpoint[0, 0], setpoint[1, 0] = GAP_FREE + GAP_SLOW, 0.2
-    assert slow_down(setpoint, tool) == pytest.approx(0.5)
+    assert slow_down(setpoint, tool, 1.0, 0.8) == pytest.approx(0.5)
+    assert slow_down(setpoint, tool, 0.4, 0.8) == pytest.approx(0.1)  # of 0.8 m/s, where 0.08 are allowed
     setpoint[1, 0] = -0.2  # it comes back
-    assert slow_down(setpoint, tool) == 1.0
+    assert slow_down(setpoint, tool, 1.0, 0.8) == 1.0

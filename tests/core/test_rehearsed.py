@@ -16,14 +16,16 @@ from numba.core.dispatcher import Dispatcher
 from service.config import Settings, robot_description
 from kmp import compiled_query
 from service.core import (
-    frame, hand_estimator, intake, inverse_kinematics, limiter, setpoint, skill, stops, workspace
+    capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation, setpoint, skill,
+    stops, workspace,
 )
 from service.core.controller import rehearse
 from service.cli.main import main
 from sim.experiments.rehearsal import shipped
 
 MODULES = (
-    compiled_query, frame, hand_estimator, intake, inverse_kinematics, limiter, setpoint, skill, stops, workspace
+    compiled_query, capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation,
+    setpoint, skill, stops, workspace,
 )
 
 def compiled():

@@ -26,7 +26,7 @@ from service.recorder.recording import Recording
 from service.recorder.replay import replay
 
 HANDOVER = requests.ViaPoint(
-    "handover", (0.62, -0.28, 0.30), RIGHT, (0.62, -0.28, 0.30), std=0.001, radius=0.03, follow="left"
+    "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
 )
 
 

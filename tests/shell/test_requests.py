@@ -63,6 +63,8 @@ class Cell:
             "memory_locked": False,
             "rejected": {},
             "hand_age_ms": {},
+            "hand_distance_m": 3.0,
+            "hand_limit_m_s": 1.5,
             "scribe": {},
         }
         words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}

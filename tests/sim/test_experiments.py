@@ -104,6 +104,15 @@ class TestExperiments:
         assert at_six["ProMP, 10 per input"]["functions"] == 10**6
         assert at_six["ProMP, 10 per input"]["error"] is None
 
+    def test_the_arm_keeps_the_rule_of_speed_and_separation(self, tmp_path: Path) -> None:
+        found = numbers("separation", tmp_path, "--share", "0.02")
+        assert found["random"]["successes"] == found["scenes"] == 2
+        assert found["random"]["overlaps"] == 0
+        for kind in ("random", "thrust"):
+            assert found[kind]["excess_after_reaction"] < found["slip_m_per_s"] + 0.02
+            assert found[kind]["pushed_mm"] < 2
+            assert min(found[kind]["self_mm"], found[kind]["table_mm"]) > 5
+
     def test_learned_correlations_lower_the_cost_and_keep_the_via_point(self, tmp_path: Path) -> None:
         found = numbers("correlation", tmp_path)
         assert found["cost_at_last_rad"]["mean"] < found["cost_at_first_rad"]
@@ -144,6 +153,7 @@ def test_every_experiment_has_a_test() -> None:
         "motion",
         "letters",
         "promp",
+        "separation",
         "correlation",
         "hands",
         "statistics",

@@ -40,7 +40,7 @@ def test_the_three_taught_places_are_flat_neighbourhoods_and_only_the_handover_f
     assert [p.name for p in (handover, glass, soldering)] == ["handover", "glass", "soldering"]
     assert [p.follow for p in (handover, glass, soldering)] == ["left", "none", "none"]
     assert {(p.radius, p.std) for p in (handover, glass, soldering)} == {(0.03, 0.001)}
-    assert handover.left == handover.tool == scene.handover
+    assert (handover.left, handover.tool) == (scene.handover, scene.offer)
     assert handover.right == scene.right_start
     assert (glass.left, glass.right, glass.tool) == (scene.soldering, scene.iron, scene.glass)
     assert (soldering.left, soldering.right, soldering.tool) == (scene.soldering, scene.right_final, scene.carry)

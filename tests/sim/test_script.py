@@ -44,7 +44,7 @@ def test_hands_and_tool_pass_the_scenes_places_when_nothing_scatters() -> None:
     )
     np.testing.assert_allclose(
         [teacher.truth(t).position for t in ends],
-        [SCENE.robot_start, SCENE.handover, SCENE.glass, SCENE.carry],
+        [SCENE.robot_start, SCENE.offer, SCENE.glass, SCENE.carry],
         atol=1e-12,
     )
 

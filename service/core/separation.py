@@ -1,0 +1,257 @@
+"""How fast the parts of the arm may approach hands, things and each other: the speed-and-separation
+rule of ISO/TS 15066, as inequalities of the joints' velocities.
+
+A pair of parts whose points nearest to each other lie `distance` apart gives one row: the speed at
+which the arm's joints bring these together is at most what the rule allows there. What leaves has a
+negative speed and is never limited. The tool may touch a hand gently where a taught place says that
+the tool goes with that hand, while the hands are at that place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.config import Settings
+from service.contract.requests import ViaPoint
+from service.core.body import body_of
+from service.core.capsules import between_segments, nearest_to_box, place, to_box
+from service.core.frame import Record, Records, Vector, as_array
+
+FARTHEST = 3.0  # [m] no distance is told as greater
+IRRELEVANT = 1.5  # [m/s] nothing on the arm is as fast: pairs that may do this make no row
+TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
+PEOPLE_ROOM, THINGS_ROOM = 0.01, 0.005  # [m] kept more where motion is planned ...
+PLAN_SHARE = 0.8  # ... and of the braking: its ramps need that
+SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
+NEAR_PLACE = 0.02  # [m] beside a place's radius, each axis
+UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
+
+
+class Separation:
+    """What the rule says at a tick: `rows` (K, J) of which the first `count` are in force, times
+    joint velocities at most `plan` (K,) [m/s] where motion is planned and `allowed` (K,) at all.
+
+    `told` (3,): distance of the nearest hand [m], the least speed that is allowed toward one, and
+    the greatest share of the setpoint's speed at which the tool could go along.
+    """
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        people, things, table = settings.people, settings.obstacles, settings.table
+        self._body = body_of(settings, urdf)
+        moving = np.flatnonzero(self._body.links)
+        self._first = int(moving[0])
+        centre, half = np.array(table.centre), np.array([*table.half_size, 0.0])
+        boxes = [[centre - half - [0.0, 0.0, TABLE_DEPTH], centre + half]]
+        boxes += [[np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)] for b in things.boxes]
+        self._boxes = np.array(boxes)
+        direction = np.array(people.toward_elbow)
+        self._hand = np.array([people.radius, *(people.length / np.linalg.norm(direction) * direction)])
+        reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
+        self._people = np.array(
+            [people.brake, reaction_s, people.clearance, people.contact_speed, people.unknown_speed]
+        )
+        self._things = np.array([things.brake, things.reaction_ms / 1000, things.clearance])
+        count, joints = len(self._body.links), len(settings.joints.names)
+        most = 2 * count + 3 * count * len(boxes) + len(self._body.pairs)
+        self.rows, self.plan, self.allowed = np.zeros((most, joints)), np.zeros(most), np.zeros(most)
+        self.told, self.count = np.array([FARTHEST, IRRELEVANT, 1.0]), 0
+        self._placed = np.zeros((count, 2, 3))
+        self._contacts = np.empty((0, 8))
+
+    def expect(self, places: Iterable[ViaPoint]) -> None:
+        """From now on the tool may touch a hand at those of the taught places where it goes with
+        that hand.
+        """
+        found = [[*p.left, *p.right, p.radius, ("left", "right").index(p.follow)] for p in places if p.follow != "none"]
+        self._contacts = np.array(found).reshape(-1, 8)
+
+    def look(self, state: Record, q: Vector, tool: Vector, jacobian: Vector) -> None:
+        """Finds what the rule says at joints q (J,) [rad], where the tool is at `tool` (3,) [m] and
+        has this Jacobian (6, J), for the state's hands.
+        """
+        self.count = _look(
+            as_array(state),
+            q,
+            tool,
+            jacobian,
+            *self._body,
+            self._first,
+            self._boxes,
+            self._hand,
+            self._people,
+            self._things,
+            self._contacts,
+            self._placed,
+            self.rows,
+            self.plan,
+            self.allowed,
+            self.told,
+        )
+
+    def excess(self, velocity: Vector, acceleration: Vector, jerk: Vector) -> float:
+        """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
+        as their acceleration comes to 0 with this jerk; at most 0 if they do not.
+        """
+        return float(_excess(self.rows, self.allowed, self.count, velocity, acceleration, jerk))
+
+
+@compiled
+def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
+    """Speed [m/s] toward something `distance` [m] away that comes at `hand_speed` [m/s] all the
+    time, from which a stop that begins a reaction time [s] late and brakes so [m/s²] ends
+    `clearance` away.
+    """
+    square = hand_speed**2 + (brake * reaction) ** 2 + 2.0 * brake * (distance - clearance)
+    return max(0.0, math.sqrt(max(square, 0.0)) - brake * reaction - hand_speed)
+
+
+@compiled
+def _look(
+    states: Records,
+    q: Vector,
+    tool: Vector,
+    jacobian: Vector,
+    frames: Vector,
+    axes: Vector,
+    links: Vector,
+    ends: Vector,
+    radii: Vector,
+    pairs: Vector,
+    first: int,
+    boxes: Vector,
+    hand: Vector,
+    people: Vector,
+    things: Vector,
+    contacts: Vector,
+    placed: Vector,
+    rows: Vector,
+    plan: Vector,
+    allowed: Vector,
+    told: Vector,
+) -> int:
+    """`Separation.look`: rows that were found."""
+    state, near, forearm, count = states[0], np.empty(9), np.empty((2, 3)), 0
+    place(q, frames, axes, links, ends, placed)
+    told[0], told[1], told[2] = FARTHEST, IRRELEVANT, 1.0
+    for side in range(2):
+        if state.hand_ticks[side] < 0:
+            continue
+        for i in range(3):
+            forearm[0, i] = state.hands[side, 0, i]
+            forearm[1, i] = forearm[0, i] + hand[1 + i]
+        variance = 0.0
+        for mode in range(state.modes.shape[1]):
+            variance += state.modes[side, mode] * state.covariances[side, mode, 1, 1]
+        receives = _receives(contacts, state.hands, side)
+        for capsule in range(first, len(links)):
+            distance = between_segments(placed[capsule], forearm, near) - radii[capsule] - hand[0]
+            coming = 0.0
+            for i in range(3):
+                coming -= near[6 + i] * state.hands[side, 1, i]
+            coming = people[4] if variance > UNSURE * UNSURE else max(coming, 0.0)
+            least = people[3] if receives and links[capsule] == len(q) else 0.0
+            most = max(least, allowed_speed(distance, coming, people[0], people[1], people[2]))
+            told[0], told[1] = min(told[0], distance), min(told[1], most)
+            if _add(near, distance, coming, least, people, PEOPLE_ROOM, plan, allowed, count):
+                _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                if links[capsule] == len(q):
+                    told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
+                count += 1
+    for capsule in range(first, len(links)):
+        for box in range(len(boxes)):
+            inner = nearest_to_box(placed[capsule], boxes[box])
+            for where in range(3):  # the ends too: a capsule that lies along a face may tip
+                share = inner if where == 0 else where - 1.0
+                distance = to_box(placed[capsule], share, boxes[box], near) - radii[capsule]
+                known = where > 0 and share == inner
+                if not known and _add(near, distance, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
+                    _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                    if links[capsule] == len(q):
+                        told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
+                    count += 1
+    for pair in range(len(pairs)):
+        one, other = pairs[pair, 0], pairs[pair, 1]
+        distance = between_segments(placed[one], placed[other], near) - radii[one] - radii[other]
+        if _add(near, distance, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
+            _bring_together(rows[count], near, 0, tool, jacobian, links[one], 1.0)
+            _bring_together(rows[count], near, 3, tool, jacobian, links[other], -1.0)
+            count += 1
+    return count
+
+
+@compiled
+def _share(near: Vector, limit: float, velocity: Vector) -> float:
+    """How much of a velocity (3,) stays under a limit along the normal."""
+    along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    return limit / along if along > limit else 1.0
+
+
+@compiled
+def _receives(contacts: Vector, hands: Vector, side: int) -> bool:
+    """Whether the hands are at a taught place where the tool goes with this one."""
+    for at in range(len(contacts)):
+        if contacts[at, 7] == side:
+            far = 0.0
+            for hand in range(2):
+                for i in range(3):
+                    far = max(far, abs(hands[hand, 0, i] - contacts[at, 3 * hand + i]))
+            if far <= contacts[at, 6] + NEAR_PLACE:
+                return True
+    return False
+
+
+@compiled
+def _add(
+    near: Vector,
+    distance: float,
+    coming: float,
+    least: float,
+    rule: Vector,
+    room: float,
+    plan: Vector,
+    allowed: Vector,
+    count: int,
+) -> bool:
+    """Writes the limits of a pair, but at least `least`, behind `count` others; not if nothing can
+    be so fast, and then false.
+    """
+    planned = allowed_speed(distance, coming, PLAN_SHARE * rule[0], rule[1], rule[2] + room)
+    if planned >= IRRELEVANT:
+        return False
+    plan[count] = max(PLAN_SHARE * least, planned)
+    allowed[count] = max(least, allowed_speed(distance, coming, rule[0], rule[1], rule[2])) + SLIP
+    return True
+
+
+@compiled
+def _bring_together(row: Vector, near: Vector, at: int, tool: Vector, jacobian: Vector, link: int, sign: float) -> None:
+    """Adds to row (J,) the speed along the normal, times the sign, of the point near[at:at + 3] of
+    a link that the first joints move.
+    """
+    if sign > 0.0:
+        row[:] = 0.0
+    x, y, z = near[at] - tool[0], near[at + 1] - tool[1], near[at + 2] - tool[2]
+    n0, n1, n2 = near[6], near[7], near[8]
+    for j in range(link):
+        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        speed = n0 * (jacobian[0, j] + wy * z - wz * y)
+        speed += n1 * (jacobian[1, j] + wz * x - wx * z)
+        speed += n2 * (jacobian[2, j] + wx * y - wy * x)
+        row[j] += sign * speed
+
+
+@compiled
+def _excess(rows: Vector, allowed: Vector, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> float:
+    """`Separation.excess`."""
+    most = -IRRELEVANT
+    for k in range(count):
+        now = crest = 0.0
+        for j in range(len(dq)):
+            now += rows[k, j] * dq[j]
+            crest += rows[k, j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
+        most = max(most, max(now, crest) - allowed[k])
+    return most

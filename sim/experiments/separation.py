@@ -1,0 +1,313 @@
+"""How near the arm comes to hands, and how fast:
+
+random scenes in closed loop, and others in which a hand is thrust in the way, judged from outside:
+joints as the simulation measures them, hands as they are.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import rerun as rr
+from scipy.ndimage import maximum_filter1d
+
+from kmp.compiled import compiled
+from service.config import Settings, robot_description
+from service.contract.records import Flag
+from service.core.body import body_of
+from service.core.capsules import between_segments, place
+from service.core.separation import SLIP, Separation, allowed_speed
+from sim.bench import Bench, TaskEvents
+from sim.experiments import rivals
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse, shipped
+from sim.experiments.results import ADAPTED, OTHER, REFERENCE, Array, Options, Results, pyplot
+from sim.experiments.scenes import OFFSET_M, Drawn, draw
+from sim.script import HandMotions, HandScript, Motion, Teacher
+
+SCENES, RATE_HZ = 100, 250  # half the rate, to save time
+KINDS = ("random", "thrust", "unheeded")
+REACH_S, STAY_S = (0.35, 0.7), 0.6  # of a thrust
+AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
+CLEARANCE_TICKS, WITHIN_M = 5, 0.3
+SHOWN_M, STEP_S = 0.3, 1e-6
+HURRY = 0.05  # [m/s] by which a hand is faster than was assumed
+UNHEEDED_EVERY = 4  # scenes: only to tell what it costs to heed anyone
+
+
+class ThrustScript(HandScript):
+    """Hands of a random scene; one is thrust in the tool's way once, stays, and goes back."""
+
+    def __init__(self, drawn: Drawn) -> None:
+        super().__init__(
+            drawn.scene, seed=drawn.seed, speed=drawn.speed, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M
+        )
+        random = np.random.default_rng([drawn.seed, 7])
+        teacher = Teacher(drawn.scene, seed=drawn.seed, clock=self.clock)
+        self.side, self.lasts_s = int(random.integers(2)), float(random.uniform(*REACH_S))
+        while True:
+            self.at_s = float(random.uniform(0.5, self.duration_s - 1.0))
+            here = teacher.truth(self.at_s).position
+            way = [teacher.truth(t).position for t in self.at_s + np.arange(0.0, 1.5, 0.02)]
+            ahead = [at for at in way if np.linalg.norm(at - here) >= AHEAD_M]
+            if ahead:
+                self._place = ahead[0]
+                break
+
+    def truth(self, t: float) -> HandMotions:
+        """Both hands' motion, the thrust included."""
+        hands = list(super().truth(t))
+        begin = (t - self.at_s) / self.lasts_s
+        back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
+        share, rate = (a - b for a, b in zip(_reach(begin), _reach(back), strict=True))
+        motion, way = hands[self.side], self._place - hands[self.side].position
+        hands[self.side] = Motion(
+            motion.position + share * way,
+            (1.0 - share) * motion.velocity + rate / self.lasts_s * way,
+            motion.acceleration,
+        )
+        return HandMotions(*hands)
+
+
+def _reach(u: float) -> tuple[float, float]:
+    """A minimum-jerk step from 0 to 1 for u in [0, 1], and its derivative."""
+    u = min(max(u, 0.0), 1.0)
+    return u**3 * (10 - 15 * u + 6 * u * u), 30 * (u * (1 - u)) ** 2
+
+
+class Outcome(NamedTuple):
+    """One run. Ticks at which the tool offers the board to the left hand are judged by the speed
+    for contact, as the service does.
+    """
+
+    kind: str
+    number: int
+    success: bool
+    errors_mm: tuple[float, float, float]
+    times_s: tuple[float, float, float]  # of the events
+    closest_mm: float  # of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    pushed_mm: float  # that a part of the arm went toward a hand that it touched
+    excess_at_once: float  # [m/s] over the rule, the most
+    excess_after_reaction: float  # over the most that the rule allowed within the reaction time
+    excess_hurried: float  # the same at hands that were faster meanwhile than the rule had assumed
+    fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
+    limited_s: float  # in which separation held the arm back
+    self_mm: float  # nearest that links come to each other, which are kept apart
+    table_mm: float
+    near: Array  # (N, 2): distance [m] and speed [m/s] of the pair nearest to its limit, some ticks
+
+
+def run_one(task: tuple[str, int]) -> Outcome:
+    """What became of one scene."""
+    kind, number = task
+    drawn = draw(number)
+    script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
+    nearest: list[tuple[float, float]] = []
+
+    def look(bench: Bench) -> None:
+        if bench.tick % CLEARANCE_TICKS == 0:
+            world = bench.world
+            nearest.append(
+                (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
+            )
+
+    skill_for = rivals.ours(shipped())(drawn.scene)
+    if kind == "unheeded":
+        with patch.object(Separation, "look"):
+            done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
+    else:
+        done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
+    return _judged(kind, number, drawn, done, nearest)
+
+
+def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list[tuple[float, float]]) -> Outcome:
+    settings = Settings()
+    people, body, dt = settings.people, body_of(settings, robot_description(settings)), 1 / RATE_HZ
+    velocities = np.gradient(done.hands, dt, axis=0)
+    moving = int(np.flatnonzero(body.links)[0])
+    count = len(body.links) - moving
+    distance, speed, coming = (np.empty((len(done.hands), 2, count)) for _ in range(3))
+    own, table = np.empty(len(done.hands)), np.empty(len(done.hands))
+    forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
+    _measure(
+        done.joints[:, 0], done.joints[:, 1], done.hands, velocities, *body, moving, people.radius, forearm,
+        settings.table.centre[2], distance, speed, coming, own, table,
+    )  # fmt: skip
+    reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
+    allowed = np.empty_like(distance)
+    _allow(distance, coming, people.brake, reaction_s, people.clearance, allowed)
+    offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
+    tool = body.links[moving:] == len(settings.joints.names)
+    allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
+    half = round(0.5 * reaction_s / dt)
+    lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
+    assumed = hurried <= _later_by(2 * half, coming) + HURRY
+    over = speed - lately
+    began = np.flatnonzero(done.time_s > 0)
+    pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
+    worst = np.argmax((speed - allowed).reshape(len(speed), -1), axis=1)
+    rows = np.arange(len(speed))
+    picked = np.stack([x.reshape(len(x), -1)[rows, worst] for x in (distance, speed)], axis=1)
+    return Outcome(
+        kind,
+        number,
+        done.events.success,
+        done.errors_mm,
+        tuple(getattr(done.events, name).time_s for name in TaskEvents.__struct_fields__),
+        1000 * min(map(min, nearest)),
+        1000 * float(pushed.max()),
+        float((speed - allowed)[began].max()),
+        float(np.where(assumed, over, -1.0)[began].max()),
+        float(np.where(assumed, -1.0, over)[began].max()),
+        float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
+        float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
+        1000 * float(own.min()),
+        1000 * float(table.min()),
+        picked[began][::10],
+    )
+
+
+def _later_by(ticks: int, values: Array) -> Array:
+    """Values (T, ...) so many ticks later, the first ones repeated."""
+    return np.concatenate([np.repeat(values[:1], ticks, axis=0), values])[: len(values)]
+
+
+@compiled
+def _measure(
+    q: Array, dq: Array, hands: Array, velocities: Array, frames: Array, axes: Array, links: Array, ends: Array,
+    radii: Array, pairs: Array, moving: int, radius: float, forearm: Array, top: float, distance: Array, speed: Array,
+    coming: Array, own: Array, table: Array,
+) -> None:  # fmt: skip
+    """Of each capsule and each hand (T, 2, N) the distance, how fast the capsule's nearest point
+    comes, and how fast the hand does; the least distances (T,) of links, and of links and table.
+    """
+    here, then, near, arm = np.empty((len(links), 2, 3)), np.empty((len(links), 2, 3)), np.empty(9), np.empty((2, 3))
+    for t in range(len(q)):
+        place(q[t], frames, axes, links, ends, here)
+        place(q[t] + STEP_S * dq[t], frames, axes, links, ends, then)
+        own[t] = table[t] = 1.0
+        for pair in range(len(pairs)):
+            one, other = pairs[pair, 0], pairs[pair, 1]
+            apart = between_segments(here[one], here[other], near) - radii[one] - radii[other]
+            own[t] = min(own[t], apart)
+        for c in range(moving, len(links)):
+            if max(here[c, 0, 0], here[c, 1, 0]) > 0.35:
+                table[t] = min(table[t], min(here[c, 0, 2], here[c, 1, 2]) - radii[c] - top)
+            for side in range(2):
+                arm[0] = hands[t, side]
+                arm[1] = arm[0] + forearm
+                distance[t, side, c - moving] = between_segments(here[c], arm, near) - radii[c] - radius
+                long = whole = along = hand = 0.0
+                for i in range(3):
+                    way = here[c, 1, i] - here[c, 0, i]
+                    whole += way * way
+                    long += way * (near[i] - here[c, 0, i])
+                share = long / whole if whole > 0.0 else 0.0
+                for i in range(3):
+                    first, second = then[c, 0, i] - here[c, 0, i], then[c, 1, i] - here[c, 1, i]
+                    along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
+                    hand -= near[6 + i] * velocities[t, side, i]
+                speed[t, side, c - moving], coming[t, side, c - moving] = along, max(hand, 0.0)
+
+
+@compiled
+def _allow(distance: Array, coming: Array, brake: float, reaction: float, clearance: float, out: Array) -> None:
+    for t in range(distance.shape[0]):
+        for side in range(2):
+            for c in range(distance.shape[2]):
+                out[t, side, c] = allowed_speed(distance[t, side, c], coming[t, side, c], brake, reaction, clearance)
+
+
+def outcomes(tasks: list[tuple[str, int]], workers: int) -> Iterator[Outcome]:
+    """What became of them, in order."""
+    if workers == 1:
+        yield from map(run_one, tasks)
+        return
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(run_one, tasks)
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    count = max(1, round(SCENES * options.share))
+    found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
+    tasks = [(kind, n) for n in range(count) for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+    for one in outcomes(tasks, options.workers):
+        found[one.kind].append(one)
+        if len(found[one.kind]) % max(1, count // 5) == 0:
+            results.say(f"{one.kind}: {_summary(found[one.kind])}")
+    _draw(results, found)
+    _record(results, found)
+    return {
+        "scenes": count,
+        "rate_hz": RATE_HZ,
+        "slip_m_per_s": SLIP,
+        **{kind: _summary(rows) for kind, rows in found.items()},
+        "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
+        "worst_scene": {
+            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
+        },
+        "failed_scenes": {kind: [one.number for one in rows if not one.success] for kind, rows in found.items()},
+    }
+
+
+def _summary(rows: list[Outcome]) -> dict[str, Any]:
+    closest = np.array([one.closest_mm for one in rows])
+    return {
+        "successes": sum(one.success for one in rows),
+        "closest_mm": {"least": closest.min(), "median": float(np.median(closest))},
+        "overlaps": int((closest < 0).sum()),
+        "pushed_mm": max(one.pushed_mm for one in rows),
+        "excess_at_once": max(one.excess_at_once for one in rows),
+        "excess_after_reaction": max(one.excess_after_reaction for one in rows),
+        "excess_hurried": max(one.excess_hurried for one in rows),
+        "above_after_reaction": sum(one.excess_after_reaction > SLIP for one in rows),
+        "fastest_hand": max(one.fastest_hand for one in rows),
+        "limited_s": float(np.mean([one.limited_s for one in rows])),
+        "self_mm": min(one.self_mm for one in rows),
+        "table_mm": min(one.table_mm for one in rows),
+    }
+
+
+def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
+    """By how much the events come later than if nobody were heeded [s]."""
+    late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
+    return {
+        name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())}
+        for i, name in enumerate(TaskEvents.__struct_fields__)
+    }
+
+
+def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
+    plt, people = pyplot(), Settings().people
+    reaction_s = (Settings().hands.stale_ms + people.reaction_ms) / 1000
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), sharey=True)
+    titles = ("random scenes", "a hand thrust in the way", "random scenes, nobody heeded")
+    colours = (OTHER, ADAPTED, REFERENCE)
+    for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
+        near = np.concatenate([one.near for one in found[kind]])
+        near = near[near[:, 0] < SHOWN_M]
+        ax.scatter(1000 * near[:, 0], near[:, 1], s=2, alpha=0.25, color=colour, lw=0, rasterized=True)
+        distances = np.linspace(-0.05, SHOWN_M, 200)
+        for hand, style in ((0.0, "-"), (0.5, "--")):
+            rule = [allowed_speed(d, hand, people.brake, reaction_s, people.clearance) for d in distances]
+            ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
+        ax.axvline(0, color="black", lw=0.6)
+        ax.set(title=title, xlabel="distance of a part of the arm from a hand [mm]", xlim=(-60, 1000 * SHOWN_M))
+    axes[0].set(ylabel="speed toward the hand [m/s]", ylim=(-0.6, 0.9))
+    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
+    results.figure(figure)
+
+
+def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
+    stream = results.recording()
+    for kind, rows in found.items():
+        for name in ("closest_mm", "excess_after_reaction"):
+            values: Array = np.array([getattr(one, name) for one in rows])
+            times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]
+            stream.send_columns(f"/{name}/{kind}", times, rr.Scalars.columns(scalars=values))
+    stream.disconnect()
