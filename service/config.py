@@ -16,13 +16,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract.channels import ENDPOINT
-from service.contract.explain import ExplainedError, explained
+from service.contract.explain import explained
+from service.described_arm import SettingsError
+from service.described_arm import check, completed
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
-FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
-NEAREST_POINT = 0.4
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Cell = Annotated[
     str,
@@ -34,10 +34,6 @@ Cell = Annotated[
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
-
-
-class SettingsError(ExplainedError, ValueError):
-    """A configuration that cannot be used: names the field, what was given and what is accepted."""
 
 
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -325,69 +321,17 @@ def converted(given: Any, *, origin: str) -> Settings:
     try:
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            given = _completed(given)
+            own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
+            given = completed(given, Urdf(own, origin=arm["urdf"]))
         settings = msgspec.convert(given, Settings)
-        _check_against_urdf(settings)
+        check(
+            settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate
+        )
     except msgspec.ValidationError as error:
         raise SettingsError(f"{origin}: {explained(error, given, Settings)}") from None
     except (UrdfError, SettingsError) as error:
         raise SettingsError(f"{origin}: {error}") from None
     return settings
-
-
-def _completed(given: dict[str, Any]) -> dict[str, Any]:
-    """The settings of an arm with a URDF of its own, with what that says where they are silent."""
-    arm, joints, reach = (
-        {**part} if isinstance(part := given.get(name, {}), dict) else {} for name in ("arm", "joints", "reach")
-    )
-    urdf = Urdf(robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"]))), origin=arm["urdf"])
-    if "plate" not in arm:
-        raise SettingsError(
-            f"$.arm.plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
-        )
-    moving = urdf.movable(str(arm["plate"]))
-    joints.setdefault("names", [joint.name for joint in moving])
-    for name in ("lower", "upper", "velocity"):
-        joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    for path, section, name in (
-        ("joints", joints, "acceleration"),
-        ("joints", joints, "jerk"),
-        ("arm", arm, "posture"),
-    ):
-        if name not in section:
-            raise SettingsError(
-                f"$.{path}.{name}: missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
-            )
-    lengths = [math.hypot(*joint.translation) for joint in urdf.chain(str(arm["plate"]))]
-    reach.setdefault("centre", [0.0, 0.0, lengths[0]])
-    reach.setdefault("outer", FARTHEST_POINT * sum(lengths[1:]))
-    reach.setdefault("inner", NEAREST_POINT * float(reach["outer"]))
-    return {**given, "arm": arm, "joints": joints, "reach": reach}
-
-
-def _check_against_urdf(settings: Settings) -> None:
-    """Raises SettingsError for joints that the arm does not have, and for limits wider than the
-    URDF's.
-    """
-    urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
-    moving = urdf.movable(settings.arm.plate)
-    names = tuple(joint.name for joint in moving)
-    if settings.joints.names != names:
-        raise SettingsError(
-            f"$.joints.names: {list(settings.joints.names)} given; the chain's {list(names)} in this order needed"
-        )
-    for i, joint in enumerate(moving):
-        for name, low, high in (
-            ("lower", joint.lower, math.inf),
-            ("upper", -math.inf, joint.upper),
-            ("velocity", 0, joint.velocity),
-        ):
-            given = getattr(settings.joints, name)[i]
-            if not low <= given <= high:
-                accepted = f"{low} or more" if name == "lower" else f"up to {high}"
-                raise SettingsError(
-                    f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}"
-                )
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:

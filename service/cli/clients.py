@@ -10,7 +10,8 @@ from typing import Any
 
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
-from service.config import SettingsError, converted
+from service.config import converted
+from service.described_arm import SettingsError
 from service.contract import requests
 from service.contract.channels import ENDPOINT
 

@@ -12,7 +12,8 @@ from typing import Any
 import msgspec
 
 from service.cli.usage import SHIPPED_SKILL, UsageError, recordings
-from service.config import Settings, SettingsError, converted, load
+from service.config import Settings, converted, load
+from service.described_arm import SettingsError
 from service.recorder.client import Scribe
 from service.shell import daemon
 

@@ -17,7 +17,7 @@ from service.learning.via_points import adapted
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
-from sim.scene import GRASP_DISTANCE, Scene
+from sim.scene import GRASP_DISTANCE, TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 
 MOST, DRAWS, HELD_OUT, SCENES = 10, 4, 5, 40
@@ -95,7 +95,7 @@ def _events_mm(skill: Skill, number: int) -> Array:
     script = HandScript(scene, seed=number, offset_std=OFFSET_M)
     at = [script.truth(end) for _, end in scene.dwells]
     hands = np.array([np.concatenate([one.left.position, one.right.position]) for one in at])
-    wanted = np.array([at[0].left.position, scene.glass, scene.carry])
+    wanted = np.array([at[0].left.position + TOOL_FROM_HAND, scene.glass, scene.carry])
     return np.asarray(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
 
 

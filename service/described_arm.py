@@ -1,0 +1,82 @@
+"""What an arm's URDF says of its settings: it completes those that are silent, and refuses those
+that contradict it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+from service.contract.explain import ExplainedError
+from service.urdf import Urdf
+
+FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
+NEAREST_POINT = 0.4
+
+
+class SettingsError(ExplainedError, ValueError):
+    """A configuration that cannot be used: names the field, what was given and what is accepted."""
+
+
+class Limits(Protocol):
+    """The joints' settings, as far as a URDF says them."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In the order of the chain."""
+
+
+def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
+    """The settings of an arm with a URDF of its own, with what that says where they are silent.
+
+    Raises SettingsError.
+    """
+    arm, joints, reach = (
+        {**part} if isinstance(part := given.get(name, {}), dict) else {} for name in ("arm", "joints", "reach")
+    )
+    if "plate" not in arm:
+        raise SettingsError(
+            f"$.arm.plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
+        )
+    moving = urdf.movable(str(arm["plate"]))
+    joints.setdefault("names", [joint.name for joint in moving])
+    for name in ("lower", "upper", "velocity"):
+        joints.setdefault(name, [getattr(joint, name) for joint in moving])
+    for path, section, name in (
+        ("joints", joints, "acceleration"),
+        ("joints", joints, "jerk"),
+        ("arm", arm, "posture"),
+    ):
+        if name not in section:
+            raise SettingsError(
+                f"$.{path}.{name}: missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
+            )
+    lengths = [math.hypot(*joint.translation) for joint in urdf.chain(str(arm["plate"]))]
+    reach.setdefault("centre", [0.0, 0.0, lengths[0]])
+    reach.setdefault("outer", FARTHEST_POINT * sum(lengths[1:]))
+    reach.setdefault("inner", NEAREST_POINT * float(reach["outer"]))
+    return {**given, "arm": arm, "joints": joints, "reach": reach}
+
+
+def check(joints: Limits, urdf: Urdf, plate: str) -> None:
+    """Raises SettingsError for joints that the arm does not have, and for limits wider than the
+    URDF's.
+    """
+    moving = urdf.movable(plate)
+    names = tuple(joint.name for joint in moving)
+    if joints.names != names:
+        raise SettingsError(
+            f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
+        )
+    for i, joint in enumerate(moving):
+        for name, low, high in (
+            ("lower", joint.lower, math.inf),
+            ("upper", -math.inf, joint.upper),
+            ("velocity", 0, joint.velocity),
+        ):
+            given = getattr(joints, name)[i]
+            if not low <= given <= high:
+                accepted = f"{low} or more" if name == "lower" else f"up to {high}"
+                raise SettingsError(
+                    f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}"
+                )
