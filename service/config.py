@@ -17,8 +17,7 @@ import msgspec
 
 from service.contract.channels import ENDPOINT
 from service.contract.explain import explained
-from service.described_arm import SettingsError
-from service.described_arm import check, completed
+from service.described_arm import SettingsError, check, completed
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"

@@ -11,9 +11,9 @@ from typing import Any
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
 from service.config import converted
-from service.described_arm import SettingsError
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.described_arm import SettingsError
 
 
 def via_points(args: argparse.Namespace) -> int:
