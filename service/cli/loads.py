@@ -15,7 +15,6 @@ import os
 import resource
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -30,19 +29,15 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
 from service.cli.probes import probe
-from service.cli.usage import SHIPPED_SKILL, recordings
+from service.cli.usage import SHIPPED_SKILL, free_port, recordings, shipped
 from service.cli.view import executable
 from service.client import Client, RefusedError, UnreachableError, open_session
-from service.config import Settings
-from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
-from service.contract.messages import PoseStamped
-from service.contract.records import SIDES
 from service.contract.requests import ViaPoint
 from service.launch import Launched, launched
-from service.learning.skill_file import decoded, with_file
+from service.learning.skill_file import with_file
 from service.recorder.replay import replay
-from service.shell.probe import TRACKER_HZ, swaying
+from service.shell.probe import TRACKER_HZ, hands_of
 
 QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
 LARGE_SKILL, LARGE = "large", 100_000  # points
@@ -163,7 +158,7 @@ def _status(client: Client, session: Any) -> None:
 
 def _teaching(client: Client, session: Any) -> None:
     """A place, taught over and over, a millimetre beside where it was."""
-    skill = _shipped()
+    skill = shipped()
     primitive = skill.primitive
     x = primitive.inputs[0].tolist()
     left, right, tool = tuple(x[:3]), tuple(x[3:]), primitive.reference.mean[0].tolist()
@@ -176,13 +171,11 @@ def _loading(client: Client, session: Any) -> None:
 
 
 def _hands(rate_hz: float, client: Client, session: Any) -> None:
-    skill, cell = _shipped(), Settings().cell
-    publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
+    publish = hands_of(session, shipped())
 
     def put(k: int) -> None:
         now_ns = time.time_ns()
-        for publisher, place in zip(publishers, swaying(skill, now_ns % 10**13 / 1e9), strict=True):
-            publisher.put(cdr.encode_pose(PoseStamped(now_ns, "base", place, (0.0, 0.0, 0.0, 1.0))))
+        publish(now_ns % 10**13 / 1e9, now_ns)
 
     _asked(rate_hz, put)
 
@@ -227,7 +220,7 @@ def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dic
 
 def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[str], None]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
-        folder, port = Path(name), _free_port()
+        folder, port = Path(name), free_port()
         arguments = ("--arm", "assumed", "--rate", str(rate_hz), "--live", str(port))
         with (
             launched(folder, *arguments, record=folder, skills=skills, program=load.program, say=say) as service,
@@ -279,14 +272,9 @@ def until_following(client: Client) -> None:
     time.sleep(SETTLE_S)
 
 
-def _shipped() -> Any:
-    path = recordings() / SHIPPED_SKILL
-    return decoded(path.read_bytes(), origin=str(path))
-
-
 def _large() -> bytes:
     """The file of a skill of many points: the shipped one's over and over, a little beside."""
-    skill = _shipped()
+    skill = shipped()
     inputs, reference = skill.primitive.inputs, skill.primitive.reference
     pick = np.arange(LARGE) % len(inputs)
     beside = np.random.default_rng(0).normal(scale=0.01, size=(LARGE, inputs.shape[1]))
@@ -300,12 +288,6 @@ def _large() -> bytes:
         prior_mean=skill.primitive.prior_mean,
     )
     return with_file(replace(skill, name=LARGE_SKILL, primitive=primitive, via_points=())).file
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 @contextlib.contextmanager

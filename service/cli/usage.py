@@ -1,10 +1,15 @@
 """What the commands share: the error of a command line that cannot be meant, and where the shipped
-files are.
+files are, and free ports.
 """
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from service.core.skill import Skill
 
 CONNECT_TIMEOUT_S = 3.0
 SHIPPED_SKILL = "soldering.npz"
@@ -19,3 +24,18 @@ def recordings() -> Path:
     service = Path(__file__).parents[1]
     folders = (service / "recordings", service.parent / "recordings")
     return next((folder for folder in folders if folder.is_dir()), folders[1])
+
+
+def shipped() -> Skill:
+    """The skill that the service runs unless told otherwise."""
+    from service.learning.skill_file import decoded  # heavy, and most commands do without
+
+    path = recordings() / SHIPPED_SKILL
+    return decoded(path.read_bytes(), origin=str(path))
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from service.cli.clients import ask
-from service.cli.usage import UsageError
+from service.cli.usage import UsageError, free_port
 from service.contract.explain import ExplainedError
 from service.recorder.recording import Recording
 from service.recorder.sinks import Viewer, ViewerError
@@ -92,14 +91,11 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
         with Path(source).open("rb") as file:
             if file.read(4) != b"RRF2":
                 raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     os.environ.setdefault("RUST_LOG", "error")  # or its remarks cover the picture
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
     try:
         with ViewerClient.spawn(
-            headless=True, port=port, hide_welcome_screen=True, executable_path=str(executable())
+            headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(executable())
         ) as client:
             client.open(str(source if "://" in str(source) else Path(source).absolute()))
             _wait(lambda: _extent(client) is not None and ("://" in str(source) or not client.get_state().loading))

@@ -100,6 +100,18 @@ def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 
 
+def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], None]:
+    """What publishes both hands, swaying, of a time [s] under a stamp [ns]."""
+    cell = Settings().cell
+    publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
+
+    def publish(t: float, stamp_ns: int) -> None:
+        for publisher, place in zip(publishers, swaying(skill, t), strict=True):
+            publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, "base", place, (0.0, 0.0, 0.0, 1.0))))
+
+    return publish
+
+
 def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
     """The core alone, in the loop."""
     settings = Settings(rate_hz=rate_hz)
@@ -139,15 +151,14 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
             session.declare_subscriber(channels.key(cell, "joints/command"), command),
             session.declare_subscriber("probe/pong", pong),
         ]
-        publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
+        publish = hands_of(session, skill)
         ping = session.declare_publisher("probe/ping", express=True)
         start_ns, sent = time.time_ns(), []
         for k in range(round((SETTLE_S + seconds) * TRACKER_HZ)):
             due_ns = start_ns + round(1e9 * k / TRACKER_HZ)
             time.sleep(max(0.0, (due_ns - time.time_ns()) / 1e9))
             now_ns = time.time_ns()
-            for publisher, place in zip(publishers, swaying(skill, k / TRACKER_HZ), strict=True):
-                publisher.put(cdr.encode_pose(PoseStamped(now_ns, "base", place, (0.0, 0.0, 0.0, 1.0))))
+            publish(k / TRACKER_HZ, now_ns)
             if k > SETTLE_S * TRACKER_HZ:
                 sent.append(now_ns)
                 if k % PING_EVERY == 0:

@@ -147,7 +147,7 @@ class Requests:
                     here.is_beside = True
                     run_beside_real_time()
                 if suffix == "status" or self._is_list(suffix, query):
-                    self._reply(suffix, query)
+                    self._reply(suffix, query, noted=False)
                 else:
                     self._lines[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
             except Exception as error:
@@ -171,7 +171,7 @@ class Requests:
         except RequestError:
             return False
 
-    def _reply(self, suffix: str, query: zenoh.Query) -> None:
+    def _reply(self, suffix: str, query: zenoh.Query, *, noted: bool = True) -> None:
         key = channels.key(self._settings.cell, suffix)
         with query:  # its end tells the asker that no more replies come
             try:
@@ -189,7 +189,7 @@ class Requests:
                 self._note(f"{suffix} failed: {error!r}")
                 query.reply_err(f"{type(error).__name__}: {error}".encode())
             else:
-                if suffix != "status" and not self._is_list(suffix, query):
+                if noted:
                     self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
                 query.reply(key, answer)
 

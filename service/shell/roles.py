@@ -66,11 +66,7 @@ def access_control(cell: str) -> dict[str, Any]:
         present, status = [channels.key(cell, "daemon/*")], keys(("status",))
         yield (
             DAEMON,
-            [
-                allow("neighbours", flow, messages, key_exprs)
-                for flow in ("ingress", "egress")
-                for messages, key_exprs in ((liveliness, present),)
-            ]
+            [allow("neighbours", flow, liveliness, present) for flow in ("ingress", "egress")]
             + [
                 allow("neighbours' status", flow, ["query", "reply", "declare_queryable"], status)
                 for flow in ("ingress", "egress")

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.cli.usage import shipped
 from service.contract.records import Mode
 from service.learning.demonstration import Demonstration
 from service.recorder.recording import Recording
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
-from sim.experiments.rehearsal import demonstrated, rehearse, shipped
+from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
 from sim.experiments.scenes import Drawn
 from sim.network import RunReport

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 import rerun as rr
 
+from service.cli.usage import shipped
 from service.config import Settings
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
@@ -24,7 +25,6 @@ from service.learning.learn import learn
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
 from sim.experiments.linear_floor import Floor, best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
-from sim.experiments.rehearsal import shipped
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
 
 PEOPLE, SECONDS, STOPS, REACHES = 3, 15.0, 24, 1

@@ -17,11 +17,12 @@ import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, OrientationKMP
 from kmp.orientation import continuous, exp, log, multiplied
+from service.cli.usage import shipped
 from service.contract.requests import TOLERANCE_M
 from service.core.frame import Event, Frame
 from service.learning.learn import mean_orientation
 from service.learning.via_points import adapted, neighbourhoods
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse, shipped
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
 from sim.scene import TOOL_ORIENTATION, Scene

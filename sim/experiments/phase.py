@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from service.cli.usage import shipped
 from sim.experiments import rivals
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse, shipped
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
 from sim.scene import Scene
 from sim.script import PAUSE_RAMP_S, HandScript, Pause

@@ -11,14 +11,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cli.usage import SHIPPED_SKILL, recordings
 from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
-from service.learning.skill_file import decoded
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop
 from sim.scene import Scene
@@ -101,12 +99,6 @@ def rehearse(
         )
         result.axis, result.joints = np.array(axes), np.array(joints)
     return result
-
-
-def shipped() -> Skill:
-    """The skill that the service runs unless told otherwise."""
-    path = recordings() / SHIPPED_SKILL
-    return decoded(path.read_bytes(), origin=str(path))
 
 
 def demonstrated(count: int, *, seed: int = 1) -> list[Demonstration]:

@@ -17,6 +17,7 @@ import rerun as rr
 from scipy.ndimage import maximum_filter1d
 
 from kmp.compiled import compiled
+from service.cli.usage import shipped
 from service.config import Settings, robot_description
 from service.contract.records import Flag
 from service.core.body import body_of
@@ -24,7 +25,7 @@ from service.core.capsules import between_segments, place
 from service.core.separation import SLIP, Separation, allowed_speed
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse, shipped
+from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
 from sim.script import HandMotions, HandScript, Motion, Teacher

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import rerun as rr
 
+from service.cli.usage import shipped
 from sim.bench import TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
-from sim.experiments.rehearsal import demonstrated, rehearse, shipped
+from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import SERIES, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
 from sim.scene import GRASP_DISTANCE

@@ -23,25 +23,18 @@ if __name__ == "__main__":
 
     sys.path.insert(0, str(Path(__file__).parents[2]))
     with atheris.instrument_imports(include=["service.contract"]):
-        from service.contract import cdr, requests
-        from service.contract.messages import (
-            JointState,
-            PoseStamped,
-            PoseWithCovarianceStamped,
-            Transform,
-            WireError,
-            in_order,
-        )
-else:
-    from service.contract import cdr, requests
-    from service.contract.messages import (
-        JointState,
-        PoseStamped,
-        PoseWithCovarianceStamped,
-        Transform,
-        WireError,
-        in_order,
-    )
+        import service.contract.cdr
+        import service.contract.requests  # noqa: F401
+
+from service.contract import cdr, requests
+from service.contract.messages import (
+    JointState,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Transform,
+    WireError,
+    in_order,
+)
 
 LONGEST_WORDS = 600  # of a refusal, which is sent and logged
 NAMES = ("wam/base_yaw_joint", "b", "c")

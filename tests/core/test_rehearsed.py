@@ -21,7 +21,7 @@ from service.core import (
 )
 from service.core.controller import rehearse
 from service.cli.main import main
-from sim.experiments.rehearsal import shipped
+from service.cli.usage import shipped
 
 MODULES = (
     compiled_query, capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation,
