@@ -15,13 +15,14 @@ from kmp.checks import RankReached, ViaPointMissed
 from kmp.correlation import Correlation, Improvement, improve
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
-from kmp.kernel import GaussianKernel, VelocityKernel
+from kmp.kernel import GaussianKernel
 from kmp.orientation import OrientationKMP
 from kmp.primitive import KMP, Uncertainty
 from kmp.query import MotionPrediction
 from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
+from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 __all__ = [
     "KMP",
@@ -35,6 +36,7 @@ __all__ = [
     "LocalKMP",
     "MotionPrediction",
     "OrientationKMP",
+    "PeriodicKernel",
     "RankReached",
     "Score",
     "Stored",

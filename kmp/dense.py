@@ -12,9 +12,11 @@ from scipy.linalg import blas, lapack
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.kernel import between
 from kmp.linear_algebra import kron_identity
 
 _COLUMNS = 64  # of a factor, copied at once
@@ -40,16 +42,21 @@ class Dense(Immutable):
     error_bound: ClassVar[float] = 0.0
 
     @property
+    def functionals(self) -> Functionals:
+        """The N reference points."""
+        return self.database.functionals
+
+    @property
     def centres(self) -> Array:
-        """(N, I) the reference points."""
+        """(N, I) where they are."""
         return self.database.inputs
 
     @cached_property
     def weights(self) -> Array:
         """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        mean = self.database.reference.mean
-        solution, _ = lapack.dpotrs(self._factor, (mean - self.hyperparameters.prior_mean).ravel(), lower=1)
-        return frozen(np.ascontiguousarray(solution).reshape(mean.shape))
+        right = self.database.deviations(self.hyperparameters.prior_mean)
+        solution, _ = lapack.dpotrs(self._factor, right.ravel(), lower=1)
+        return frozen(np.ascontiguousarray(solution).reshape(right.shape))
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
@@ -116,14 +123,14 @@ class Dense(Immutable):
         """The rows of K (x) I + lambda Sigma that the base does not share: ((N - same) O, N O)."""
         kernel, o = self.hyperparameters.kernel, self.hyperparameters.outputs
         c, d, same = kernel.channels, self.hyperparameters.channel_outputs, self.same
-        inputs, count, changed = self.database.inputs, len(self.database), len(self.database) - same
+        points, count, changed = self.database.functionals, len(self.database), len(self.database) - same
         rows = np.zeros((changed, c, d, count, c, d))
-        k = kernel(inputs[same:], inputs).reshape(changed, c, count, c)
+        k = between(kernel, points.take(slice(same, None)), points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
-        points = np.arange(changed)
+        diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        blocks[points, :, points + same, :] += penalty * self.database.reference.covariance[same:]
+        blocks[diagonal, :, diagonal + same, :] += penalty * self.database.reference.covariance[same:]
         return rows.reshape(changed * o, count * o)
 
 

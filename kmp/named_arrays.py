@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from kmp.checks import numbers
 from kmp.database import Changes, Database
 from kmp.dense import Dense
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
-from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
+from kmp.kernel import GaussianKernel, Kernel
 from kmp.low_rank import LowRank
 from kmp.solution import Solution
+from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _NAMES = (
     *("base_inputs", "base_mean", "base_covariance", "base_weights"),
@@ -44,8 +46,13 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
         "lambda_covariance": np.array(parameters.lambda_covariance),
         "prior_mean": parameters.prior_mean,
     }
+    if parameters.kernel.period is not None:
+        arrays["period"] = np.array(parameters.kernel.period)
     if parameters.kernel.channels > 1:
         arrays["channels"] = np.array(parameters.kernel.channels)
+    for name, functionals in (("base", base.database.functionals), ("via", changes.functionals)):
+        if functionals.directions is not None:
+            arrays[f"{name}_directions"] = functionals.directions
     return arrays | base.to_arrays()
 
 
@@ -73,7 +80,7 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
         inputs=inputs.shape[1],
         outputs=reference.outputs,
     )
-    database = Database(inputs, reference)
+    database = Database(Functionals.checked(inputs, arrays.get("base_directions")), reference)
     low_rank = "pivots" in arrays
     solution = LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
     return _weighted(solution, "base_weights", arrays)
@@ -87,7 +94,7 @@ def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
     n = len(database)
     if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
         raise ValueError(f"replaced: {replaced} given, ascending indices of the {n} base points needed.")
-    return Changes(frozen(replaced), via, points)
+    return Changes(frozen(replaced), Functionals.checked(via, arrays.get("via_directions")), points)
 
 
 def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
@@ -96,6 +103,8 @@ def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]])
 
 
 def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
+    if "period" in arrays:
+        return PeriodicKernel(float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"])))
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
     if int(arrays["channels"]) != 2:

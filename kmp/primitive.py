@@ -5,7 +5,6 @@ The paper, sections II-B and II-C.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,23 +14,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
-from kmp.checks import Array, RankReached, check_finite, check_shape, numbers, positive
+from kmp.checks import Array, check_finite, check_shape, numbers, positive, real
 from kmp.compiled_query import CompiledQuery
 from kmp.database import Changes, Database, warn_of_missed
-from kmp.dense import Dense
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, unchecked
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
-from kmp.kernel import Kernel
+from kmp.kernel import Kernel, between
 from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
-from kmp.low_rank import RANK, TOLERANCE, Features, LowRank
+from kmp.low_rank import RANK, TOLERANCE, Features
 from kmp.query import MotionPrediction, Query
-from kmp.solution import Solution, mean_at
+from kmp.solution import Solution, mean_at, mean_of
+from kmp.solving import solved
 
 _BATCH = 256  # queries at once, which bounds the memory of `predict`
-_SMALL = 1500  # N O up to which the dense solution is the faster one
-_LARGE = 6000  # N O beyond which the dense solution takes seconds and 300 MB
-_ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever was asked for
 _RESIDUAL = 1e-10  # the same, for the uncertainty that is distance from the data
 
 
@@ -68,6 +65,7 @@ class KMP(Immutable):
         lambda_mean: float,
         lambda_covariance: float | None = None,
         prior_mean: ArrayLike | None = None,
+        directions: ArrayLike | None = None,
         representation: Literal["auto", "dense", "low_rank"] = "auto",
         rank: int = RANK,
         rank_tolerance: float = TOLERANCE,
@@ -77,6 +75,9 @@ class KMP(Immutable):
         `prior_mean` (O,) [unit of the outputs] is what the mean returns to far from the inputs, the
         origin by default. `lambda_covariance` None is `lambda_mean`; another value costs a second
         factor.
+
+        Where a row of `directions` (N, I) [unit of the inputs] is not zero, that normal is of the
+        output's derivative along it [unit of the outputs], dxi/ds times the direction.
 
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
         (4) on at most `rank` features of the kernel, which leave a share of at most
@@ -104,8 +105,8 @@ class KMP(Immutable):
         if rank < 1:
             raise ValueError(f"rank is {rank}, and must be at least 1.")
         positive("rank_tolerance", rank_tolerance)
-        database = Database(s, reference)
-        return cls(_solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
+        database = Database(Functionals.checked(s, directions), reference)
+        return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
 
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
@@ -129,10 +130,10 @@ class KMP(Immutable):
         s = self._checked_many(queries)
         if len(s) == 1:
             row = self._query.row(s[0])
-            return unchecked(self._query.mean(row)[None], self._query.covariance(row.kernel)[None])
-        solution = self._solution
+            by = self._compiled_query or self._query
+            return unchecked(self._query.mean(row)[None], by.covariance(row.kernel)[None])
         batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
-        posterior = [solution.posterior_covariance(self.kernel(one, solution.centres)) for one in batches]
+        posterior = [self._solution.posterior_covariance(self._rows(one)) for one in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
         return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self._query.covariance_scale)
 
@@ -153,21 +154,21 @@ class KMP(Immutable):
 
         Raises ValueError if a shape is another or a number is not finite.
         """
-        s, v, a = (np.asarray(x, dtype=np.float64) for x in (query, velocity, acceleration))
+        s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
         compiled = self._compiled_query
         if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
             found = compiled.motion(s, v, a, covariance=covariance)
             if found is not None:
                 return found
-        checked = self._checked("query", s), self._checked("velocity", v), self._checked("acceleration", a)
-        return self._query.motion(*checked, covariance=covariance)
+        checked = self._checked("velocity", v), self._checked("acceleration", a)
+        return self._query.motion(self._one_query(s), *checked, covariance=covariance)
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
 
         Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
         """
-        return self._query.jacobian(self._query.row(self._checked("query", query)))
+        return self._query.jacobian(self._query.row(self._one_query(query)))
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
@@ -176,7 +177,7 @@ class KMP(Immutable):
         this is the part of the output's acceleration [unit of the outputs / s^2] that the velocity
         makes. Raises ValueError if a shape is another or a number is not finite.
         """
-        s, v = self._checked("query", query), self._checked("direction", direction)
+        s, v = self._one_query(query), self._checked("direction", direction)
         return self._query.curvature(self._query.row(s), v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
@@ -188,18 +189,31 @@ class KMP(Immutable):
         s = self._checked_many(queries)
         total = self.predict(s).covariance
         c = self.kernel.channels
-        z = self._spanned(s).T.reshape(len(s), c, -1)
+        z = self._spanned(Functionals(s)).T.reshape(len(s), c, -1)
         residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
         distance = nearest_positive_semidefinite(residual) * self._query.covariance_scale
         return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
 
-    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> KMP:
+    def adapt(
+        self,
+        inputs: ArrayLike,
+        desired: Gaussians,
+        *,
+        tolerance: float,
+        directions: ArrayLike | None = None,
+    ) -> KMP:
         """A new primitive that also goes through desired points: inputs (V, I), V normals.
 
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
         point of the *base's* reference takes the place of its nearest one (of all, where several
         are equally near); any other is inserted. The order of the desired points does not matter.
-        Earlier via-points stay: to be rid of them, adapt `base` anew.
+        Earlier via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the
+        base's, so that teaching here changes nothing elsewhere.
+
+        Where a row of `directions` (V, I) [unit of the inputs] is not zero, that normal is of the
+        output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
+        of the output, where the direction is that of the input. It is inserted, and replaces
+        nothing.
 
         A desired point that is then missed by more than 3 of its deviations, and by more than 0.001
         (1 mm, where the unit is the metre), is named in a `ViaPointMissed` warning.
@@ -213,25 +227,43 @@ class KMP(Immutable):
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
         if len(via) == 0:
             return self
-        before = self._changes
+        before, points = self._changes, Functionals.checked(via, directions)
+        nearest = self.base._solution.database.nearest(points, tolerance, self.kernel.period)
         changes = Changes(
-            frozen(np.union1d(before.replaced, self.base._solution.database.nearest(via, tolerance))),
-            frozen(np.concatenate([before.inputs, via])),
+            frozen(np.union1d(before.replaced, nearest)),
+            Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )
         adapted = KMP(self.base._solution.adapted(changes).solved(), changes, self.base)
-        warn_of_missed(desired, adapted.mean(via), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
         return adapted
+
+    def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
+        """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
+
+        `deviation` [unit of the outputs / unit of the inputs] is how sure each entry is. So one
+        via-point says what lies about it: the output follows an input there (ones), or does not
+        heed it (zeros). What is not known of a Jacobian is left out by `adapt` along `directions`.
+
+        Raises ValueError as `adapt` does.
+        """
+        via = numbers("inputs", inputs, "V", self._dimensions)
+        given = numbers("jacobians", jacobians, len(via), self.outputs, self._dimensions)
+        axes = np.tile(np.eye(self._dimensions), (len(via), 1))
+        means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
+        variance = positive("deviation", deviation) ** 2
+        desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
+        return self.adapt(np.repeat(via, self._dimensions, axis=0), desired, tolerance=0, directions=axes)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        inputs = self.base.inputs
-        check_pairs(inputs, reference, self.outputs)
-        database, parameters = Database(inputs, reference), self._solution.hyperparameters
-        fitted = KMP(_solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
+        points = self.base._solution.database.functionals
+        check_pairs(points.inputs, reference, self.outputs)
+        database, parameters = Database(points, reference), self._solution.hyperparameters
+        fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         if self is self.base:
             return fitted
         return KMP(fitted._solution.adapted(self._changes).solved(), self._changes, fitted)
@@ -323,8 +355,7 @@ class KMP(Immutable):
 
     @cached_property
     def _query(self) -> Query:
-        count = len(self.base.inputs) - len(self._changes.replaced) + len(self.via_inputs)
-        return Query.of(self._solution, count)
+        return Query.of(self._solution, len(self.base.inputs))
 
     @cached_property
     def _compiled_query(self) -> CompiledQuery | None:
@@ -332,49 +363,34 @@ class KMP(Immutable):
 
     @cached_property
     def _spanned(self) -> Features:
-        centres = self._solution.centres
-        return Features.of(self.kernel, centres, rank=len(centres), tolerance=_RESIDUAL)[0]
+        known = self._solution.functionals
+        return Features.of(self.kernel, known, rank=len(known), tolerance=_RESIDUAL)[0]
 
     @cached_property
     def _dimensions(self) -> int:
         return int(self._changes.inputs.shape[1])
 
+    def _rows(self, queries: Array, directions: Array | None = None) -> Array:
+        """k of M queries, or their derivatives, and what is known: (M C, R C)."""
+        return between(self.kernel, Functionals(queries, directions), self._solution.functionals)
+
+    def _wrapped(self, queries: Array) -> Array:
+        """The queries, within the period where there is one: no seam, not even rounding's."""
+        period = self.kernel.period
+        return queries if period is None else queries % period
+
+    def _one_query(self, query: ArrayLike) -> Array:
+        return self._wrapped(self._checked("query", query))
+
     def _checked(self, name: str, value: ArrayLike) -> Array:
-        s = np.asarray(value, dtype=np.float64)
+        s = real(name, value)
         check_shape(name, s, self._dimensions)
         check_finite(name, s)
         return s
 
     def _checked_many(self, queries: ArrayLike) -> Array:
-        s = np.asarray(queries, dtype=np.float64)
+        s = real("queries", queries)
         if s.ndim != 2 or s.shape[1] != self._dimensions:
             check_shape("queries", s, "M", self._dimensions)
         check_finite("queries", s)
-        return s
-
-
-def _solved(
-    parameters: Hyperparameters,
-    database: Database,
-    representation: str,
-    rank: int,
-    tolerance: float,
-) -> Solution:
-    size = database.reference.mean.size
-    if representation == "dense" or (representation == "auto" and size <= _SMALL):
-        return Dense(parameters, database).solved()
-    features, residual = Features.of(parameters.kernel, database.inputs, rank=rank, tolerance=tolerance)
-    reached = len(features.pivots) >= rank
-    enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
-    if representation == "auto" and not enough and size <= _LARGE:
-        return Dense(parameters, database).solved()
-    solution = LowRank.fit(parameters, database, features).solved()
-    if not enough:
-        warnings.warn(
-            f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} was asked for: the mean at them may be off by up to {solution.error_bound:.2g} "
-            "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
-            RankReached,
-            stacklevel=3,
-        )
-    return solution
+        return self._wrapped(s)

@@ -15,8 +15,9 @@ from kmp.checks import Array, numbers, positive
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.immutable import Immutable, frozen
-from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
+from kmp.kernel import GaussianKernel, Kernel
 from kmp.primitive import KMP
+from kmp.time_kernels import VelocityKernel
 
 _ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # over twice the variance of the inputs
 _LAMBDAS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # over the mean variance of the reference

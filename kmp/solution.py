@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
+from kmp.kernel import between
 
 
 class Solution(Protocol):
@@ -31,8 +33,12 @@ class Solution(Protocol):
         """How the costs are solved."""
 
     @property
+    def functionals(self) -> Functionals:
+        """The R values, and derivatives, that the kernels stand for."""
+
+    @property
     def centres(self) -> Array:
-        """s_r (R, I)."""
+        """s_r (R, I) where they are."""
 
     @property
     def weights(self) -> Array:
@@ -63,7 +69,14 @@ class Solution(Protocol):
 
 def mean_at(solution: Solution, queries: Array) -> Array:
     """Equation (8) at queries (M, I): (M, O)."""
+    return mean_of(solution, Functionals(queries))
+
+
+def mean_of(solution: Solution, queries: Functionals) -> Array:
+    """Equation (8) for M queries, derived where a query is a derivative: (M, O)."""
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
-    expansion = parameters.kernel(queries, solution.centres) @ weights
-    return expansion.reshape(len(queries), parameters.outputs) + parameters.prior_mean
+    expansion = (between(parameters.kernel, queries, solution.functionals) @ weights).reshape(-1, parameters.outputs)
+    if queries.directions is None:
+        return np.asarray(expansion + parameters.prior_mean)
+    return np.asarray(expansion + queries.values[:, None] * parameters.prior_mean)

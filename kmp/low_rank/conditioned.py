@@ -12,9 +12,11 @@ from scipy.linalg import lapack
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
+from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bound
 
 if TYPE_CHECKING:
@@ -61,9 +63,14 @@ class Conditioned(Immutable):
         return self.base.database.changed(self.changes)
 
     @cached_property
+    def functionals(self) -> Functionals:
+        """The r pivots, then the V via-points."""
+        return Functionals.concatenated([self.base.functionals, self.changes.functionals])
+
+    @property
     def centres(self) -> Array:
-        """(r + V, I) the pivots, then the via-points."""
-        return frozen(np.concatenate([self.base.centres, self.changes.inputs]))
+        """(r + V, I) where they are."""
+        return self.functionals.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -72,7 +79,7 @@ class Conditioned(Immutable):
         shared = penalty == self.hyperparameters.lambda_covariance
         system = self._covariance_system if shared else self._system(penalty, base.mean_factor)
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
-        pull = system.solve((self._points.mean - self.hyperparameters.prior_mean - mean).ravel())
+        pull = system.solve((self._points.deviations(self.hyperparameters.prior_mean) - mean).ravel())
         back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
         columns = self._added_columns
         w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]
@@ -114,15 +121,17 @@ class Conditioned(Immutable):
         return self._added * self.base.features.kernel.channels
 
     @cached_property
-    def _points(self) -> Gaussians:
-        """The U normals, the added first."""
-        return Gaussians.concatenated([self.changes.points, self.base.database.reference.take(self.changes.replaced)])
+    def _points(self) -> Database:
+        """The U points, the added first."""
+        database, replaced = self.base.database, self.changes.replaced
+        functionals = Functionals.concatenated([self.changes.functionals, database.functionals.take(replaced)])
+        normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
+        return Database(functionals, normals)
 
     @cached_property
     def _z(self) -> Array:
         """The features (r, U C) of the U points."""
-        inputs = np.concatenate([self.changes.inputs, self.base.database.inputs[self.changes.replaced]])
-        return frozen(self.base.features(inputs))
+        return frozen(self.base.features(self._points.functionals))
 
     @cached_property
     def _covariance_system(self) -> _System:
@@ -145,18 +154,18 @@ class Conditioned(Immutable):
 
     def _system(self, penalty: float, base_factor: Array) -> _System:
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
-        added, first = self.changes.inputs, self._added_columns
+        added, first = self.changes.functionals, self._added_columns
         lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
-        between = self.base.features.kernel(added, added) - self._z[:, :first].T @ self._z[:, :first]
+        left = between(self.hyperparameters.kernel, added, added) - self._z[:, :first].T @ self._z[:, :first]
         for i in range(d):
             lifted[:, i, :, i] = self._z
-            residual[:first, i, :first, i] = between
+            residual[:first, i, :first, i] = left
         cross, _ = lapack.dtrtrs(base_factor, lifted.reshape(r * d, -1), lower=1)
         matrix = penalty * (cross.T @ cross) + residual.reshape(columns * d, columns * d)
         blocks = matrix.reshape(count, -1, count, columns * d // count)
         points = np.arange(count)
         sign = np.where(points < self._added, penalty, -penalty)
-        blocks[points, :, points, :] += sign[:, None, None] * self._points.covariance
+        blocks[points, :, points, :] += sign[:, None, None] * self._points.reference.covariance
         lu, pivots, info = lapack.dgetrf(matrix)
         if info or not np.isfinite(lu).all():
             raise ValueError(

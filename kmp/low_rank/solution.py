@@ -13,6 +13,7 @@ from scipy.linalg import blas, lapack
 
 from kmp.checks import Array, numbers
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
@@ -54,15 +55,15 @@ class LowRank(Immutable):
     ) -> LowRank:
         """The solution. Raises ValueError if the normal equations cannot be solved."""
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
-        inputs = database.inputs
+        points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
-        target = database.reference.mean - hyperparameters.prior_mean
-        blocks = [slice(i, i + BLOCK) for i in range(0, len(inputs), BLOCK)]
+        target = database.deviations(hyperparameters.prior_mean)
+        blocks = [slice(i, i + BLOCK) for i in range(0, len(points), BLOCK)]
 
         def lifted(start: int) -> Array:
-            return features(inputs[start : start + BLOCK]).T.reshape(-1, c, r)
+            return features(points.take(slice(start, start + BLOCK))).T.reshape(-1, c, r)
 
-        z = cache(lifted) if len(inputs) * c * r <= _KEPT else lifted
+        z = cache(lifted) if len(points) * c * r <= _KEPT else lifted
         total = np.zeros((r, d, r, d))
         for block in blocks:
             _add_information(total, z(block.start), precision[block])
@@ -90,15 +91,21 @@ class LowRank(Immutable):
         r, d = len(pivots), hyperparameters.channel_outputs
         information = numbers("information", arrays["information"], r * d, r * d)
         w = numbers("features", arrays["features"], r, d)
-        features = Features.at(hyperparameters.kernel, pivots)
+        directions = arrays.get("pivot_directions")
+        features = Features.at(hyperparameters.kernel, Functionals.checked(pivots, directions))
         if (usable := len(features.pivots)) < r:
             raise ValueError(f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the primitive anew.")
         return cls(hyperparameters, database, features, information, w)
 
     @property
-    def centres(self) -> Array:
-        """(r, I) the pivots."""
+    def functionals(self) -> Functionals:
+        """The r pivots."""
         return self.features.pivots
+
+    @property
+    def centres(self) -> Array:
+        """(r, I) where they are."""
+        return self.features.pivots.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -132,7 +139,7 @@ class LowRank(Immutable):
         # So many changes cost more, and lose more digits, than a new solution.
         database = base.database.changed(changes)
         rank = max(RANK, len(base.centres) + len(changes.inputs))
-        features, _ = Features.of(base.features.kernel, database.inputs, rank=rank, tolerance=TOLERANCE)
+        features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
         return LowRank.fit(self.hyperparameters, database, features, base)
 
     def with_weights(self, weights: Array) -> Self:
@@ -141,7 +148,10 @@ class LowRank(Immutable):
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """The pivots, the information and W of the base."""
         base = self.base or self
-        return {"pivots": base.centres, "information": base.information, "features": base.w}
+        arrays = {"pivots": base.centres, "information": base.information, "features": base.w}
+        if base.functionals.directions is not None:
+            arrays["pivot_directions"] = base.functionals.directions
+        return arrays
 
     def whitened_one(self, row: Array) -> tuple[Array, Array]:
         """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
