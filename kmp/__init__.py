@@ -17,7 +17,8 @@ from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
 from kmp.orientation import OrientationKMP
-from kmp.primitive import KMP, Uncertainty
+from kmp.predictor import Uncertainty
+from kmp.primitive import KMP
 from kmp.query import MotionPrediction
 from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn

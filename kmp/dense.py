@@ -63,9 +63,10 @@ class Dense(Immutable):
         self._covariance_factor  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self._inverse_factor.times_one(row.T)
-        return np.asarray(self._prior_covariance - blas.dgemm(1.0, root, root, trans_b=1))
+        own = self._prior_covariance if prior is None else kron_identity(prior, self.hyperparameters.channel_outputs)
+        return np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1))
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self._inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)

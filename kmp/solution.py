@@ -51,8 +51,11 @@ class Solution(Protocol):
     def solved(self) -> Self:
         """This solution, its weights and factors made. Raises ValueError if that fails."""
 
-    def posterior_covariance_one(self, row: Array) -> Array:
-        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C)."""
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C).
+
+        Of M queries together (M O, M O), with k (M C, R C) and `prior` k(s, s) (M C, M C).
+        """
 
     def posterior_covariance(self, rows: Array) -> Array:
         """Those (M, O, O) of the kernel rows (M C, R C) of M queries."""

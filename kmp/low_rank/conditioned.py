@@ -95,9 +95,9 @@ class Conditioned(Immutable):
         self._covariance_system  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.base.whitened_one(row)
-        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None])[0])
+        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0])
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.base.whitened(rows)
@@ -137,11 +137,11 @@ class Conditioned(Immutable):
     def _covariance_system(self) -> _System:
         return self._system(self.hyperparameters.lambda_covariance, self.base.covariance_factor)
 
-    def _posterior_covariance(self, rows: Array, z: Array, roots: Array) -> Array:
+    def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
         m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
         columns, system = self._added_columns, self._covariance_system
-        residual = rows[:, :, z.shape[1] * c :] - z.transpose(0, 2, 1) @ self._z[:, :columns]  # (M, C, V C)
+        residual = rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]  # (M, C, V C)
         cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
         split = cross.reshape(m, c, d, -1, d)
         for i in range(d):
@@ -149,7 +149,7 @@ class Conditioned(Immutable):
         cross = split.reshape(m * c * d, -1)
         gain = system.solve(cross.T).T.reshape(m, c * d, -1)
         within = penalty * (roots.transpose(0, 2, 1) @ roots)
-        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z) + within
+        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
         return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
     def _system(self, penalty: float, base_factor: Array) -> _System:

@@ -121,10 +121,10 @@ class LowRank(Immutable):
         self.covariance_factor  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.whitened_one(row)
         within = blas.dgemm(1.0, root, root, trans_b=1)
-        return self.residual_covariance(z.T @ z) + self.hyperparameters.lambda_covariance * within
+        return self.residual_covariance(z.T @ z, prior) + self.hyperparameters.lambda_covariance * within
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.whitened(rows)
@@ -157,7 +157,7 @@ class LowRank(Immutable):
         """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(row[..., : len(self.centres) * c : c].T)
-        return z.reshape(-1, c), self._inverse_factor.times_one(z)
+        return z.reshape(len(self.centres), -1), self._inverse_factor.times_one(z)
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
@@ -165,9 +165,10 @@ class LowRank(Immutable):
         z = self.features.of_kernel(rows[:, : len(self.centres) * c : c].T)
         return z.reshape(len(z), -1, c).transpose(1, 0, 2), self._inverse_factor.times_many(z, c)
 
-    def residual_covariance(self, explained: Array) -> Array:
+    def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
         """k(s, s) less what the features explain (..., C, C), for each output: (..., O, O)."""
-        return kron_identity(self.features.kernel.prior_variance - explained, self.w.shape[1])
+        own = self.features.kernel.prior_variance if prior is None else prior
+        return kron_identity(own - explained, self.w.shape[1])
 
     @cached_property
     def mean_factor(self) -> Array:
