@@ -12,6 +12,7 @@ fitted weights.
 """
 
 from kmp.checks import RankReached, ViaPointMissed
+from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement, improve
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
@@ -34,6 +35,7 @@ __all__ = [
     "Gaussians",
     "Improvement",
     "Learned",
+    "LinearConstraints",
     "LocalKMP",
     "MotionPrediction",
     "OrientationKMP",

@@ -69,3 +69,27 @@ def positive(name: str, value: float | Array) -> float:
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"{name} is {number:g}, and must be finite and above 0.")
     return number
+
+
+def whole(name: str, value: object, *, least: int = 1) -> int:
+    """The value as an integer. Raises ValueError unless it is one, and not below the least."""
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
+        raise ValueError(f"{name} is {value!r}, and must be a whole number.")
+    if value < least:
+        raise ValueError(f"{name} is {value}, and must be at least {least}.")
+    return int(value)
+
+
+def check_kind(name: str, value: object, kind: type, how: str) -> None:
+    """Raises ValueError unless the value is of that kind; `how` says how one is made."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name}: {type(value).__name__} given, {kind.__name__} needed: {how}.")
+
+
+def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
+    """Inputs and outputs of a demonstration. Raises ValueError unless it is a pair."""
+    if isinstance(demonstration, (tuple, list)) and len(demonstration) == 2:
+        return demonstration[0], demonstration[1]
+    of = f" of shape {demonstration.shape}" if isinstance(demonstration, np.ndarray) else ""
+    needed = "a pair needed: inputs (T, I) and outputs (T, O)"
+    raise ValueError(f"{name}: {type(demonstration).__name__}{of} given, {needed}.")

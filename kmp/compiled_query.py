@@ -21,7 +21,7 @@ from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.query import MotionPrediction, Query
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CompiledQuery(Immutable):
     """A query's arrays for compiled loops. R centres, O outputs."""
 

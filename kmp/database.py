@@ -33,7 +33,7 @@ class Changes(NamedTuple):
         return self.functionals.inputs
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Database(Immutable):
     """N reference points: where they are, and the normal distribution of the output there.
 

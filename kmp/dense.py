@@ -22,7 +22,7 @@ from kmp.linear_algebra import kron_identity
 _COLUMNS = 64  # of a factor, copied at once
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dense(Immutable):
     """The solution for N points, N O x N O numbers; the factors are made when first asked for.
 

@@ -21,7 +21,7 @@ class Derivatives(NamedTuple):
     along: Array  # (R', I) their directions, in the kernel's coordinates
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Functionals(Immutable):
     """N linear functionals of the output: its value at an input, or its derivative there.
 

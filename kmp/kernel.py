@@ -99,7 +99,7 @@ def variances(kernel: Kernel, functionals: Functionals) -> Array:
     return kernel.variances(functionals.directions)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianKernel(Immutable):
     """k(s, s') = exp(-ell |s - s'|^2), `ell` in 1 / (unit of the inputs)^2. The paper, section III.
 
@@ -122,6 +122,9 @@ class GaussianKernel(Immutable):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, GaussianKernel) and np.array_equal(self.ell, other.ell)
+
+    def __repr__(self) -> str:
+        return f"GaussianKernel(ell={np.asarray(self.ell).tolist()})"
 
     def __hash__(self) -> int:
         return hash(np.asarray(self.ell).tobytes())

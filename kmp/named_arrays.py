@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.checks import numbers
+from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database
 from kmp.dense import Dense
 from kmp.functionals import Functionals
@@ -25,6 +26,7 @@ _NAMES = (
     *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
     *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
 )
+_OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
 
 
@@ -53,6 +55,11 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
     for name, functionals in (("base", base.database.functionals), ("via", changes.functionals)):
         if functionals.directions is not None:
             arrays[f"{name}_directions"] = functionals.directions
+    if isinstance(solution, Constrained):
+        constraints = solution.constraints
+        arrays |= {name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS}
+        if constraints.directions is not None:
+            arrays["constraint_directions"] = constraints.directions
     return arrays | base.to_arrays()
 
 
@@ -63,9 +70,20 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, 
         raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
     base = _base(arrays)
     changes = _changes(arrays, base.database)
-    if len(changes.inputs) == 0:
-        return base, changes, base
-    return base, changes, _weighted(base.adapted(changes), "weights", arrays)
+    solution = base.adapted(changes) if len(changes.inputs) else base
+    if any(name in arrays for name in _OF_CONSTRAINTS):
+        solution = _constrained(solution, arrays)
+    return base, changes, solution if solution is base else _weighted(solution, "weights", arrays)
+
+
+def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
+    if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
+        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}.")
+    if not isinstance(solution, Dense):
+        raise ValueError("constraints: given for a low rank solution, a dense one needed.")
+    inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
+    given = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
+    return Constrained(solution, given)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:

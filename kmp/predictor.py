@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_finite, check_shape, real
+from kmp.checks import Array, check_finite, check_shape, real, whole
 from kmp.compiled_query import CompiledQuery
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
@@ -28,7 +28,7 @@ _BATCH = 256  # queries at once, which bounds the memory of `predict`
 _RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(Immutable):
     """The covariance of `predict` as the sum of two, each (M, O, O) [unit of the outputs^2]."""
 
@@ -95,8 +95,7 @@ class Predictor(Immutable):
 
         Raises ValueError as `predict` does, or if the count is below 1.
         """
-        if count < 1:
-            raise ValueError(f"count is {count}, and must be at least 1.")
+        whole("count", count)
         joint = self.predict_joint(queries)
         values, vectors = np.linalg.eigh(joint.covariance[0])
         root = vectors * np.sqrt(np.maximum(values, 0.0))

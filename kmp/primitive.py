@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
-from kmp.checks import Array, numbers, positive
+from kmp.checks import Array, check_kind, numbers, positive, real, whole
+from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
+from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians, check_pairs
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
 from kmp.kernel import Kernel
@@ -26,7 +28,7 @@ from kmp.solution import Solution, mean_of
 from kmp.solving import solved
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class KMP(Predictor):
     """A skill: a reference database, the via-points in it, and its solution.
 
@@ -38,6 +40,11 @@ class KMP(Predictor):
     _solution: Solution
     _changes: Changes
     _base: KMP | None = None
+
+    def __repr__(self) -> str:
+        count, inputs = self.inputs.shape
+        of = f"{count} points" + (f", {len(self.via_inputs)} of them taught" if len(self.via_inputs) else "")
+        return f"KMP({of}: {inputs} inputs, {self.outputs} outputs, {self.kernel}, {self.representation})"
 
     @classmethod
     def fit(
@@ -75,6 +82,7 @@ class KMP(Predictor):
         s = numbers("inputs", inputs, "N", "I")
         if len(s) == 0:
             raise ValueError("inputs: no reference point given, at least 1 needed.")
+        check_gaussians("reference", reference)
         check_pairs(s, reference, reference.outputs)
         parameters = Hyperparameters.checked(
             kernel,
@@ -86,8 +94,7 @@ class KMP(Predictor):
         )
         if representation not in {"auto", "dense", "low_rank"}:
             raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
-        if rank < 1:
-            raise ValueError(f"rank is {rank}, and must be at least 1.")
+        whole("rank", rank)
         positive("rank_tolerance", rank_tolerance)
         database = Database(Functionals.checked(s, directions), reference)
         return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
@@ -120,8 +127,9 @@ class KMP(Predictor):
         or the equations cannot be solved to working precision.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
+        check_gaussians("desired", desired)
         check_pairs(via, desired, self.outputs)
-        if not tolerance >= 0:
+        if not real("tolerance", tolerance) >= 0:
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
         if len(via) == 0:
             return self
@@ -132,7 +140,7 @@ class KMP(Predictor):
             Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )
-        adapted = KMP(self.base._solution.adapted(changes).solved(), changes, self.base)
+        adapted = KMP(self._solution.adapted(changes).solved(), changes, self.base)
         warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
         return adapted
 
@@ -153,6 +161,30 @@ class KMP(Predictor):
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         return self.adapt(np.repeat(via, self._dimensions, axis=0), desired, tolerance=0, directions=axes)
 
+    def constrained(self, constraints: LinearConstraints) -> KMP:
+        """A new primitive whose mean obeys these constraints too, to 1e-9. LC-KMP.
+
+        They hold at the inputs that they are given at; between them the mean may cross a little, so
+        give them closer than the kernel is long. Later via-points obey them, and `base` is without.
+        The covariance is as without. For the dense representation.
+
+        Raises ValueError if shapes do not agree, or the constraints cannot be met together.
+        """
+        check_kind("constraints", constraints, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
+        for name, given, needed in (
+            ("inputs", constraints.inputs.shape[1], self._dimensions),
+            ("outputs", constraints.normals.shape[1], self.outputs),
+        ):
+            if given != needed:
+                raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
+        solution: Solution = self._solution
+        if isinstance(solution, Constrained):
+            constraints = solution.constraints.joined(constraints)
+            solution = solution.solution
+        if not isinstance(solution, Dense):
+            raise ValueError('constraints: representation "low_rank" given, "dense" needed; fit the primitive so.')
+        return KMP(Constrained(solution, constraints).solved(), self._changes, self.base)
+
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
@@ -164,7 +196,11 @@ class KMP(Predictor):
         fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         if self is self.base:
             return fitted
-        return KMP(fitted._solution.adapted(self._changes).solved(), self._changes, fitted)
+        changed: Solution = fitted._solution.adapted(self._changes) if len(self.via_inputs) else fitted._solution
+        before: Solution = self._solution
+        if isinstance(before, Constrained) and isinstance(changed, Dense):
+            changed = Constrained(changed, before.constraints)
+        return KMP(changed.solved(), self._changes, fitted)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""

@@ -44,7 +44,7 @@ class KernelRow(NamedTuple):
     kernel: Array  # (R,) or (C, R C) k(s, s_r), derived where s_r stands for a derivative
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Query(Immutable):
     """A solution made ready for one query at a time: R centres, C channels, D outputs a channel."""
 

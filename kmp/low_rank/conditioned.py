@@ -37,7 +37,7 @@ class _System(NamedTuple):
         return np.asarray(lapack.dgetrs(self.lu, self.pivots.copy(), right)[0])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Conditioned(Immutable):
     """The low rank solution after V points were added and R taken out: U = V + R changes.
 
@@ -141,7 +141,9 @@ class Conditioned(Immutable):
         """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
         m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
         columns, system = self._added_columns, self._covariance_system
-        residual = rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]  # (M, C, V C)
+        residual = (
+            rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]
+        )  # (M, C, V C)
         cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
         split = cross.reshape(m, c, d, -1, d)
         for i in range(d):

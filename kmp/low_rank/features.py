@@ -24,7 +24,7 @@ _MARGIN = 0.25  # of the tolerance, for the inputs that are no candidates
 _FLOOR = 1e-14  # of k(s, s): a smaller residual is rounding
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Features(Immutable):
     """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of their kernel matrix."""
 

@@ -28,7 +28,7 @@ _KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are mad
 _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LowRank(Immutable):
     """The solution on r features, with the members of `Solution`; factors are made when used."""
 

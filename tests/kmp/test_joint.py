@@ -18,7 +18,9 @@ def fitted(kernel="gaussian", representation="dense", adapted=False):
     one = KMP.fit(T, reference, kernel=KERNELS[kernel], **options)
     if not adapted:
         return one
-    return one.adapt([[0.5], [1.51]], Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))), tolerance=0.02)
+    return one.adapt(
+        [[0.5], [1.51]], Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))), tolerance=0.02
+    )
 
 
 @pytest.fixture(params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)], ids=str)
