@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+_SHOWN = 3  # of a tuple
 _Some = TypeVar("_Some", bound=NDArray[Any])
 
 
@@ -47,7 +48,11 @@ class Immutable:
 
 
 def _short(value: object) -> str:
-    return f"array{value.shape}" if isinstance(value, np.ndarray) else repr(value)
+    if isinstance(value, np.ndarray):
+        return f"array{value.shape}"
+    if isinstance(value, tuple) and len(value) > _SHOWN:
+        return f"({len(value)} of {type(value[0]).__name__})"
+    return repr(value)
 
 
 def _freeze(value: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
 
 
 def _fields(kind: Any) -> tuple[str, ...]:
-    return tuple(getattr(kind, "__dataclass_fields__", None) or kind._fields)
+    return tuple(one.name for one in fields(kind)) if is_dataclass(kind) else kind._fields
 
 
 def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:

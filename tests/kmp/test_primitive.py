@@ -117,7 +117,7 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
     inputs = spread * random.normal(size=(20, 2))
     primitive = KMP.fit(
         inputs,
-        Gaussians(random.normal(size=(20, 2)), np.tile(1e-14 * np.eye(2), (20, 1, 1))),
+        Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1))),
         kernel=kernel,
         lambda_mean=1.0,
     )
@@ -125,6 +125,20 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
     for covariance in (p.covariance for p in predictions):
         assert np.array_equal(covariance, covariance.swapaxes(1, 2))
         assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+@pytest.mark.parametrize("lambda_covariance", [1e-2, 1.0])
+def test_a_covariance_that_rounding_would_hide_is_refused_and_the_remedy_works(lambda_covariance):
+    inputs, reference = database()
+    sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
+    one = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance)
+    assert one.predict(inputs).covariance.shape == (30, 3, 3)
+    points = via(0, 1, std=1e-8)
+    says = rf"point 30 .* lambda Sigma is {1e-16 * lambda_covariance:.3g} .* lambda_covariance of at least 1e\+05"
+    with pytest.raises(ValueError, match=says):
+        one.adapt(*points, tolerance=0)
+    remedied = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=1e5)
+    np.testing.assert_allclose(remedied.adapt(*points, tolerance=0).mean(points[0]), points[1].mean, atol=1e-6)
 
 
 def test_far_away_the_mean_is_the_prior_and_the_covariance_the_whole():
