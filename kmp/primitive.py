@@ -131,16 +131,8 @@ class KMP(Predictor):
         check_pairs(via, desired, self.outputs)
         if not real("tolerance", tolerance) >= 0:
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
-        if len(via) == 0:
-            return self
-        before, points = self._changes, Functionals.checked(via, directions)
-        nearest = self.base._solution.database.nearest(points, tolerance, self.kernel.period)
-        changes = Changes(
-            frozen(np.union1d(before.replaced, nearest)),
-            Functionals.concatenated([before.functionals, points]),
-            Gaussians.concatenated([before.points, desired]),
-        )
-        adapted = KMP(self._solution.adapted(changes).solved(), changes, self.base)
+        points = Functionals.checked(via, directions)
+        adapted = self._through(points, desired, tolerance)
         warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
         return adapted
 
@@ -159,7 +151,10 @@ class KMP(Predictor):
         means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
         variance = positive("deviation", deviation) ** 2
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
-        return self.adapt(np.repeat(via, self._dimensions, axis=0), desired, tolerance=0, directions=axes)
+        points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
+        adapted = self._through(points, desired, 0.0)
+        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
+        return adapted
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
         """A new primitive whose mean obeys these constraints too, to 1e-9. LC-KMP.
@@ -218,6 +213,18 @@ class KMP(Predictor):
         unadapted = cls(base, base.database.unchanged())
         return unadapted if solution is base else cls(solution, changes, unadapted)
 
+    def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
+        if len(points) == 0:
+            return self
+        before = self._changes
+        nearest = self.base._solution.database.nearest(points, tolerance, self.kernel.period)
+        changes = Changes(
+            frozen(np.union1d(before.replaced, nearest)),
+            Functionals.concatenated([before.functionals, points]),
+            Gaussians.concatenated([before.points, desired]),
+        )
+        return KMP(self._solution.adapted(changes).solved(), changes, self.base)
+
     @property
     def _count(self) -> int:
         return len(self.base.inputs)
@@ -241,6 +248,11 @@ class KMP(Predictor):
     def via_inputs(self) -> Array:
         """(V, I) where the via-points are."""
         return self._changes.inputs
+
+    @property
+    def via_directions(self) -> Array:
+        """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
+        return self._changes.functionals.along
 
     @property
     def via_points(self) -> Gaussians:

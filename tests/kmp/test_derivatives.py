@@ -208,8 +208,11 @@ def test_so_many_derivatives_that_the_low_rank_solution_is_fitted_anew():
 
 def test_jacobians_that_contradict_are_named():
     twice = np.concatenate([PLACE, PLACE])
-    with pytest.warns(ViaPointMissed, match=r"0 by .* deviations"):
-        base().adapt_jacobian(twice, np.concatenate([FOLLOW, -FOLLOW]), deviation=1e-2)
+    with pytest.warns(ViaPointMissed, match=r"0 by .* deviations") as told:
+        one = base().adapt_jacobian(twice, np.concatenate([FOLLOW, -FOLLOW]), deviation=1e-2)
+    assert told[0].filename == __file__
+    np.testing.assert_array_equal(one.via_directions, np.tile(np.eye(4), (2, 1)))
+    assert base().via_directions.shape == (0, 4)
 
 
 @pytest.mark.parametrize(
