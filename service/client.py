@@ -106,7 +106,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:
     """The endpoints at which a session really listens, with the ports that it was given."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=ENDPOINTS_TIMEOUT_S):
+    for reply in session.get(f"@/{session.zid()}/*", timeout=ENDPOINTS_TIMEOUT_S):
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
     return ()

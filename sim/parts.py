@@ -1,0 +1,183 @@
+"""Parts of a cell as processes of their own, to be killed, frozen and begun again: a tracker, a
+network between two ends, a Zenoh router.
+
+python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the same sample for good
+python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a network that is silent
+python -m sim.parts router PORT           a Zenoh session that routes between its clients
+
+Each says where it listens, if it does, or else that it began; port 0 takes a free one.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import argparse
+import asyncio
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from service import child
+from service.client import endpoints, open_session
+from service.contract import cdr, channels, messages
+from service.shell.clock import Deadlines
+from sim.scene import Scene
+from sim.script import HandScript
+
+HANDS_HZ = 100
+MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
+START_TIMEOUT_S = 60.0
+PRIORITY = 20  # below the service's loop, above what it does beside
+CLIENT = {"mode": "client"}  # as a router wants it
+
+
+def before_others() -> None:
+    """Lets this thread, and those that it starts, run before other processes, if that is granted:
+    then a machine that is busy is not taken for a fault.
+    """
+    with contextlib.suppress(PermissionError, AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+
+
+class PartError(RuntimeError):
+    """A part that did not begin; the message says which."""
+
+
+def script_time(time_s: float) -> float:
+    """The script's time [s] of hands that swing to and fro where they lead the tool fastest."""
+    return MIDDLE_S + SWING_S * math.sin(FASTEST / SWING_S * time_s)
+
+
+def track(endpoint: str, *, routed: bool) -> None:
+    """Publishes both hands for good; on SIGUSR1 what it sent last, again and again."""
+    repeats = threading.Event()
+    signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
+    script, sides = HandScript(Scene(), seed=1), ("left", "right")
+    with open_session(connect=[endpoint], more=CLIENT if routed else None) as session:
+        publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
+        clock, payloads = Deadlines(HANDS_HZ), [b"", b""]
+        print("begun", flush=True)
+        while True:
+            clock.wait()
+            if not repeats.is_set() or not payloads[0]:
+                stamp_ns = time.time_ns()
+                poses = [pose.tolist() for pose in script.sample(script_time(time.monotonic()))]
+                payloads = [
+                    cdr.encode_pose(messages.PoseStamped(stamp_ns, messages.BASE, (x, y, z), tuple(turn)))
+                    for x, y, z, *turn in poses
+                ]
+            for publisher, payload in zip(publishers, payloads, strict=True):
+                publisher.put(payload)
+
+
+async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+    try:
+        while data := await source.read(65536):
+            sink.write(data)
+            await sink.drain()
+    except OSError:  # an end that is gone ends both
+        pass
+    finally:
+        sink.close()
+
+
+async def relay(target: str, port: int) -> None:
+    """Carries bytes between whoever connects and the target, for good."""
+    host, _, target_port = target.removeprefix("tcp/").rpartition(":")
+
+    async def carry(near: asyncio.StreamReader, to_near: asyncio.StreamWriter) -> None:
+        try:
+            far, to_far = await asyncio.open_connection(host, int(target_port))
+        except OSError:  # nobody there: so the asker learns
+            to_near.close()
+            return
+        await asyncio.gather(_pump(near, to_far), _pump(far, to_near))
+
+    server = await asyncio.start_server(carry, "127.0.0.1", port)
+    print(f"listening on tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}", flush=True)
+    await server.serve_forever()
+
+
+def route(port: int) -> None:
+    """Routes between the clients that connect, for good."""
+    with open_session(listen=[f"tcp/127.0.0.1:{port}"], more={"mode": "router"}) as session:
+        print(f"listening on {endpoints(session)[0]}", flush=True)
+        signal.pause()
+
+
+class Part:
+    """One of them, running; `endpoint` where it listens. Raises PartError where it does not begin.
+
+    `again` begins it anew at the same endpoint, after its end.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        self._arguments = arguments
+        self._start()
+
+    def _start(self) -> None:
+        command = [sys.executable, "-m", "sim.parts", *self._arguments]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        clock = threading.Timer(START_TIMEOUT_S, self.process.kill)
+        clock.start()
+        assert self.process.stdout is not None
+        said = self.process.stdout.readline().split()
+        clock.cancel()
+        if not said:
+            raise PartError(f"python -m sim.parts {' '.join(self._arguments)} did not begin")
+        self.endpoint = said[-1]
+
+    def send(self, number: int) -> None:
+        """Sends a signal."""
+        self.process.send_signal(number)
+
+    def again(self) -> None:
+        """Ends it and begins it anew, where it was."""
+        self.close()
+        if self._arguments[0] != "tracker":
+            self._arguments = (*self._arguments[:-1], self.endpoint.rsplit(":", 1)[1])
+        self._start()
+
+    def close(self) -> None:
+        """Ends it."""
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code: 0, 2 on bad usage."""
+    p = argparse.ArgumentParser(
+        prog="python -m sim.parts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    kinds = p.add_subparsers(dest="kind", required=True)
+    tracker = kinds.add_parser("tracker", help="both hands, to and fro")
+    tracker.add_argument("endpoint", metavar="ENDPOINT", help="where the service or a router listens")
+    tracker.add_argument("--routed", action="store_true", help="as a router's client")
+    relaying = kinds.add_parser("relay", help="a network between two ends")
+    relaying.add_argument("target", metavar="TARGET", help="where it leads to, like tcp/127.0.0.1:7447")
+    routing = kinds.add_parser("router", help="a Zenoh router")
+    for one in (relaying, routing):
+        one.add_argument("port", metavar="PORT", type=int, help="where it listens; 0: a free one")
+    args = p.parse_args(arguments)
+    child.end_with_parent()
+    before_others()
+    if args.kind == "tracker":
+        track(args.endpoint, routed=args.routed)
+    elif args.kind == "relay":
+        asyncio.run(relay(args.target, args.port))
+    else:
+        route(args.port)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
