@@ -52,6 +52,7 @@ def open_session(
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(timeout_s * 1000),
         "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
         "adminspace/enabled": bool(listen),
         "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import zenoh
 
@@ -24,14 +24,18 @@ from service.launch import Launched, launched
 from service.shell.clock import Deadlines
 from sim.bench import Bench
 from sim.network import Bridge, Live
-from sim.parts import CLIENT, Part, before_others
+from sim.parts import CLIENT, Link, Part, before_others
 from sim.scene import Scene
 from sim.script import HandScript
 
-FAST, MOVES = 0.35, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
+FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
 WATCHED_S = 1.5  # after a fault, before it is mended
 RESUMES_WITHIN_S = 30.0
 CELL = "thirdhand"
+
+
+Network = Literal["relays", "router", "link"]
+Command = tuple[float, int, bytes]  # when it left the service (time.monotonic() [s]), its tick, its bytes
 
 
 class FaultError(RuntimeError):
@@ -54,14 +58,14 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Fault:
-    """How something is broken and mended; after it the arm `stops`, or else goes on. What stands in
-    `routed` needs a cell whose parts meet at a router.
+    """How something is broken and mended, in a cell over which network; after it the arm `stops`,
+    or else goes on.
     """
 
     provoke: Callable[[FaultyCell], None]
     mend: Callable[[FaultyCell], None] = lambda cell: None
     stops: bool = True
-    routed: bool = False
+    network: Network = "relays"
     lasts_s: float = WATCHED_S
 
 
@@ -106,32 +110,37 @@ class _Arm:
 class FaultyCell:
     """A running cell whose tool swings to and fro, with its files in `folder`.
 
-    Tracker and arm reach the service each over a relay of its own, or, `routed`, over one router.
-    Raises FaultError, LaunchError and PartError.
+    Tracker and arm reach the service each over a relay of its own, both over one router, or over a
+    cable that leads to a network namespace. Raises FaultError, LaunchError and PartError.
     """
 
-    def __init__(self, folder: Path, *, routed: bool = False) -> None:
-        self.folder, self.records, self.routed = folder, folder / "records", routed
-        self.commands: list[tuple[float, int, bytes]] = []  # of the service's first life: time [s], tick, bytes
+    def __init__(self, folder: Path, *, network: Network = "relays") -> None:
+        self.folder, self.records, self.network = folder, folder / "records", network
+        self.commands: list[Command] = []  # of the service's first life
         self._parts = contextlib.ExitStack()
         self._life = contextlib.ExitStack()
         self._lives = 0
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as parts:
-            if self.routed:
+            if self.network == "router":
                 self.router = self._part(parts, "router", "0")
-                self.begin_service()
-                self.to_tracker = self.to_arm = self.router
+            elif self.network == "link":
+                self.link = parts.enter_context(contextlib.closing(Link()))
+            parts.callback(self._life.close)
+            self.begin_service()
+            here = self.service.endpoint
+            if self.network == "relays":
+                self.to_tracker, self.to_arm = (self._part(parts, "relay", here, "0") for _ in range(2))
+                to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
             else:
-                self.begin_service()
-                self.to_tracker, self.to_arm = (self._part(parts, "relay", self.service.endpoint, "0") for _ in "12")
-            parts.callback(lambda: self._life.close())
+                to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
+            routed = self.network == "router"
             # the operator is at the service itself, so that what left it is known whatever is cut
             self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
-            self.tracker = self._part(parts, "tracker", self.to_tracker.endpoint, *["--routed"] * self.routed)
-            self.arm = parts.enter_context(contextlib.closing(_Arm(self.to_arm.endpoint, self.routed)))
+            self.tracker = self._part(parts, "tracker", to_tracker, *["--routed"] * routed)
+            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, routed)))
             self._listen()
             self.until_fast()
             self._parts = parts.pop_all()
@@ -146,13 +155,21 @@ class FaultyCell:
 
     def begin_service(self) -> None:
         """Begins the service, where it was if it has been."""
-        listen = self.service.endpoint if self._lives else "tcp/127.0.0.1:0"
+        listen = f"tcp/{Link.ADDRESS if self.network == 'link' else '127.0.0.1'}:0"
+        if self._lives:
+            listen = self.service.endpoint
         self._lives += 1
-        connect = f"connect = [{self.router.endpoint!r}]\n" if self.routed else ""
-        network = f"[network]\nlisten = [{listen!r}]\n{connect}"
+        network = f"[network]\nlisten = [{listen!r}]\n"
+        if self.network == "router":
+            network += f"connect = [{self.router.endpoint!r}]\n"
+        if self.network == "link":
+            network += "allow_insecure = true\n"
+        program = self.link.program if self.network == "link" else ("-m", "service")
         record = self.records if self._lives == 1 else self.folder / f"records-{self._lives}"
         self._life.close()
-        self.service: Launched = self._life.enter_context(launched(self.folder, record=record, network=network))
+        self.service: Launched = self._life.enter_context(
+            launched(self.folder, record=record, network=network, program=program)
+        )
 
     def _listen(self) -> None:
         """Keeps every command that leaves the service."""

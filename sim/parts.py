@@ -1,8 +1,10 @@
 """Parts of a cell as processes of their own, to be killed, frozen and begun again: a tracker, a
 network between two ends, a Zenoh router.
 
-python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the same sample for good
-python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a network that is silent
+python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the
+                                          same sample for good
+python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a
+                                          network that is silent
 python -m sim.parts router PORT           a Zenoh session that routes between its clients
 
 Each says where it listens, if it does, or else that it began; port 0 takes a free one.
@@ -151,6 +153,56 @@ class Part:
         self.process.wait()
         if self.process.stdout is not None:
             self.process.stdout.close()
+
+
+class Link:
+    """A cable between this machine and a network namespace of its own in which a service may run:
+    it can be taken down. Only root may have one; raises PartError where it is not allowed.
+    """
+
+    ADDRESS, OTHER = "198.18.77.1", "198.18.77.2"  # of the range that is set aside for measurements
+
+    def __init__(self) -> None:
+        self.name = f"thirdhand{os.getpid()}"
+        self._cable = f"th{os.getpid()}"
+        _ip("netns", "add", self.name)
+        try:
+            _ip("link", "add", self._cable, "type", "veth", "peer", "name", "th0", "netns", self.name)
+            _ip("-n", self.name, "addr", "add", f"{self.ADDRESS}/30", "dev", "th0")
+            _ip("-n", self.name, "link", "set", "th0", "up")
+            _ip("-n", self.name, "link", "set", "lo", "up")
+            _ip("addr", "add", f"{self.OTHER}/30", "dev", self._cable)
+            self.set("up")
+        except PartError:
+            self.close()
+            raise
+
+    def set(self, state: str) -> None:
+        """Takes it `up` or `down`."""
+        _ip("link", "set", self._cable, state)
+
+    @property
+    def program(self) -> tuple[str, ...]:
+        """A Python program that runs the service at the far end."""
+        return (
+            "-c",
+            "import ctypes, os, sys\n"
+            f"if ctypes.CDLL(None).setns(os.open('/run/netns/{self.name}', os.O_RDONLY), 0): sys.exit('no namespace')\n"
+            "from service.__main__ import main\nsys.exit(main())",
+        )
+
+    def close(self) -> None:
+        """Removes it."""
+        _ip("netns", "del", self.name)
+
+
+def _ip(*arguments: str) -> None:
+    try:
+        done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=10, check=False)
+    except OSError as error:
+        raise PartError(f"ip cannot be run: {error}") from None
+    if done.returncode != 0:
+        raise PartError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
 
 def main(arguments: list[str] | None = None) -> int:

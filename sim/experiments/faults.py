@@ -16,9 +16,10 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -28,8 +29,9 @@ from service.contract import cdr
 from service.contract.records import Mode, Reason
 from service.core.arm import Arm
 from service.recorder.recording import Recording
-from sim.experiments.results import REFERENCE, SERIES, Options, Results, pyplot
-from sim.faulty_cell import WATCHED_S, Event, Fault, FaultyCell
+from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
+from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
+from sim.parts import PartError
 from sim.script import Array
 
 STANDS_M = 0.001  # a tool that stays this near to where it ends has come to rest
@@ -66,6 +68,10 @@ def _kill_the_service(cell: FaultyCell) -> None:
     cell.service.process.kill()
 
 
+def _end_the_service(cell: FaultyCell) -> None:
+    cell.service.process.terminate()
+
+
 def _kill_the_workshop_at_work(cell: FaultyCell) -> None:
     workshop = cell.child("workshop")
     os.kill(workshop, signal.SIGSTOP)  # so it is at work when it is killed
@@ -87,37 +93,37 @@ def _fill_the_disk(cell: FaultyCell) -> None:
 
 def _empty_the_disk(cell: FaultyCell) -> None:
     (cell.folder / "ballast").unlink()
+    _until_recorded(cell)
+
+
+def _until_recorded(cell: FaultyCell) -> None:
     cell.until(lambda: cell.client.status()["scribe"]["state"] == "recording", "nothing was recorded again")
 
 
-def _recording_again(cell: FaultyCell) -> None:
-    cell.until(lambda: cell.client.status()["scribe"]["state"] == "recording", "nothing was recorded again")
-
-
+KILL, STOP, CONT = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
 FAULTS = {
-    "tracker killed": Fault(_signal("tracker", signal.SIGKILL), _begin_anew("tracker")),
-    "tracker frozen": Fault(_signal("tracker", signal.SIGSTOP), _signal("tracker", signal.SIGCONT)),
+    "tracker killed": Fault(_signal("tracker", KILL), _begin_anew("tracker")),
+    "tracker frozen": Fault(_signal("tracker", STOP), _signal("tracker", CONT)),
     "tracker repeats its last sample": Fault(_signal("tracker", signal.SIGUSR1), _begin_anew("tracker")),
-    "network to the tracker silent": Fault(
-        _signal("to_tracker", signal.SIGSTOP), _signal("to_tracker", signal.SIGCONT)
-    ),
-    "network to the tracker torn": Fault(_signal("to_tracker", signal.SIGKILL), _begin_anew("to_tracker")),
-    "network to the arm silent": Fault(
-        _signal("to_arm", signal.SIGSTOP), _and_reset(_signal("to_arm", signal.SIGCONT))
-    ),
-    "network to the arm torn": Fault(_signal("to_arm", signal.SIGKILL), _and_reset(_begin_anew("to_arm"))),
+    "network to the tracker silent": Fault(_signal("to_tracker", STOP), _signal("to_tracker", CONT)),
+    "network to the tracker torn": Fault(_signal("to_tracker", KILL), _begin_anew("to_tracker")),
+    "network to the arm silent": Fault(_signal("to_arm", STOP), _and_reset(_signal("to_arm", CONT))),
+    "network to the arm torn": Fault(_signal("to_arm", KILL), _and_reset(_begin_anew("to_arm"))),
     "workshop killed": Fault(_kill_the_workshop_at_work, stops=False),
-    "scribe killed": Fault(_stop_or_kill("scribe", signal.SIGKILL), _recording_again, stops=False, lasts_s=3.0),
-    "scribe stopped": Fault(
-        _stop_or_kill("scribe", signal.SIGSTOP), _recording_again, stops=False, lasts_s=SCRIBE_SILENT_S
-    ),
-    "recording folder removed": Fault(_remove_the_folder, _recording_again, stops=False, lasts_s=3.0),
+    "scribe killed": Fault(_stop_or_kill("scribe", KILL), _until_recorded, stops=False, lasts_s=3.0),
+    "scribe stopped": Fault(_stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S),
     "disk full": Fault(_fill_the_disk, _empty_the_disk, stops=False, lasts_s=3.0),
-    "service killed": Fault(_kill_the_service, FaultyCell.begin_service),  # the last: another life begins
-    "router killed": Fault(
-        _signal("router", signal.SIGKILL), _and_reset(_begin_anew("router")), routed=True
+    # what ends the service is the last of its cell
+    "service killed": Fault(_kill_the_service, FaultyCell.begin_service),
+    # takes the recordings with it: the first of its cell
+    "recording folder removed": Fault(_remove_the_folder, _until_recorded, stops=False, network="router", lasts_s=3.0),
+    "cable pulled": Fault(
+        lambda cell: cell.link.set("down"), _and_reset(lambda cell: cell.link.set("up")), network="link"
     ),
+    "router killed": Fault(_signal("router", KILL), _and_reset(_begin_anew("router")), network="router"),
+    "service asked to end": Fault(_end_the_service, FaultyCell.begin_service, network="router"),
 }
+SHORT = ("tracker killed", "network to the arm silent", "scribe killed", "service killed", "router killed")
 
 
 class Recorded:
@@ -157,33 +163,37 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
     period_ms = 1e3 * Settings().period_s
     until = event.mended_s if fault.stops else event.ended_s
     mine = steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= until)]
-    told = [entry for entry in cell.commands if event.struck_s <= entry[0] <= until]
+    told = [command for command in cell.commands if event.struck_s <= command[0] <= until]
     stop = recorded.first_stop(event.tick)
-    if stop is not None and (stop[0] - event.tick) * period_ms > 1e3 * (until - event.struck_s):
-        stop = None
+    hold_ms = None if stop is None else (stop[0] - event.tick) * period_ms
+    if hold_ms is not None and hold_ms > 1e3 * (until - event.struck_s):
+        hold_ms = None  # it belongs to what came later
     found: dict[str, Any] = {
-        "hold_ms": None if stop is None else round((stop[0] - event.tick) * period_ms, 1),
-        "reason": None if stop is None else stop[1],
-        "lost_ticks": event.lost,
+        "hold_ms": hold_ms,
+        "reason": None if stop is None or hold_ms is None else stop[1],
+        "lost_ticks": event.lost
+        if event.lost >= 0
+        else sum(entry[1] > recorded.ticks.max() for entry in cell.commands),
+        "speed_m_per_s": float(mine[0, 4]),
         "fastest_m_per_s": float(steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= event.ended_s), 4].max()),
         "arm_largest_gap_ms": 1e3 * float(np.diff(mine[:, 0]).max()),
     }
     if fault.stops:
         at_s, way = way_to_rest(mine[:, 0], mine[:, 1:4])
         found |= {
-            "speed_m_per_s": float(mine[0, 4]),
             "rest_ms": 1e3 * (at_s - event.struck_s),
             "travelled_mm": 1e3 * way,
             "commanded_mm": 1e3 * _commanded(told),
+            "speed_at_the_end_m_per_s": float(mine[-1, 4]),
             "moves_again_ms": 1e3 * (event.moving_s - event.mended_s),
         }
     else:
-        gaps = np.diff([event.struck_s, *(entry[0] for entry in told)])
+        gaps = np.diff([event.struck_s, *(command[0] for command in told)])
         found |= {"command_largest_gap_ms": 1e3 * float(gaps.max()), "command_mean_gap_ms": 1e3 * float(gaps.mean())}
     return found
 
 
-def _commanded(told: list[tuple[float, int, bytes]]) -> float:
+def _commanded(told: list[Command]) -> float:
     """How far the commands led the tool [m]."""
     if len(told) < 2:
         return 0.0
@@ -205,45 +215,97 @@ def disk() -> Iterator[tuple[Path, bool]]:
                 subprocess.run(["umount", "--lazy", scratch], check=True, timeout=10)
 
 
-def suffered(names: list[str], say: Callable[[str], None] = lambda line: None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The figures of some faults by name, and the tool's speeds around each (T, 2) [s, m/s]."""
-    found: dict[str, Any] = {}
-    curves: dict[str, Any] = {}
-    for routed in (False, True):
-        mine = [name for name in FAULTS if name in names and FAULTS[name].routed == routed]
-        if mine:
-            with disk() as (folder, bounded):
-                if not bounded and "disk full" in mine:
-                    mine.remove("disk full")
-                    say("disk full: mounting a small disk is not allowed here, left out")
-                _suffer(folder, mine, routed, found, curves, say)
-    return found, curves
+@dataclass
+class Suffered:
+    """The figures of faults by name, the tool's speed around each (T, 2) [s, m/s], and how many
+    commands went out that are neither recorded nor counted as lost.
+    """
+
+    figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    speeds: dict[str, Array] = field(default_factory=dict)
+    unaccounted: int = 0
+
+
+def suffered(names: Sequence[str], say: Callable[[str], None] = lambda line: None) -> Suffered:
+    """What came of some faults, each struck once.
+
+    Raises FaultError, LaunchError and PartError.
+    """
+    result = Suffered()
+    for network in get_args(Network):
+        mine = [name for name in FAULTS if name in names and FAULTS[name].network == network]
+        with disk() as (folder, bounded):
+            if not bounded and "disk full" in mine:
+                mine.remove("disk full")
+                say("disk full: mounting a small disk is not allowed here, left out")
+            try:
+                if mine:
+                    _suffer(result, mine, folder, say, network=network)
+            except PartError as error:
+                if network != "link":
+                    raise
+                say(f"cable pulled: left out, as a network namespace is not allowed here: {error}")
+    return result
 
 
 def _suffer(
-    folder: Path, names: list[str], routed: bool, found: dict[str, Any], curves: dict[str, Any], say: Callable[[str], None]
+    result: Suffered, names: Sequence[str], folder: Path, say: Callable[[str], None], *, network: Network
 ) -> None:
-    events = []
-    with FaultyCell(folder, routed=routed) as cell:
+    """What came of some faults in one cell."""
+    events: list[Event] = []
+    with FaultyCell(folder, network=network) as cell:
         for name in names:
+            say(name)
             events.append(cell.suffer(name, FAULTS[name]))
-            say(f"{name}: done")
-        code = cell.close()
-        if code != 0:
-            say(f"the service ended with code {code}")
+        cell.close()
         recorded, steps = Recorded(cell.records), np.array(cell.arm.steps)
     for event in events:
-        found[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
+        result.figures[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
         near = steps[(steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)]
-        curves[event.fault] = np.column_stack([near[:, 0] - event.struck_s, near[:, 4]])
-    said = set(recorded.ticks.tolist())
-    found.setdefault("unrecorded_commands", 0)
-    found["unrecorded_commands"] += sum(tick not in said for _, tick, _ in cell.commands)
+        result.speeds[event.fault] = np.column_stack([near[:, 0] - event.struck_s, near[:, 4]])
+    known = set(recorded.ticks.tolist())
+    missing = sum(tick not in known for _, tick, _ in cell.commands)
+    result.unaccounted += max(0, missing - sum(result.figures[name]["lost_ticks"] for name in names))
+
+
+def table(found: dict[str, dict[str, Any]]) -> str:
+    """The figures for people to read."""
+    rows = [f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'told':>8}{'lost':>7}{'on again':>10}"]
+    rows += [f"{'':<32}{'ms':>8}{'ms':>9}{'mm':>11}{'mm':>8}{'ticks':>7}{'ms':>10}"]
+    for name, one in found.items():
+        values = (
+            one.get(key)
+            for key in ("hold_ms", "rest_ms", "travelled_mm", "commanded_mm", "lost_ticks", "moves_again_ms")
+        )
+        cells = ("-" if value is None else f"{value:.0f}" for value in values)
+        rows.append(
+            f"{name:<32}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, (8, 9, 11, 8, 7, 10), strict=True))
+        )
+    return "\n".join(rows)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    names = list(FAULTS)
-    found, curves = suffered(names, results.say)
-    for name, one in found.items():
-        print(name, one)
-    return {"faults": found}
+    """The figures of every fault, or of a few where less than the full size is wanted."""
+    came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say)
+    print(table(came.figures), flush=True)
+    _draw(results, came)
+    return {"faults": came.figures, "unaccounted_ticks": came.unaccounted, "load": os.getloadavg()[0]}
+
+
+def _draw(results: Results, came: Suffered) -> None:
+    stopping = [name for name in came.speeds if FAULTS[name].stops]
+    figure, grid = pyplot().subplots(
+        -(-len(stopping) // 3), 3, figsize=(9, 1.9 * -(-len(stopping) // 3)), sharex=True, sharey=True, squeeze=False
+    )
+    for axes, name in zip(grid.flat, stopping, strict=False):
+        speed, one = came.speeds[name], came.figures[name]
+        axes.plot(1e3 * speed[:, 0], speed[:, 1], color=TOOL)
+        axes.axvline(0, color=REFERENCE, linewidth=0.8)
+        if one["hold_ms"] is not None:
+            axes.axvline(one["hold_ms"], color=DESIRED, linewidth=0.8, linestyle="--")
+        axes.set_title(f"{name}: {one['travelled_mm']:.0f} mm", fontsize=9)
+    for axes in grid.flat[len(stopping) :]:
+        axes.set_visible(False)
+    figure.supxlabel("ms after the fault; dashed: the service decides to stop", fontsize=9)
+    figure.supylabel("tool, m/s", fontsize=9)
+    results.figure(figure)
