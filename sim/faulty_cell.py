@@ -29,7 +29,8 @@ from sim.scene import Scene
 from sim.script import HandScript
 
 FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
-WATCHED_S = 1.5  # after a fault, before it is mended
+WATCHED_S = 1.0  # after a fault, before it is mended
+STEADY_S = 1.5  # it has followed before a fault strikes
 RESUMES_WITHIN_S = 30.0
 CELL = "thirdhand"
 
@@ -205,8 +206,10 @@ class FaultyCell:
 
     def suffer(self, name: str, fault: Fault) -> Event:
         """What came of a fault that strikes while the tool is fast, and of mending it."""
+        time.sleep(STEADY_S)
         self.until_fast()
         lost = self.client.status()["scribe"]["lost"]
+        self.until_fast()
         struck = time.monotonic()
         tick = self.commands[-1][1]
         fault.provoke(self)
@@ -214,7 +217,6 @@ class FaultyCell:
         mended = time.monotonic()
         fault.mend(self)
         moving = self.until(lambda: self.arm.speed > MOVES, "the tool did not move again")
-        self.until_fast()
         lost = self.client.status()["scribe"]["lost"] - lost
         return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
 

@@ -2,7 +2,8 @@
 network between two ends, a Zenoh router.
 
 python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the
-                                          same sample for good
+                                          same sample for good, at each SIGUSR2 with a clock that
+                                          is set back by an hour, or ahead to where it was
 python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a
                                           network that is silent
 python -m sim.parts router PORT           a Zenoh session that routes between its clients
@@ -18,6 +19,7 @@ from service import one_blas_thread  # noqa: F401
 import argparse
 import asyncio
 import contextlib
+import itertools
 import math
 import os
 import signal
@@ -33,7 +35,7 @@ from service.shell.clock import Deadlines
 from sim.scene import Scene
 from sim.script import HandScript
 
-HANDS_HZ = 100
+HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
 MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
 START_TIMEOUT_S = 60.0
 PRIORITY = 20  # below the service's loop, above what it does beside
@@ -58,9 +60,18 @@ def script_time(time_s: float) -> float:
 
 
 def track(endpoint: str, *, routed: bool) -> None:
-    """Publishes both hands for good; on SIGUSR1 what it sent last, again and again."""
-    repeats = threading.Event()
+    """Publishes both hands for good; on SIGUSR1 what it sent last, again and again, on SIGUSR2 by a
+    clock that was set.
+    """
+    repeats, offs_ns = threading.Event(), itertools.cycle([HOUR_NS, 0])
+    off_ns = 0
+
+    def set_the_clock(*_: object) -> None:
+        nonlocal off_ns
+        off_ns = next(offs_ns)
+
     signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
+    signal.signal(signal.SIGUSR2, set_the_clock)
     script, sides = HandScript(Scene(), seed=1), ("left", "right")
     with open_session(connect=[endpoint], more=CLIENT if routed else None) as session:
         publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
@@ -69,7 +80,7 @@ def track(endpoint: str, *, routed: bool) -> None:
         while True:
             clock.wait()
             if not repeats.is_set() or not payloads[0]:
-                stamp_ns = time.time_ns()
+                stamp_ns = time.time_ns() - off_ns
                 poses = [pose.tolist() for pose in script.sample(script_time(time.monotonic()))]
                 payloads = [
                     cdr.encode_pose(messages.PoseStamped(stamp_ns, messages.BASE, (x, y, z), tuple(turn)))

@@ -105,6 +105,8 @@ FAULTS = {
     "tracker killed": Fault(_signal("tracker", KILL), _begin_anew("tracker")),
     "tracker frozen": Fault(_signal("tracker", STOP), _signal("tracker", CONT)),
     "tracker repeats its last sample": Fault(_signal("tracker", signal.SIGUSR1), _begin_anew("tracker")),
+    "clock of the tracker set back": Fault(_signal("tracker", signal.SIGUSR2), stops=False),
+    "clock of the tracker set ahead": Fault(_signal("tracker", signal.SIGUSR2), stops=False),
     "network to the tracker silent": Fault(_signal("to_tracker", STOP), _signal("to_tracker", CONT)),
     "network to the tracker torn": Fault(_signal("to_tracker", KILL), _begin_anew("to_tracker")),
     "network to the arm silent": Fault(_signal("to_arm", STOP), _and_reset(_signal("to_arm", CONT))),
@@ -148,6 +150,10 @@ class Recorded:
             return None
         return int(self.ticks[found[0]]), Reason(int(self.reasons[found[0]])).name.lower()
 
+    def stopped(self, after: int, until: int) -> int:
+        """How many ticks did not follow."""
+        return int(((self.ticks > after) & (self.ticks <= until) & (self.modes != Mode.FOLLOW)).sum())
+
 
 def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
     """When a point came to rest [s] and how far it went until then [m]: times (T,) and places
@@ -189,7 +195,11 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
         }
     else:
         gaps = np.diff([event.struck_s, *(command[0] for command in told)])
-        found |= {"command_largest_gap_ms": 1e3 * float(gaps.max()), "command_mean_gap_ms": 1e3 * float(gaps.mean())}
+        found |= {
+            "command_largest_gap_ms": 1e3 * float(gaps.max()),
+            "command_mean_gap_ms": 1e3 * float(gaps.mean()),
+            "held_ms": period_ms * recorded.stopped(event.tick, told[-1][1]),
+        }
     return found
 
 
