@@ -32,6 +32,7 @@ FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it 
 WATCHED_S = 1.0  # after a fault, before it is mended
 STEADY_S = 1.5  # it has followed before a fault strikes
 RESUMES_WITHIN_S = 30.0
+SWING_S = 5.0  # longer than the hands take to and fro
 CELL = "thirdhand"
 
 
@@ -118,6 +119,7 @@ class FaultyCell:
     def __init__(self, folder: Path, *, network: Network = "relays") -> None:
         self.folder, self.records, self.network = folder, folder / "records", network
         self.commands: list[Command] = []  # of the service's first life
+        self.unasked = 0  # faults that nobody struck: a machine that is busy
         self._parts = contextlib.ExitStack()
         self._life = contextlib.ExitStack()
         self._lives = 0
@@ -201,8 +203,16 @@ class FaultyCell:
         return time.monotonic()
 
     def until_fast(self) -> None:
-        """Waits until the tool is fast."""
-        self.until(lambda: self.arm.speed > FAST, "the tool was not fast")
+        """Waits until the tool is fast; a fault that nobody struck is counted and reset."""
+        end = time.monotonic() + RESUMES_WITHIN_S
+        while time.monotonic() < end:
+            with contextlib.suppress(FaultError):
+                self.until(lambda: self.arm.speed > FAST, "the tool was not fast", within_s=SWING_S)
+                return
+            if self.client.status()["mode"] == "fault":
+                self.unasked += 1
+                self.client.ask("reset")
+        raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
 
     def suffer(self, name: str, fault: Fault) -> Event:
         """What came of a fault that strikes while the tool is fast, and of mending it."""

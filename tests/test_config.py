@@ -131,6 +131,43 @@ def test_a_reach_without_room_is_refused() -> None:
     assert "reach.inner" in refusal("[reach]\ninner = 0.9\nouter = 0.5")
 
 
+def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
+    text = """
+    rate_hz = 7
+    a-b = 1
+    [tool]
+    max_speed = -1
+    colour = 'red'
+    [hands]
+    unit = 'ft'
+    [network]
+    listen = ['tcp/0.0.0.0:1']
+    [reach]
+    inner = 3
+    outer = 2
+    [joints]
+    jerk = [1, 1, 0, 1, 1, 1, 1]
+    velocity = [9, 1, 1, 1, 1, 1, 8]
+    """
+    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
+    assert sorted(line.split(":")[0] for line in lines) == [
+        "$",
+        "$.hands.unit",
+        "$.joints.jerk[2]",
+        "$.joints.velocity[0]",
+        "$.joints.velocity[6]",
+        "$.network.listen[0]",
+        "$.rate_hz",
+        "$.reach.inner",
+        "$.tool",
+        "$.tool.max_speed",
+    ]
+
+
+def test_what_follows_from_another_error_is_not_told() -> None:
+    assert "posture" not in refusal("[joints]\nnames = 3\n[arm]\nposture = [0, 0, 0]")
+
+
 def test_a_toml_error_is_told_with_its_place() -> None:
     assert refusal("rate_hz = 500\nhands = [").startswith("cell.toml: ")
     assert "line 2" in refusal("rate_hz = 500\nhands = = 3\n")

@@ -228,12 +228,14 @@ def disk() -> Iterator[tuple[Path, bool]]:
 @dataclass
 class Suffered:
     """The figures of faults by name, the tool's speed around each (T, 2) [s, m/s], and how many
-    commands went out that are neither recorded nor counted as lost.
+    commands went out that are neither recorded nor counted as lost, and how many faults came that
+    nobody struck.
     """
 
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
     speeds: dict[str, Array] = field(default_factory=dict)
     unaccounted: int = 0
+    unasked: int = 0
 
 
 def suffered(names: Sequence[str], say: Callable[[str], None] = lambda line: None) -> Suffered:
@@ -269,6 +271,7 @@ def _suffer(
             events.append(cell.suffer(name, FAULTS[name]))
         cell.close()
         recorded, steps = Recorded(cell.records), np.array(cell.arm.steps)
+    result.unasked += cell.unasked
     for event in events:
         result.figures[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
         near = steps[(steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)]
@@ -299,7 +302,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say)
     print(table(came.figures), flush=True)
     _draw(results, came)
-    return {"faults": came.figures, "unaccounted_ticks": came.unaccounted, "load": os.getloadavg()[0]}
+    return {
+        "faults": came.figures,
+        "unaccounted_ticks": came.unaccounted,
+        "unasked_faults": came.unasked,
+        "load": os.getloadavg()[0],
+    }
 
 
 def _draw(results: Results, came: Suffered) -> None:
