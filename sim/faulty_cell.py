@@ -18,20 +18,20 @@ from typing import Literal, NamedTuple, Self
 
 import zenoh
 
-from service.client import Client, open_session
+from service.client import Client, UnreachableError, open_session
 from service.contract import cdr, channels
 from service.launch import Launched, launched
 from service.shell.clock import Deadlines
 from sim.bench import Bench
 from sim.network import Bridge, Live
-from sim.parts import CLIENT, Link, Part, before_others
+from sim.parts import CLIENT, Link, Part, as_usual_afterwards, before_others
 from sim.scene import Scene
 from sim.script import HandScript
 
 FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
 WATCHED_S = 1.0  # after a fault, before it is mended
 STEADY_S = 1.5  # it has followed before a fault strikes
-RESUMES_WITHIN_S = 30.0
+RESUMES_WITHIN_S = 60.0
 SWING_S = 5.0  # longer than the hands take to and fro
 CELL = "thirdhand"
 
@@ -140,7 +140,8 @@ class FaultyCell:
                 to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
             routed = self.network == "router"
             # the operator is at the service itself, so that what left it is known whatever is cut
-            self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
+            with as_usual_afterwards():
+                self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
             self.tracker = self._part(parts, "tracker", to_tracker, *["--routed"] * routed)
             self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, routed)))
@@ -202,16 +203,16 @@ class FaultyCell:
             time.sleep(0.005)
         return time.monotonic()
 
-    def until_fast(self) -> None:
-        """Waits until the tool is fast; a fault that nobody struck is counted and reset."""
+    def until_fast(self, speed: float = FAST) -> float:
+        """When the tool came to be as fast [s]; a fault that nobody struck is counted and reset."""
         end = time.monotonic() + RESUMES_WITHIN_S
         while time.monotonic() < end:
             with contextlib.suppress(FaultError):
-                self.until(lambda: self.arm.speed > FAST, "the tool was not fast", within_s=SWING_S)
-                return
-            if self.client.status()["mode"] == "fault":
-                self.unasked += 1
-                self.client.ask("reset")
+                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
+            with contextlib.suppress(UnreachableError):
+                if self.client.status()["mode"] == "fault":
+                    self.unasked += 1
+                    self.client.ask("reset")
         raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
 
     def suffer(self, name: str, fault: Fault) -> Event:
@@ -226,7 +227,7 @@ class FaultyCell:
         time.sleep(max(0.0, struck + fault.lasts_s - time.monotonic()))
         mended = time.monotonic()
         fault.mend(self)
-        moving = self.until(lambda: self.arm.speed > MOVES, "the tool did not move again")
+        moving = self.until_fast(MOVES)
         lost = self.client.status()["scribe"]["lost"] - lost
         return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
 

@@ -27,6 +27,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 
 from service import child
 from service.client import endpoints, open_session
@@ -48,6 +49,17 @@ def before_others() -> None:
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+
+
+@contextlib.contextmanager
+def as_usual_afterwards() -> Iterator[None]:
+    """Within it, threads that are started run before other processes; this one only until its end."""
+    before_others()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(PermissionError, AttributeError, OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class PartError(RuntimeError):
