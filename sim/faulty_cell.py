@@ -207,7 +207,7 @@ class FaultyCell:
         """When the tool came to be as fast [s]; a fault that nobody struck is counted and reset."""
         end = time.monotonic() + RESUMES_WITHIN_S
         while time.monotonic() < end:
-            with contextlib.suppress(FaultError):
+            with contextlib.suppress(FaultError, UnreachableError):
                 return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
             with contextlib.suppress(UnreachableError):
                 if self.client.status()["mode"] == "fault":

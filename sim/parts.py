@@ -53,7 +53,7 @@ def before_others() -> None:
 
 @contextlib.contextmanager
 def as_usual_afterwards() -> Iterator[None]:
-    """Within it, threads that are started run before other processes; this one only until its end."""
+    """Within it, threads that are started run before other processes; this one until its end."""
     before_others()
     try:
         yield

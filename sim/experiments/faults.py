@@ -50,12 +50,12 @@ def _begin_anew(part: str) -> Act:
 
 
 def _and_reset(mend: Act) -> Act:
-    """Mends, then resets the service, as an operator would."""
+    """Mends, then resets a service that is at fault, as an operator would."""
 
     def mend_and_reset(cell: FaultyCell) -> None:
         mend(cell)
-        cell.until(lambda: cell.client.status()["mode"] == "fault", "the service was not at fault")
-        cell.client.ask("reset")
+        if cell.client.wait_until_ready()["mode"] == "fault":
+            cell.client.ask("reset")
 
     return mend_and_reset
 
@@ -125,7 +125,17 @@ FAULTS = {
     "router killed": Fault(_signal("router", KILL), _and_reset(_begin_anew("router")), network="router"),
     "service asked to end": Fault(_end_the_service, FaultyCell.begin_service, network="router"),
 }
-SHORT = ("tracker killed", "network to the arm silent", "scribe killed", "service killed", "router killed")
+SHORT = (
+    "tracker killed",
+    "tracker frozen",
+    "network to the tracker silent",
+    "network to the arm silent",
+    "network to the arm torn",
+    "scribe killed",
+    "service killed",
+    "router killed",
+    "cable pulled",
+)
 
 
 class Recorded:

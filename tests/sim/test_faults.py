@@ -31,13 +31,15 @@ def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     assert main(["faults", "--output", str(folder), "--share", "0.1", "--quiet"]) == 0
     assert (folder / "faults.png").read_bytes()[:4] == b"\x89PNG"
     found: dict[str, Any] = json.loads((folder / "faults.json").read_text())
-    assert list(found["faults"]) == [name for name in found["faults"] if name in SHORT]
-    assert len(found["faults"]) == len(SHORT)
+    assert set(found["faults"]) >= set(SHORT) - {"cable pulled"}
     return found
 
 
-def test_a_tracker_that_is_killed_stops_the_arm_when_its_hands_are_stale(suffered: dict[str, Any]) -> None:
-    one = suffered["faults"]["tracker killed"]
+@pytest.mark.parametrize("name", ["tracker killed", "tracker frozen", "network to the tracker silent"])
+def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
+    suffered: dict[str, Any], name: str
+) -> None:
+    one = suffered["faults"][name]
     assert one["reason"] == "stale_hand"
     assert 80 <= one["hold_ms"] <= 110
     assert one["rest_ms"] < 700
@@ -46,13 +48,17 @@ def test_a_tracker_that_is_killed_stops_the_arm_when_its_hands_are_stale(suffere
     assert one["lost_ticks"] == 0
 
 
-def test_a_network_that_falls_silent_leaves_no_arm_in_motion_and_nothing_late_moves_it(
-    suffered: dict[str, Any],
+@pytest.mark.parametrize("name", ["network to the arm silent", "network to the arm torn", "cable pulled"])
+def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it(
+    suffered: dict[str, Any], name: str
 ) -> None:
-    one = suffered["faults"]["network to the arm silent"]
+    if name not in suffered["faults"]:
+        pytest.skip("a network namespace is not allowed here")
+    one = suffered["faults"][name]
     assert one["reason"] in ("arm_error", "arm_silent")
     assert one["hold_ms"] <= 110
-    assert one["travelled_mm"] < BRAKE_MM < one["commanded_mm"]
+    assert one["travelled_mm"] < BRAKE_MM
+    assert one["speed_at_the_end_m_per_s"] < 1e-3
     assert one["fastest_m_per_s"] < 1.0  # also when all comes that was held back
     assert one["lost_ticks"] == 0
 
