@@ -32,6 +32,7 @@ BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
 READY_TIMEOUT_S = 15.0
 RESTART_S = 1.0
+NOT_RECORDED = "ticks are not recorded"
 SILENT_S = 5.0  # a scribe reports twice a second
 
 
@@ -247,8 +248,8 @@ class Scribe:
             for _, fd in self._memory.values():
                 os.close(fd)
             self._memory = {}
-        lost = self._lost + self._buried
-        return f"{lost} of {self._sent + self._lost} ticks are not recorded" if lost else ""
+        lost = self._lost + self._buried if self._folder is not None or self._recording is not None else 0
+        return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
         """A process that was given its task and is not told anything yet."""

@@ -70,7 +70,7 @@ class Pending:
         """
         if not self._taken.wait(ADOPTION_TIMEOUT_S):
             if self._claim.acquire(blocking=False):
-                raise RequestError("the control loop did not take the request: it is ending or stalled")
+                raise RequestError("the loop did not take the request: it is starting, ending or stalled")
             self._taken.wait()
         return self._tick
 

@@ -264,7 +264,9 @@ def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Worksh
 def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
     cell.running = False
-    with pytest.raises(RefusedError, match="the control loop did not take the request: it is ending or stalled"):
+    with pytest.raises(
+        RefusedError, match="the loop did not take the request: it is starting, ending or stalled"
+    ):
         cell.client.ask("hold")
 
 

@@ -18,9 +18,9 @@ from cell import LEFT, Tracker, thirdhand
 from service.client import Client, UnreachableError, endpoints, open_session
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
+from service.contract.roles import ROLES, access_control
 from service.launch import launched
 from service.shell.door import BOUNDS
-from service.shell.roles import ROLES, access_control
 
 CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state")
