@@ -81,7 +81,7 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
         raise ExplainedError(f"{folder / AUTHORITY_KEY} is not the key of {beside}")
-    if authority.not_valid_after_utc <= datetime.datetime.now(datetime.UTC):
+    if authority.not_valid_after_utc <= now():
         raise ExplainedError(
             f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: make all anew"
         )
@@ -126,8 +126,13 @@ def _write(
     return until
 
 
+def now() -> datetime.datetime:
+    """The time by which certificates are made."""
+    return datetime.datetime.now(datetime.UTC)
+
+
 def _days_from_now(days: int) -> datetime.datetime:
-    return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+    return now() + datetime.timedelta(days=days)
 
 
 def _name(common: str) -> x509.Name:
@@ -150,7 +155,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(datetime.datetime.now(datetime.UTC) - CLOCKS_DIFFER)
+        .not_valid_before(now() - CLOCKS_DIFFER)
         .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
