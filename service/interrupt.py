@@ -16,7 +16,7 @@ from types import FrameType
 from typing import NoReturn
 
 EXIT_CODE = 128 + signal.SIGINT
-_PUTS_AWAY = threading.Event()
+_PUTS_AWAY, _RAISED = threading.Event(), threading.Event()
 
 
 def end_at_once() -> NoReturn:
@@ -52,7 +52,8 @@ def put_away_first() -> Iterator[None]:
 
 def _raise_to_put_away(number: int, frame: FrameType | None) -> None:
     """Python's handler; that of all other cases is `_serve`, which waits for no bytecode."""
-    if _PUTS_AWAY.is_set():
+    if _PUTS_AWAY.is_set() and not _RAISED.is_set():
+        _RAISED.set()
         raise KeyboardInterrupt
 
 

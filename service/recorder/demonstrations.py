@@ -73,7 +73,7 @@ def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda 
     if any(not fault.cut for fault in messages.faults):
         raise RecordingError(f"{path}: {faults}; {there} can be read; nothing is learned from it")
     if faults:
-        say(f"{path}: {faults}; {there} are there and learned from")
+        say(f"{path}: {faults}; {there} are there")
     tracks = []
     for name, poses in rows.items():
         if not poses:

@@ -175,8 +175,8 @@ class Daemon:
         try:
             self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
             reporter = watch.start("status thread", self._report, self._fail)
-            announce(self)
             self._granted = ask_for_real_time()
+            announce(self)
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             watch.watched("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
