@@ -17,6 +17,7 @@ import msgspec
 
 from service.contract.channels import ENDPOINT
 from service.contract.explain import InvalidError, validated
+from service.contract.roles import DAEMON, ROLES, names
 from service.described_arm import SettingsError, check, completed
 from service.urdf import Urdf, UrdfError
 
@@ -181,18 +182,29 @@ class Network(Section, frozen=True):
     listen: tuple[str, ...] = (ENDPOINT,)
     connect: tuple[str, ...] = ()
     certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
-    allow_insecure: bool = False  # listen for other machines without TLS: whoever reaches it moves the arm
+    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
+    allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
 
     def __post_init__(self) -> None:
-        for i, endpoint in enumerate(self.listen):
+        endpoints = {f"listen[{i}]": endpoint for i, endpoint in enumerate(self.listen)}
+        endpoints |= {f"connect[{i}]": endpoint for i, endpoint in enumerate(self.connect)}
+        for name, endpoint in endpoints.items():
             if self.certificate and not endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.listen[{i}]: {endpoint} given; with a certificate tls/... needed")
+                raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
             if not self.certificate and endpoint.startswith("tls/"):
                 raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
             if not (self.certificate or self.allow_insecure or is_local(endpoint)):
                 raise ValueError(
-                    f"$.network.listen[{i}]: {endpoint} given; other machines could move the arm: an address like "
+                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an address like "
                     "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
+                )
+        if self.revoked and not self.certificate:
+            raise ValueError("$.network.revoked: given without $.network.certificate; without one nobody is told apart")
+        for i, name in enumerate(self.revoked):
+            if not any(name in names(role) for role in (*ROLES, DAEMON)):
+                raise ValueError(
+                    f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
+                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
                 )
 
 

@@ -33,6 +33,7 @@ _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
 READY_TIMEOUT_S = 15.0  # to listen; one that was replaced for it is followed by one with twice the time
 LONGEST_READY_S = 240.0
 RESTART_S = 1.0
+NOT_RECORDED = "ticks are not recorded"
 SILENT_S = 5.0  # a scribe reports twice a second
 
 
@@ -252,8 +253,8 @@ class Scribe:
             for _, fd in self._memory.values():
                 os.close(fd)
             self._memory = {}
-        lost = self._lost + self._buried
-        return f"{lost} of {self._sent + self._lost} ticks are not recorded" if lost else ""
+        lost = self._lost + self._buried if self._folder is not None or self._recording is not None else 0
+        return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
         """A process that was given its task and is not told anything yet."""
