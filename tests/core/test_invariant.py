@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from explained import Explained
 from hypothesis import HealthCheck
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
@@ -65,6 +66,7 @@ class Cell(RuleBasedStateMachine):
     @initialize(skill=st.integers(0, len(SKILLS) - 1), hands=st.booleans())
     def start(self, skill: int, hands: bool) -> None:
         self.controller = Controller(SETTINGS, SKILLS[skill], urdf=URDF)
+        self.controller._setpoint = Explained(SETTINGS)
         self.tick = 0
         self.joints: Vector = np.array(SETTINGS.arm.posture)
         self.at: Vector = np.array([LEFT, RIGHT])
