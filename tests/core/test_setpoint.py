@@ -108,7 +108,7 @@ def test_targets_that_alternate_or_tremble_make_no_setpoint_run_away(
 
 
 @properties
-@given(st.lists(inside, min_size=2, max_size=4), inside, st.integers(1, 40), st.floats(0.0, 1e4))
+@given(st.lists(inside, min_size=2, max_size=4), inside, st.integers(1, 40), st.sampled_from([0.0, 1e2, 1e4, 1e6]))
 def test_an_axis_that_wild_ones_starve_comes_back(
     places: list[tuple[float, ...]], start: tuple[float, ...], ticks: int, wild: float
 ) -> None:
@@ -117,7 +117,7 @@ def test_an_axis_that_wild_ones_starve_comes_back(
     for k in range(1500):
         y, z = places[k // ticks % len(places)][1:]
         sign = (-1.0) ** (k // ticks)
-        targets.append(np.array([(0.5, y, z), (0.0, sign * wild, -sign * wild), (0.0, 0.0, 0.0)]))
+        targets.append(np.array([(0.5, y, z), (0.0, 0.0, 0.0), (0.0, sign * wild, -sign * wild)]))
     states, _ = driven(targets, start=at_rest(start))
     back_s = (abs(start[0] - 0.5) - HULL_MARGIN) / (RETURN_SHARE * TOOL.max_speed)
     if back_s < len(targets) * PERIOD_S - 2 * HULL_TIME_S:
