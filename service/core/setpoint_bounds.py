@@ -151,7 +151,7 @@ def farthest(setpoint: Vector, axis: int, side: float, hardest: float, sharpest:
     """
     stop = np.empty(6)
     fastest_stop(side * setpoint[1, axis] + back, side * setpoint[2, axis], hardest, sharpest, 0.0, stop)
-    return side * setpoint[0, axis] + stop[4]
+    return float(side * setpoint[0, axis] + stop[4])
 
 
 @compiled
