@@ -16,6 +16,7 @@ LIMITS, TOOL = SETTINGS.joints, SETTINGS.tool
 LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
 SPEED, ACCELERATION, JERK = (np.array(of) for of in (LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk))
 EXACT, OVER_M = 1e-9, 0.05
+BEHIND_M = 0.25  # [m] of a tool that something near keeps back; else centimetres
 SOME = 3  # of the frames the tool's speed is looked at
 ARM = Arm(SETTINGS, URDF)
 
@@ -43,10 +44,13 @@ def bounds_hold(seen: np.ndarray, measured: np.ndarray, *, box: Vector) -> None:
     assert there[jumps].all(), "a jump to where the arm is not"
     jerks = (after["joint_accelerations"] - before["joint_accelerations"]) / PERIOD_S
     assert (np.abs(jerks) <= JERK * (1 + EXACT) + EXACT / PERIOD_S).all()
-    beyond = np.maximum(box[0] - seen["setpoint"], seen["setpoint"] - box[1]).max(axis=1)
-    follows = seen["mode"] == Mode.FOLLOW  # from an arm that stands outside it comes back
-    leaves = follows[1:] & follows[:-1] & (beyond[1:] > np.maximum(OVER_M, beyond[:-1] + EXACT))
-    assert not leaves.any(), "a setpoint that leaves the workspace"
+    follows = seen["mode"] == Mode.FOLLOW
+    for name in ("setpoint", "tool"):  # an arm that stands outside, or moves outwards at the start, comes back
+        beyond = np.maximum(box[0] - seen[name], seen[name] - box[1]).max(axis=1)
+        leaves = follows[1:] & follows[:-1] & (beyond[1:] > np.maximum(OVER_M, beyond[:-1] + EXACT))
+        assert not leaves.any(), f"a {name} that leaves the workspace"
+    gap = np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)[follows]
+    assert gap.max(initial=0.0) <= BEHIND_M, "a tool that does not follow its setpoint"
     following = seen[follows]
     for frame in following[::SOME]:
         here = ARM.at(frame["joints"])
