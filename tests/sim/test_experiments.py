@@ -109,7 +109,7 @@ class TestExperiments:
         assert found["random"]["successes"] == found["scenes"] == 2
         assert found["random"]["overlaps"] == 0
         for kind in ("random", "thrust"):
-            assert found[kind]["excess_after_reaction"] < found["slip_m_per_s"] + 0.02
+            assert found[kind]["excess_after_reaction"] < found["slip_m_per_s"]
             assert found[kind]["pushed_mm"] < 2
             assert min(found[kind]["self_mm"], found[kind]["table_mm"]) > 5
 
