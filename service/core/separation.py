@@ -66,6 +66,7 @@ class Separation:
         self._things = np.array([things.brake, things.reaction_ms / 1000, things.clearance])
         count, joints = len(self._body.links), len(settings.joints.names)
         most = 2 * count * len(AHEAD_S) + 3 * count * len(boxes) + len(self._body.pairs)
+        self._fastest = np.array(settings.joints.velocity)
         self.rows, self.plan, self.allowed = np.zeros((most, joints)), np.zeros(most), np.zeros(most)
         self.told, self.count = np.array([FARTHEST, IRRELEVANT, 1.0]), 0
         self._placed = np.zeros((2, count, 2, 3))
@@ -94,6 +95,7 @@ class Separation:
             self._people,
             self._things,
             self._contacts,
+            self._fastest,
             self._placed,
             self.rows,
             self.plan,
@@ -136,6 +138,7 @@ def _look(
     people: Vector,
     things: Vector,
     contacts: Vector,
+    fastest: Vector,
     placed: Vector,
     rows: Vector,
     plan: Vector,
@@ -186,7 +189,7 @@ def _look(
                     _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
                     if links[capsule] == len(q):
                         told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                    count += 1
+                    count += _may_pass(rows[count], plan[count], fastest)
     for capsule in range(first, len(links)):
         for box in range(len(boxes)):
             inner = nearest_to_box(here[capsule], boxes[box])
@@ -198,15 +201,24 @@ def _look(
                     _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
                     if links[capsule] == len(q):
                         told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                    count += 1
+                    count += _may_pass(rows[count], plan[count], fastest)
     for pair in range(len(pairs)):
         one, other = pairs[pair, 0], pairs[pair, 1]
         distance = between_segments(here[one], here[other], near) - radii[one] - radii[other]
         if _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
             _bring_together(rows[count], near, 0, tool, jacobian, links[one], 1.0)
             _bring_together(rows[count], near, 3, tool, jacobian, links[other], -1.0)
-            count += 1
+            count += _may_pass(rows[count], plan[count], fastest)
     return count
+
+
+@compiled
+def _may_pass(row: Vector, limit: float, fastest: Vector) -> int:
+    """1 if joints within their greatest speeds can pass a limit along a row (J,), else 0."""
+    most = 0.0
+    for j in range(len(row)):
+        most += abs(row[j]) * fastest[j]
+    return 1 if most > limit else 0
 
 
 @compiled
