@@ -205,9 +205,11 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
         }
     else:
         gaps = np.diff([event.struck_s, *(command[0] for command in told)])
+        before = np.diff([command[0] for command in cell.commands if 0 < event.struck_s - command[0] < BEFORE_S])
         found |= {
             "command_largest_gap_ms": 1e3 * float(gaps.max()),
             "command_mean_gap_ms": 1e3 * float(gaps.mean()),
+            "command_mean_gap_before_ms": 1e3 * float(before.mean()),
             "held_ms": period_ms * recorded.stopped(event.tick, told[-1][1]),
         }
     return found
