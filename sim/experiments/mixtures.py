@@ -12,8 +12,9 @@ import numpy as np
 from kmp import GaussianMixture
 from sim.experiments.results import Array
 from sim.experiments.trials import Predicted
-from sim.people import Places, Shown
+from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
+from sim.sessions import Shown
 
 LEAST_STD_M, SEED = 0.001, 0
 UNUSUAL = 0.001  # share of the demonstrations' samples that are less usual than the threshold
@@ -21,7 +22,7 @@ SLACK = 10.0  # [nat] less usual than those: far
 
 
 def frames(places: Places) -> Array:
-    """Where hands and tool are at start, handover, glass and soldering, as perceived: (4, 9) [m]."""
+    """Hands and tool at start, handover, glass and soldering, as perceived: (4, 9) [m]."""
     p = places
     return np.array(
         [
@@ -36,6 +37,15 @@ def frames(places: Places) -> Array:
 def joined(shown: Shown) -> Array:
     """Hands and tool (T, 9) [m]."""
     return np.hstack([shown.hands, shown.tool])
+
+
+def way_gone(shown: Shown) -> Array:
+    """The share (T,) of the way that hands and tool have gone; rest is none."""
+    window = np.ones(13) / 13  # half a second
+    x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
+    speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
+    gone = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m]: less than 2 cm/s is no way gone
+    return np.asarray((gone - gone[0]) / (gone[-1] - gone[0]))
 
 
 @dataclass(frozen=True)
@@ -113,9 +123,9 @@ class TaskParameterised:
     iterations: int = 40
 
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedFrames:
-        """The mixture, by EM from equal spans of time; responsibilities are shared by the frames."""
+        """The mixture, by EM from equal spans of the way; the frames share responsibilities."""
         local = np.concatenate([joined(one)[:, None] - frames(one.places) for one in demonstrations])  # (M, 4, 9)
-        phase = np.concatenate([np.linspace(0, 1 - 1e-9, len(one.times)) for one in demonstrations])
+        phase = 0.999 * np.concatenate([way_gone(one) for one in demonstrations])
         count = self.components
         share = np.eye(count)[(phase * count).astype(int)]
         weights, means, covariances = np.empty(0), np.empty(0), np.empty(0)
@@ -127,10 +137,7 @@ class TaskParameterised:
             covariances = np.einsum("mk,mkfi,mkfj->kfij", share, off, off, optimize=True) / total[:, None, None, None]
             covariances += self.regularization_m**2 * np.eye(9)
             logs = np.log(weights) + np.stack(
-                [
-                    sum(_log_normal(local[:, f], means[k, f], covariances[k, f]) for f in range(4))
-                    for k in range(count)
-                ],
+                [sum(_log_normal(local[:, f], means[k, f], covariances[k, f]) for f in range(4)) for k in range(count)],
                 axis=1,
             )
             share = np.exp(logs - _log_sum(logs)[:, None])
@@ -141,7 +148,7 @@ class TaskParameterised:
 
 @dataclass(frozen=True, eq=False)
 class LearnedFrames:
-    """Weights (K,), means (K, 4, 9) [m], covariances (K, 4, 9, 9) [m²] of a mixture in four frames."""
+    """A mixture in four frames: weights (K,), means (K, 4, 9), covariances (K, 4, 9, 9) [m]."""
 
     weights: Array
     means: Array
@@ -160,8 +167,8 @@ class LearnedFrames:
 
 @dataclass(frozen=True)
 class InteractionProMP:
-    """Interaction ProMP (Amor et al. 2014; Ewerton et al. 2015): hands and tool share a distribution
-    of weights over the phase, which is conditioned on the places.
+    """Interaction ProMP (Amor et al. 2014; Ewerton et al. 2015): hands and tool share a
+    distribution of weights over the phase, which is conditioned on the places.
 
     The phase is estimated from the hands so far by a hidden Markov model over a grid; the tool is
     the expectation over it, conditioned on where the hands are now. Not conditioned: weights on
@@ -205,11 +212,7 @@ class InteractionProMP:
         """The phase (T,) of a demonstration's samples."""
         if not self.by_length:
             return np.linspace(0.0, 1.0, len(one.times))
-        window = np.ones(13) / 13  # half a second
-        x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(one).T], axis=1)
-        speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
-        gone = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m]: less than 2 cm/s is no way gone
-        return np.asarray((gone - gone[0]) / (gone[-1] - gone[0]))
+        return way_gone(one)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +259,7 @@ class PlacedInteraction:
 
     def evidence(self, hands: Array) -> Array:
         """Log density (T,) of hands (T, 6) at the likeliest phase."""
-        return self._likelihoods(hands).max(axis=1)
+        return np.asarray(self._likelihoods(hands).max(axis=1))
 
     def mean(self, hands: Array) -> Array:
         """As `trials.Placed`."""
@@ -273,7 +276,9 @@ class PlacedInteraction:
         tools = constant + np.einsum("ti,zio->tzo", hands, gains, optimize=True)
         mean = np.einsum("tz,tzo->to", beliefs, tools)
         off = tools - mean[:, None]
-        covariance = np.einsum("tz,zop->top", beliefs, left) + np.einsum("tz,tzo,tzp->top", beliefs, off, off, optimize=True)
+        covariance = np.einsum("tz,zop->top", beliefs, left) + np.einsum(
+            "tz,tzo,tzp->top", beliefs, off, off, optimize=True
+        )
         return Predicted(mean, covariance, logs.max(axis=1) < self.threshold)
 
     def _likelihoods(self, hands: Array) -> Array:
@@ -284,8 +289,8 @@ class PlacedInteraction:
         """The belief in each phase (T, Z), from the hands until then."""
         cells = self.method.cells
         steps = {-1: 0.05, 0: 0.60, 1: 0.25, 2: 0.08, 3: 0.02}
-        move = sum(share * np.eye(cells, k=step) for step, share in steps.items()) + 1e-6
-        move = move / move.sum(axis=1, keepdims=True)
+        move = np.sum([share * np.eye(cells, k=step) for step, share in steps.items()], axis=0) + 1e-6
+        move /= move.sum(axis=1, keepdims=True)
         belief = np.exp(-np.arange(cells) / 3.0)
         belief /= belief.sum()
         out = np.empty_like(logs)

@@ -13,7 +13,8 @@ from scipy.signal import butter, sosfiltfilt
 
 from sim.experiments.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
 from sim.experiments.results import Array, ExperimentError
-from sim.people import SHAPE_STEPS, Person, Tracker, person
+from sim.people import Person, Tracker, person
+from sim.sessions import SHAPE_STEPS
 
 SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach is what lies between slow moments, and as long as this
 MOST_UNEVEN = 5.0  # a reach's greatest speed over its mean one: beyond it, it is none

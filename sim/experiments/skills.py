@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
@@ -24,8 +25,9 @@ from service.learning.learn import learn
 from service.learning.via_points import adapted, neighbourhoods
 from sim.experiments.results import Array
 from sim.experiments.trials import Predicted
-from sim.people import Places, Shown
+from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION
+from sim.sessions import Shown
 
 RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each taught place, as the bench teaches them
 COVARIANCE_EVERY = 4  # ticks: as often as a slow tracker speaks
@@ -40,8 +42,9 @@ def via_points(places: Places, *, start: bool = False) -> tuple[ViaPoint, ...]:
     std = max(places.std_m / math.sqrt(3.0), LEAST_STD_M)
 
     def point(name: str, left: Array, right: Array, tool: Array, follow: str = "none") -> ViaPoint:
-        at = [tuple(np.round(p, 6).tolist()) for p in (left, right, tool)]
-        return ViaPoint(name, *at, std=std, radius=RADIUS_M, follow=follow)  # type: ignore[arg-type]
+        given = [np.round(p, 6).tolist() for p in (left, right, tool)]
+        fields = {"name": name, "left": given[0], "right": given[1], "tool": given[2], "follow": follow}
+        return msgspec.convert({**fields, "std": std, "radius": RADIUS_M}, ViaPoint)
 
     p = places
     taught = (
@@ -64,9 +67,7 @@ class Service:
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
         """The skill that the service learns."""
         taken = [recorded(one) for one in demonstrations]
-        skill = learn(
-            taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components
-        )
+        skill = learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
         return LearnedByService(skill)
 
 
@@ -129,7 +130,7 @@ class NoDemonstrations:
         """The regression through these places."""
         at, wanted, std = neighbourhoods(via_points(places, start=True))
         kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
-        return PlacedProcess.of([kernel], [at], [wanted], [std**2], wanted.mean(axis=0))
+        return PlacedProcess.of([kernel], [at], [wanted], [std**2], centre=wanted.mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,8 @@ class GaussianProcess:
     Hensman et al. 2013.)
     """
 
-    each: int = 40  # samples of a demonstration
+    each: int = 30  # samples of a demonstration
+    own_m: float = 0.0  # least deviation of a demonstration's own function
     gate: float = 1.5  # times the largest deviation along a demonstration that is left out: far
 
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedProcess:
@@ -213,18 +215,27 @@ class GaussianProcess:
         centre = outputs.mean(axis=0)
         left, right = (cdist(part, part, "sqeuclidean") for part in (inputs[:, :3], inputs[:, 3:]))
 
-        def cost(log: Array) -> float:
+        def cost(log: Array) -> tuple[float, Array]:
             shared, own, l_s, r_s, l_o, r_o, noise = np.exp(log)
-            k = shared**2 * np.exp(-0.5 * (left / l_s**2 + right / r_s**2))
-            k += same * own**2 * np.exp(-0.5 * (left / l_o**2 + right / r_o**2))
-            k[np.diag_indices_from(k)] += noise**2 + 1e-8
-            root = np.linalg.cholesky(k)
-            white = solve_triangular(root, outputs - centre, lower=True)
-            return float(3.0 * np.log(np.diag(root)).sum() + 0.5 * (white**2).sum())
+            first = shared**2 * np.exp(-0.5 * (left / l_s**2 + right / r_s**2))
+            second = same * own**2 * np.exp(-0.5 * (left / l_o**2 + right / r_o**2))
+            root = cho_factor(first + second + (noise**2 + 1e-8) * np.eye(len(same)), lower=True)
+            weights = cho_solve(root, outputs - centre)
+            outer = 0.5 * (3.0 * cho_solve(root, np.eye(len(same))) - weights @ weights.T)
+            by_first, by_second = outer * first, outer * second
+            slopes = [2.0 * by_first.sum(), 2.0 * by_second.sum()]
+            slopes += [(by_first * left).sum() / l_s**2, (by_first * right).sum() / r_s**2]
+            slopes += [(by_second * left).sum() / l_o**2, (by_second * right).sum() / r_o**2]
+            slopes += [2.0 * noise**2 * np.trace(outer)]
+            value = 3.0 * np.log(np.diag(root[0])).sum() + 0.5 * np.sum(weights * (outputs - centre))
+            return float(value), np.array(slopes)
 
-        begin = np.log([0.2, 0.05, 0.3, 0.3, 0.3, 0.3, 0.005])
-        bounds = [(np.log(low), np.log(high)) for low, high in [(0.02, 2.0)] * 2 + [(0.05, 3.0)] * 4 + [(0.001, 0.05)]]
-        found = np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}).x)
+        begin = np.log([0.2, max(0.05, self.own_m), 0.3, 0.3, 0.3, 0.3, 0.005])
+        bounds = [
+            (np.log(low), np.log(high))
+            for low, high in [(0.02, 2.0), (max(self.own_m, 0.02), 2.0)] + [(0.05, 3.0)] * 4 + [(0.001, 0.05)]
+        ]
+        found = np.exp(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 100}).x)
         kernels = [Kernel(found[i] ** 2, np.repeat(found[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)]
         base = LearnedProcess(kernels[0], kernels[1], float(found[6]), inputs, outputs, owner, centre, np.inf)
         held_out = [base.without(i).place(None).predict(one.hands).deviation for i, one in enumerate(demonstrations)]
@@ -262,7 +273,9 @@ class LearnedProcess:
         inputs = [self.inputs[group] for group in groups] + [at]
         outputs = [self.outputs[group] for group in groups] + [wanted]
         noise = [np.full(int(group.sum()), self.noise**2) for group in groups] + [std**2]
-        return PlacedProcess.of([self.shared, self.own], inputs, outputs, noise, self.centre, self.threshold)
+        return PlacedProcess.of(
+            [self.shared, self.own], inputs, outputs, noise, centre=self.centre, threshold=self.threshold
+        )
 
 
 class PredictedWithDeviation(Predicted):
@@ -295,6 +308,7 @@ class PlacedProcess:
         inputs: Sequence[Array],
         outputs: Sequence[Array],
         noise: Sequence[Array],
+        *,
         centre: Array,
         threshold: float = np.inf,
     ) -> PlacedProcess:
@@ -320,8 +334,9 @@ class PlacedProcess:
     def predict(self, hands: Array) -> PredictedWithDeviation:
         """As `trials.Placed`."""
         rows = self._rows(hands)
-        variance = self._prior - np.sum(solve_triangular(self.root[0], rows.T, lower=True) ** 2, axis=0)
-        variance = np.maximum(variance, 1e-6)
+        white = solve_triangular(self.root[0], rows[::COVARIANCE_EVERY].T, lower=True)
+        some = np.maximum(self._prior - np.sum(white**2, axis=0), 1e-6)
+        variance = np.repeat(some, COVARIANCE_EVERY)[: len(hands)]
         covariance = variance[:, None, None] * np.eye(3)
         return PredictedWithDeviation(rows @ self.weights + self.centre, covariance, np.sqrt(variance) > self.threshold)
 

@@ -7,26 +7,27 @@ All in process at one rate, the same for every skill. The tool is where the setp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
+from scipy.stats import chi2
 
 from service.config import Settings
 from service.contract.messages import BASE, PoseStamped
-from service.core.controller import state_layout
-from service.core.frame import blank
+from service.core.frame import blank, state_layout
 from service.core.intake import Intake
 from service.core.setpoint import SetpointGenerator
 from service.core.stops import fastest_stop
 from service.core.workspace import Target
 from sim.closed_loop import START_NS
 from sim.experiments.results import Array
-from sim.people import Places, Session, Shown
+from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
+from sim.sessions import Session, Shown
 
 RATE_HZ = 125
 WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # of an event
@@ -36,7 +37,8 @@ STEP_S = 1e-3  # of differences along the hands' motion
 SMOOTHED = 5  # ticks over which a target's velocity is taken where the skill has a memory
 RESUMED_S = 0.1  # hands must be near the data for so long after they were far
 LONGEST_DELAY_S = 0.6
-CHI2_50, CHI2_95 = 2.365974, 7.814728  # quantiles for three degrees of freedom
+LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose coverage is counted
+KEPT = 0.05  # share of the time falsely followed up to which the way was kept
 SWAP_OVER_S = 0.2  # after a swap the hands' estimates are still coming back
 Mask = NDArray[np.bool_]
 
@@ -159,21 +161,28 @@ class Outcome(NamedTuple):
     falsely_held: float
     falsely_followed: float
     swapped: float
-    swapped_held: float
+    swapped_held: float  # of the session, as all shares
     negative_log_likelihood: float
-    inside_50: float
-    inside_95: float
+    inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
     predicted_mm: float  # rms that the covariance predicts
     error_mm: float  # rms over the same ticks
 
+    @property
+    def kept(self) -> bool:
+        """A success on the teacher's way, not only at its places."""
+        return self.success and self.falsely_followed <= KEPT
+
 
 def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
-    """The outcome of a session; None stands for the teacher, whose tool is the target."""
+    """The outcome of a session; None stands for the teacher, who is told the places as the others
+    are.
+    """
     predicted, velocity, acceleration = _targets(placed, one)
     mean = np.clip(predicted.mean, box[0], box[1])
     inside = mean == predicted.mean
     held = _held(predicted.far) | ~one.fresh
-    tool = follow(mean, velocity * inside, acceleration * inside, held, one.session.places.robot_start, box)
+    targets = np.stack([mean, velocity * inside, acceleration * inside])
+    tool = follow(targets, held, start=one.session.places.robot_start, box=box)
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
     events = tuple(_event(one, tool, speed, held, i) for i in range(3))
     apart = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
@@ -200,12 +209,11 @@ def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
         tool_delay / RATE_HZ,
         float(held[judged].mean()),
         float((held & good).sum() / judged.sum()),
-        float((~held & (wrong | one.swapped) & judged).sum() / judged.sum()),
+        float((~held & wrong & judged).sum() / judged.sum()),
         float(planted.sum() / judged.sum()),
         float((held & planted).sum() / judged.sum()),
         float(np.minimum(likelihood, 1e3).mean()),
-        float((squares <= CHI2_50).mean()),
-        float((squares <= CHI2_95).mean()),
+        tuple(float((squares <= quantile).mean()) for quantile in np.asarray(chi2.ppf(LEVELS, 3))),
         1000 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())),
         1000 * float(np.sqrt(np.sum(errors**2, axis=1).mean())),
     )
@@ -219,8 +227,10 @@ def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]
     """
     if placed is None or not placed.memoryless:
         if placed is None:
-            count = len(one.times)
-            predicted = Predicted(one.tool, np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool))
+            count, as_told = len(one.times), replace(one.session, places=one.session.told)
+            predicted = Predicted(
+                as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool)
+            )
         else:
             predicted = placed.predict(one.estimates[:, 0])
         before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
@@ -240,17 +250,17 @@ def _held(far: Mask) -> Mask:
     return np.asarray(recent > 0)
 
 
-def follow(mean: Array, velocity: Array, acceleration: Array, held: Mask, start: Array, box: Array) -> Array:
-    """The setpoints (T, 3) [m] that follow targets (T, 3), and brake where held, from rest at
-    `start`.
+def follow(targets: Array, held: Mask, *, start: Array, box: Array) -> Array:
+    """The setpoints (T, 3) [m] that follow targets (3, T, 3), positions, velocities and
+    accelerations, and brake where held (T,), from rest at `start`.
     """
     chosen = settings()
     generator, state = SetpointGenerator(chosen), blank(state_layout(len(chosen.joints.names)))
     generator.begin(state, np.stack([start, np.zeros(3), np.zeros(3)]))
-    costs, out, stop, still = np.zeros((3, 3, 1)), np.empty_like(mean), np.empty(6), np.zeros(3)
+    mean, velocity, acceleration = np.ascontiguousarray(targets)
+    costs, out, stop = np.zeros((3, 3, 1)), np.empty(mean.shape), np.empty(6)
     tool = chosen.tool
     for k in range(len(mean)):
-        target = Target(mean[k], velocity[k], acceleration[k], clamped=False)
         if held[k]:
             now = state["setpoint"]
             if not now[1:].any():
@@ -262,9 +272,8 @@ def follow(mean: Array, velocity: Array, acceleration: Array, held: Mask, start:
                 now[1, i], now[2, i] = stop[0], stop[1]
             generator.begin(state, now.copy())
         else:
-            generator.step(state, Target(*(np.ascontiguousarray(part) for part in target[:3]), False), box, costs, 1.0)
+            generator.step(state, Target(mean[k], velocity[k], acceleration[k], clamped=False), box, costs, 1.0)
         out[k] = state["setpoint"][0]
-    del still
     return out
 
 
@@ -283,7 +292,8 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> Event:
     runs = np.convolve(there, np.ones(steps), mode="valid") if len(there) >= steps else np.zeros(1)
     best = int(np.argmin(uniform_filter1d(off, steps, mode="nearest")))
     true_off = np.linalg.norm(tool[window] - true, axis=1)
-    return Event(bool((runs >= steps - 0.5).any()), 1000 * float(off[best]), 1000 * float(true_off[best]), bool(held[window].mean() > 0.8))
+    reached, was_held = bool((runs >= steps - 0.5).any()), bool(held[window].mean() > 0.8)
+    return Event(reached, 1000 * float(off[best]), 1000 * float(true_off[best]), was_held)
 
 
 def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:
