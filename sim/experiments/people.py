@@ -41,8 +41,8 @@ from sim.people import Group, person
 from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
 
 DEMONSTRATORS = 6
-PEOPLE: dict[Group, int] = {"tuning": 10, "test": 20}
-SCENES: dict[Group, int] = {"tuning": 2, "test": 6}  # of each person, half with each sigma
+PEOPLE: dict[Group, int] = {"tuning": 10, "test": 24}
+SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # of each person, half with each sigma
 SIGMAS_M = (0.005, 0.010)
 BREAKING_SCENES: dict[Group, int] = {"tuning": 10, "test": 40}
 RESAMPLED = 2000
@@ -59,32 +59,26 @@ class Entry(NamedTuple):
 
 METHODS = {
     "ours": Entry("ours, as the service\nlearns and adapts", (Service(),)),
-    "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (10.0, 20.0, 5.0, 2.5, 40.0, 1.0))),
-    "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 6.0, 2.0, 3.0, 8.0, 12.0))),
+    "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0))),
+    "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0))),
     "gaussian_process": Entry(
         "Gaussian process",
         tuple(
             GaussianProcess(each, own_m)
-            for each, own_m in ((30, 0.0), (15, 0.0), (30, 0.05), (30, 0.1), (15, 0.05), (15, 0.1))
+            for each, own_m in ((15, 0.0), (30, 0.0), (30, 0.05), (30, 0.1), (15, 0.05), (15, 0.1))
         ),
     ),
-    "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (8, 5, 6, 12, 16, 20))),
+    "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
     "paper": Entry(
         "KMP, the paper's numbers,\nour neighbourhoods",
-        tuple(Service(0.5, 2.0, spread) for spread in (0.001, 0.0001, 0.003, 0.005, 0.01, 0.02)),
+        tuple(Service(0.5, 2.0, spread) for spread in (0.01, 0.0001, 0.001, 0.003, 0.005, 0.02)),
     ),
     "promp": Entry(
         "Interaction ProMP",
         tuple(
             InteractionProMP(by_length=by_length, hands_m=hands_m)
-            for by_length, hands_m in (
-                (False, 0.02),
-                (False, 0.01),
-                (False, 0.03),
-                (True, 0.02),
-                (True, 0.01),
-                (True, 0.03),
-            )
+            for by_length in (True, False)
+            for hands_m in (0.02, 0.01, 0.03)
         ),
     ),
     "tp_gmm": Entry(
