@@ -178,8 +178,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         compared = [rows for task, rows in found.items() if task.method == method and not task.kind]
         if (best := chosen(compared)) > 0:
             results.say(f"{method}: {entry.candidates[best]} is better than what is chosen; put it first")
-    _draw(results, main)
-    return {
+    numbers = {
         "set": group,
         "people": len({one.person for one in main["ours"]}),
         "scenes_of_each": scenes,
@@ -214,6 +213,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             if not task.kind and task.method != TEACHER and group == "tuning"
         },
     }
+    draw(results, numbers)
+    return numbers
 
 
 MEASURES: dict[str, Callable[[Outcome], float]] = {
@@ -298,7 +299,9 @@ def line(rows: Sequence[Outcome]) -> str:
     )
 
 
-def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
+def draw(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
+    found = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.4), width_ratios=(1.1, 1, 1, 1.3))
     labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
@@ -309,8 +312,8 @@ def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
         ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
     )
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
-        for i, (method, rows) in enumerate(found.items()):
-            mean, low, high = (scale * value for value in summary(rows)[name].values())
+        for i, (method, one) in enumerate(found.items()):
+            mean, low, high = (scale * one[name][value] for value in ("mean", "low", "high"))
             ax.barh(i, mean, color=colours[method], height=0.65)
             ax.plot((low, high), (i, i), color="black", lw=1.2)
             ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
@@ -319,12 +322,11 @@ def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
         ax.invert_yaxis()
     levels = 100 * np.array(LEVELS)
     axes[3].plot((0, 100), (0, 100), "--", color="black", lw=0.8)
-    for method, rows in found.items():
+    for method, one in found.items():
         if method != TEACHER:
-            coverage = 100 * np.mean([one.inside for one in rows], axis=0)
-            axes[3].plot(levels, coverage, "o-", ms=3, color=colours[method], label=labels[method].replace("\n", " "))
+            axes[3].plot(levels, 100 * np.array(one["coverage"]), "o-", ms=3, color=colours[method])
     axes[3].set(xlabel="region said to hold [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
-    axes[3].legend(frameon=False, fontsize=6.5)
-    count = len({one.person for one in found["ours"]})
-    figure.suptitle(f"{count} people who did not demonstrate, {len(found['ours'])} scenes; lines: 95 % over people")
+    axes[3].set_title("coloured as the bars", fontsize=8)
+    people, scenes = numbers["people"], numbers["scenes_of_each"]
+    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % over people")
     results.figure(figure)
