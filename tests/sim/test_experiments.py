@@ -123,14 +123,17 @@ class TestExperiments:
     def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
         assert numbers("hands", tmp_path)["figures"] == ["hands-stages.png", "hands.png"]
 
-    def test_statistics_compare_five_methods_in_the_same_scenes(
+    def test_statistics_compare_eight_methods_in_the_same_scenes(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("sim.experiments.statistics.SCENES", 10)
         monkeypatch.setattr("sim.experiments.statistics.OURS_HZ", 250)
         found = numbers("statistics", tmp_path)
-        assert list(found["methods"]) == ["ours", "gaussian_process", "paper", "promp", "gmr"]
-        assert found["methods"]["ours"]["successes"] == found["scenes"] == 1
+        reaching = ["ours", "none", "look_up", "gaussian_process_5"]
+        assert list(found["methods"]) == [*reaching, "gaussian_process", "paper", "promp", "gmr"]
+        assert found["scenes"] == 1
+        # taught places are reached without any demonstration too
+        assert [found["methods"][method]["successes"] for method in reaching] == [1, 1, 1, 1]
         assert found["methods"]["gmr"]["successes"] == 0
 
     def test_hands_that_go_back_take_the_robot_back(self, tmp_path: Path) -> None:
@@ -154,6 +157,7 @@ def test_every_experiment_has_a_test() -> None:
     assert set(ABOUT) == {
         "faults",  # in test_faults.py
         "motion",
+        "people",  # in test_people.py
         "letters",
         "promp",
         "separation",
