@@ -16,6 +16,7 @@ COMPONENTS, SEED = 8, 0
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
 TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
+HALF_CM = 12.5  # of what is drawn of a letter, either way
 SETS = {"model": "modelled", "recorded": "recorded"}
 NEAR_S = 0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
 
@@ -152,9 +153,11 @@ def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
             axes.set_title(title, fontsize=8.5, loc="left")
         for letter in rows:
             _draw_letter(columns[names.index(letter.name)], letter)
-    corner = grid[-1, 0].transData
-    grid[-1, 0].plot([-5, 5], [-11, -11], color="black", lw=1.5)
-    grid[-1, 0].text(0, -12, "10 cm", transform=corner, ha="center", va="top", fontsize=7)
+    first = next(iter(sets.values()))[-1]
+    x, y = _middle(first)
+    axes = grid[names.index(first.name), 0]
+    axes.plot([x - 5, x + 5], [y - HALF_CM, y - HALF_CM], color="black", lw=1.5, clip_on=False)
+    axes.text(x, y - HALF_CM - 0.5, "10 cm", ha="center", va="top", fontsize=7)
     handles = [
         plt.Line2D([], [], color=REFERENCE, lw=0.8, label="demonstrations"),
         plt.Line2D([], [], color=ADAPTED, marker="o", ms=7, lw=0, alpha=0.5, label="Gaussians, 1 standard deviation"),
@@ -168,6 +171,11 @@ def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
     results.figure(figure)
 
 
+def _middle(letter: Letter) -> tuple[float, float]:
+    x, y = (letter.reference.min(axis=0) + letter.reference.max(axis=0)) / 2
+    return float(x), float(y)
+
+
 def _draw_letter(row: Any, letter: Letter) -> None:
     for demonstration in letter.demonstrations:
         row[0].plot(*demonstration.T, color=REFERENCE, lw=0.7)
@@ -176,7 +184,10 @@ def _draw_letter(row: Any, letter: Letter) -> None:
     for axes, case in zip(row[1:], cases(letter), strict=True):
         axes.plot(*letter.reference.T, "--", color=REFERENCE, lw=0.9)
         axes.plot(*adapted(letter, case).mean(TIMES[:, None]).T, color=ADAPTED, lw=1.3)
-        axes.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=1.4, ms=5)
+        axes.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=1.4, ms=5, clip_on=False)
+    x, y = _middle(letter)
+    for axes in row:
+        axes.set(xlim=(x - HALF_CM, x + HALF_CM), ylim=(y - HALF_CM, y + HALF_CM))
 
 
 def _record(stream: rr.RecordingStream, letter: Letter, name: str) -> None:

@@ -331,7 +331,7 @@ def _draw_dimensions(results: Results, rows: list[Grown]) -> None:
         )
     at = (MOST_BYTES / 8) ** 0.5 / OUTPUTS
     functions.axhline(at, color=REFERENCE, lw=0.8)
-    functions.text(1, at * 1.4, "above: more than 1 GiB for the weights' covariance", fontsize=7.5, color=REFERENCE)
+    functions.text(0.9, at * 1.5, "above: more than 1 GiB\nfor their covariance", fontsize=7.5, color=REFERENCE)
     functions.set(yscale="log", ylabel="basis functions, or reference points")
     seconds.set(yscale="log", ylabel="time to learn [s]")
     error.set(yscale="log", ylabel="error along a held-out demonstration\n[% of the output's deviation]")
