@@ -104,7 +104,8 @@ class Policy(NamedTuple):
 
 class Trial(NamedTuple):
     """One letter with one via-point: before learning, learned, and three that are equally far from
-    the reference.
+    the reference. Only what is tried at that distance counts as a try of the random ones: the
+    trajectories by which each is brought there do not.
     """
 
     letter: str
@@ -309,8 +310,8 @@ def letter(name: str) -> Letter:
 
 def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
     plt = pyplot()
-    figure = plt.figure(figsize=(10, 7.2))
-    above, below = figure.subfigures(2, 1, height_ratios=(1.35, 1))
+    figure = plt.figure(figsize=(10, 7.9))
+    above, below = figure.subfigures(2, 1, height_ratios=(1.5, 1), hspace=0.06)
     first, second = above.subplots(1, 2, subplot_kw={"projection": "3d"})
     third, fourth = below.subplots(1, 2)
     trial = trials[0]
@@ -336,8 +337,8 @@ def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
     second.plot(*last[:1].T, "*", color="black", ms=8, label="start")
     second.plot(*last[-1:].T, "+", color="black", ms=9, mew=2, label="end")
     second.plot(*trial.via_cm[:, None], "o", mfc="none", mec=DESIRED, mew=2, ms=10, label="via-point")
-    second.set_title("(b) one via-point: learned, and loosened by one number", loc="left")
-    above.legend(*second.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    second.set_title("(b) learned, and loosened by one number", loc="left")
+    above.legend(*second.get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     for axes in (first, second):
         lines = [one.demonstrations.reshape(-1, 3), *trial.trajectories, trial.constant.trajectory]
         equal_box(axes, np.concatenate(lines))
