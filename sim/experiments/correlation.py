@@ -8,6 +8,7 @@ best of as many random Lambda, Lambda = c I with the one number c, and what lear
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -197,7 +198,9 @@ def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
     )
 
 
-def scaled(correlation: Correlation, distance: float, apart: Any, *, begun: float = 1.0) -> tuple[Correlation, float]:
+def scaled(
+    correlation: Correlation, distance: float, apart: Callable[[Correlation], float], *, begun: float = 1.0
+) -> tuple[Correlation, float]:
     """The multiple of a Lambda that is so far [cm] from the reference within 1 %, and the
     multiplier; one near to it where that is out of reach. `begun` is a first guess.
     """
