@@ -79,8 +79,8 @@ def _reproduction_mm(skill: Skill, held_out: list[Demonstration]) -> float:
 
 
 def _floor_mm(known: list[Demonstration], held_out: list[Demonstration]) -> float:
-    """The demonstrations' own scatter: the distance of held-out ones from the mean of all known ones
-    at the same time.
+    """The demonstrations' own scatter: the distance of held-out ones from the mean of all known
+    ones at the same time.
     """
     mean = np.mean([one.tool[:, :3] for one in known], axis=0)
     return float(1000 * np.sqrt(np.mean([np.sum((one.tool[:, :3] - mean) ** 2, axis=1) for one in held_out])))
