@@ -1,8 +1,15 @@
 """Correlation-adaptive imitation: how the outputs are tied together, learned from a reward.
 
 The paper, section II-D: the reference's covariances become Lambda(s)^T Sigma Lambda(s), equation
-(11), and the diagonal Lambda(s) is found by policy improvement with path integrals with constant
-exploration, as in section III-B; the reward is the caller's.
+(11), and the diagonal Lambda(s) is found from rollouts alone, as in section III-B; the reward is
+the caller's. A diagonal Lambda that stays above 0 leaves every correlation coefficient as it was,
+and only loosens or tightens; where one of its factors is below 0 that output's change their signs.
+
+The search is PI^BB (Stulp and Sigaud 2012, "Policy improvement methods: between black-box
+optimization and episodic reinforcement learning"): that which remains of policy improvement with
+path integrals (PI^2, Theodorou, Buchli, Schaal 2010) when the noise is constant over a rollout and
+its total reward alone counts. PI^2 weighs each time step by what follows it; that means nothing
+here, where each Lambda(s_n) moves the whole trajectory.
 """
 
 from __future__ import annotations
@@ -23,7 +30,7 @@ Reward = Callable[[Array], float]
 """How good a predicted trajectory (M, O) is; higher is better."""
 
 _SHARPNESS = 10.0  # h of the exponential weights, usual in path integral methods
-_SMALLEST = 0.05  # of Lambda: below it a covariance would be near to singular
+_SMALLEST = 0.05  # of |Lambda|: below it a deviation shrinks no further
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,8 +38,8 @@ class Correlation(Immutable):
     """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions. Read-only.
 
     centres (B, I) and width [unit of the inputs] of the basis functions; theta (B, O), a factor for
-    each output. Lambda = 1 leaves the covariances as they are; factors below 0.05 are 0.05. Raises
-    ValueError if shapes do not agree, a number is not finite, or the width is not above 0.
+    each output, of either sign. Lambda = 1 leaves the covariances as they are. Raises ValueError if
+    shapes do not agree, a number is not finite, or the width is not above 0.
     """
 
     centres: Array
@@ -59,10 +66,14 @@ class Correlation(Immutable):
         exponent = -0.5 * cdist(s, self.centres, "sqeuclidean") / self.width**2
         phi = np.exp(exponent - exponent.max(axis=1, keepdims=True))
         share = phi / phi.sum(axis=1, keepdims=True)
-        return np.asarray(np.maximum(share @ self.theta, _SMALLEST))
+        return np.asarray(share @ self.theta)
 
     def applied(self, primitive: KMP) -> KMP:
         """The primitive of the cost (11): the base's covariances changed, the via-points kept.
+
+        Lambda^T Sigma Lambda is singular where a factor is 0. So no factor makes a deviation
+        smaller than 0.05 times what it was: what lacks there is added to its variance alone, and
+        its correlations fade to 0 as the factor does, before their signs change.
 
         Raises ValueError if it has another number of inputs or outputs.
         """
@@ -70,8 +81,10 @@ class Correlation(Immutable):
         base = primitive.base
         if (given := self.theta.shape[1]) != base.outputs:
             raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
-        scale = self(base.inputs)
-        covariance = scale[:, :, None] * base.reference.covariance * scale[:, None, :]
+        scale, sigma = self(base.inputs), base.reference.covariance
+        variances = np.diagonal(sigma, axis1=1, axis2=2)
+        lacking = np.maximum(_SMALLEST**2 - scale**2, 0.0) * variances
+        covariance = scale[:, :, None] * sigma * scale[:, None, :] + lacking[:, :, None] * np.eye(base.outputs)
         return primitive.refitted(Gaussians(base.reference.mean, covariance))
 
 
@@ -100,10 +113,10 @@ def improve(
 ) -> Improvement:
     """The Lambda(s) that makes the trajectory at `queries` (M, I) more rewarding: equation (11).
 
-    Each update draws `rollouts` theta + epsilon, epsilon of standard deviation `exploration`, the
-    same in each update (constant exploration); fits and adapts the primitive with each; and moves
-    theta by the mean of the epsilons, weighted with exp(h (R - max R) / (max R - min R)), h = 10.
-    The via-points of the primitive are kept. The paper, section III-B.
+    PI^BB: each update draws `rollouts` theta + epsilon, epsilon of standard deviation
+    `exploration`, the same in each update (constant exploration); fits and adapts the primitive
+    with each; and moves theta by the mean of the epsilons, weighted with exp(h (R - max R) / (max R
+    - min R)), h = 10. The via-points of the primitive are kept. The paper, section III-B.
 
     Raises ValueError if shapes do not agree, a parameter is out of its range, or a reward is not
     finite.

@@ -47,6 +47,7 @@ from service.core.workspace import Target, clamp
 REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
 READY, RETURNING = 1, 2  # of an arm: within its limits, on its way into them
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
+NEAR_SPEED = 0.95  # of the tool's greatest; what the joints turn in a tick changes it by less than the rest
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
@@ -300,12 +301,23 @@ class Controller:
             stop = self._limiter.stop(q, dq, ddq)
             stopped = self._apart.excess(*stop[1:3], self._jerk) < excess
             moved, limited = (stop, True) if stopped else (moved, limited)
-        if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1] > fastest:
+        if self._comes_to(moved) > fastest:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0] > fastest:
                 state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
         return limited, stopped
+
+    def _comes_to(self, moved: Limited) -> float:
+        """The greatest speed [m/s] that the tool comes to if the joints stop after a step; near the
+        limit also as the arm will stand then, for what joints do to the tool changes on the way.
+        """
+        fastest = self._settings.tool.max_speed
+        speed = self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1]
+        if not NEAR_SPEED * fastest < speed <= fastest:
+            return speed
+        stop = self._limiter.stop(*moved[:3])
+        return max(speed, self._arm.speeds(self._arm.at(stop.position), *stop[1:3])[1])
 
     def _brake(self) -> Limited:
         """The joints one period on their way to rest, together; or each as it can, where that

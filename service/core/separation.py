@@ -5,6 +5,11 @@ A pair of parts whose points nearest to each other lie `distance` apart gives on
 which the arm's joints bring these together is at most what the rule allows there. What leaves has a
 negative speed and is never limited. The tool may touch a hand gently where a taught place says that
 the tool goes with that hand, while the hands are at that place.
+
+Where a hand and a part pass each other, what leads past the hand now may lead into it a moment
+later, as the direction between them turns faster than joints brake. So the rule is also asked about
+moments ahead, as if hands and joints went on as they do; what can still be braked until then is
+allowed on top.
 """
 
 from __future__ import annotations
@@ -28,6 +33,10 @@ PEOPLE_ROOM, THINGS_ROOM = 0.01, 0.005  # [m] kept more where motion is planned 
 PLAN_SHARE = 0.8  # ... and of the braking: its ramps need that
 SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
 NEAR_PLACE = 0.02  # [m] beside a place's radius, each axis
+AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
+CHANGE_S = 0.07  # over which a hand's acceleration fades
+STEADY = 0.1  # [m/s] slower hands tremble, and nothing is foreseen of them; all of it at twice that
+RAMP_S = 0.08  # of a braking, and until a hand's new velocity is known
 UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
 
 
@@ -56,10 +65,11 @@ class Separation:
         )
         self._things = np.array([things.brake, things.reaction_ms / 1000, things.clearance])
         count, joints = len(self._body.links), len(settings.joints.names)
-        most = 2 * count + 3 * count * len(boxes) + len(self._body.pairs)
+        most = 2 * count * len(AHEAD_S) + 3 * count * len(boxes) + len(self._body.pairs)
+        self._fastest = np.array(settings.joints.velocity)
         self.rows, self.plan, self.allowed = np.zeros((most, joints)), np.zeros(most), np.zeros(most)
         self.told, self.count = np.array([FARTHEST, IRRELEVANT, 1.0]), 0
-        self._placed = np.zeros((count, 2, 3))
+        self._placed = np.zeros((2, count, 2, 3))
         self._contacts = np.empty((0, 8))
 
     def expect(self, places: Iterable[ViaPoint]) -> None:
@@ -85,6 +95,7 @@ class Separation:
             self._people,
             self._things,
             self._contacts,
+            self._fastest,
             self._placed,
             self.rows,
             self.plan,
@@ -127,6 +138,7 @@ def _look(
     people: Vector,
     things: Vector,
     contacts: Vector,
+    fastest: Vector,
     placed: Vector,
     rows: Vector,
     plan: Vector,
@@ -135,52 +147,85 @@ def _look(
 ) -> int:
     """`Separation.look`: rows that were found."""
     state, near, forearm, count = states[0], np.empty(9), np.empty((2, 3)), 0
-    place(q, frames, axes, links, ends, placed)
+    later, velocity, here, there = np.empty(len(q)), np.empty(3), placed[0], placed[1]
+    place(q, frames, axes, links, ends, here)
     told[0], told[1], told[2] = FARTHEST, IRRELEVANT, 1.0
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
-        for i in range(3):
-            forearm[0, i] = state.hands[side, 0, i]
-            forearm[1, i] = forearm[0, i] + hand[1 + i]
         variance = 0.0
         for mode in range(state.modes.shape[1]):
             variance += state.modes[side, mode] * state.covariances[side, mode, 1, 1]
-        receives = _receives(contacts, state.hands, side)
-        for capsule in range(first, len(links)):
-            distance = between_segments(placed[capsule], forearm, near) - radii[capsule] - hand[0]
-            coming = 0.0
+        known, receives = variance <= UNSURE * UNSURE, _receives(contacts, state.hands, side)
+        moment = _swiftness(state.hands[side, 1]) if known else 0.0
+        for k in range(len(AHEAD_S) if moment > 0.0 else 1):
+            ahead = moment * AHEAD_S[k]
+            parts = here if k == 0 else there
+            if k > 0:
+                for j in range(len(q)):
+                    later[j] = q[j] + ahead * state.joints[1, j]
+                place(later, frames, axes, links, ends, there)
+            faster = CHANGE_S * (1.0 - math.exp(-ahead / CHANGE_S))
             for i in range(3):
-                coming -= near[6 + i] * state.hands[side, 1, i]
-            coming = people[4] if variance > UNSURE * UNSURE else max(coming, 0.0)
-            least = people[3] if receives and links[capsule] == len(q) else 0.0
-            most = max(least, allowed_speed(distance, coming, people[0], people[1], people[2]))
-            told[0], told[1] = min(told[0], distance), min(told[1], most)
-            if _add(near, distance, coming, least, people, PEOPLE_ROOM, plan, allowed, count):
-                _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
-                if links[capsule] == len(q):
-                    told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                count += 1
-    for capsule in range(first, len(links)):
-        for box in range(len(boxes)):
-            inner = nearest_to_box(placed[capsule], boxes[box])
-            for where in range(3):  # the ends too: a capsule that lies along a face may tip
-                share = inner if where == 0 else where - 1.0
-                distance = to_box(placed[capsule], share, boxes[box], near) - radii[capsule]
-                known = where > 0 and share == inner
-                if not known and _add(near, distance, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
+                v, a = state.hands[side, 1, i], state.hands[side, 2, i]
+                velocity[i] = v + faster * a
+                moved = ahead * v + CHANGE_S * (ahead - faster) * a
+                forearm[0, i] = state.hands[side, 0, i] + moved
+                forearm[1, i] = forearm[0, i] + hand[1 + i]
+            braked = people[0] * max(ahead - RAMP_S, 0.0)
+            for capsule in range(first, len(links)):
+                distance = between_segments(parts[capsule], forearm, near) - radii[capsule] - hand[0]
+                coming = 0.0
+                for i in range(3):
+                    coming -= near[6 + i] * velocity[i]
+                coming = max(coming, 0.0) if known else people[4]
+                least = people[3] if receives and links[capsule] == len(q) else 0.0
+                if k == 0:
+                    most = max(least, allowed_speed(distance, coming, people[0], people[1], people[2]))
+                    told[0], told[1] = min(told[0], distance), min(told[1], most)
+                if _add(near, distance, coming, least, braked, people, PEOPLE_ROOM, plan, allowed, count):
+                    if k > 0:
+                        _carry_back(near, there[capsule], here[capsule])
                     _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
                     if links[capsule] == len(q):
                         told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                    count += 1
+                    count += _may_pass(rows[count], plan[count], fastest)
+    for capsule in range(first, len(links)):
+        for box in range(len(boxes)):
+            inner = nearest_to_box(here[capsule], boxes[box])
+            for where in range(3):  # the ends too: a capsule that lies along a face may tip
+                share = inner if where == 0 else where - 1.0
+                distance = to_box(here[capsule], share, boxes[box], near) - radii[capsule]
+                twice = where > 0 and share == inner
+                if not twice and _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
+                    _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                    if links[capsule] == len(q):
+                        told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
+                    count += _may_pass(rows[count], plan[count], fastest)
     for pair in range(len(pairs)):
         one, other = pairs[pair, 0], pairs[pair, 1]
-        distance = between_segments(placed[one], placed[other], near) - radii[one] - radii[other]
-        if _add(near, distance, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
+        distance = between_segments(here[one], here[other], near) - radii[one] - radii[other]
+        if _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
             _bring_together(rows[count], near, 0, tool, jacobian, links[one], 1.0)
             _bring_together(rows[count], near, 3, tool, jacobian, links[other], -1.0)
-            count += 1
+            count += _may_pass(rows[count], plan[count], fastest)
     return count
+
+
+@compiled
+def _may_pass(row: Vector, limit: float, fastest: Vector) -> int:
+    """1 if joints within their greatest speeds can pass a limit along a row (J,), else 0."""
+    most = 0.0
+    for j in range(len(row)):
+        most += abs(row[j]) * fastest[j]
+    return 1 if most > limit else 0
+
+
+@compiled
+def _swiftness(velocity: Vector) -> float:
+    """0 for a hand that rests or trembles, 1 for one that goes somewhere."""
+    speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    return min(max(speed / STEADY - 1.0, 0.0), 1.0)
 
 
 @compiled
@@ -210,21 +255,38 @@ def _add(
     distance: float,
     coming: float,
     least: float,
+    braked: float,
     rule: Vector,
     room: float,
     plan: Vector,
     allowed: Vector,
     count: int,
 ) -> bool:
-    """Writes the limits of a pair, but at least `least`, behind `count` others; not if nothing can
-    be so fast, and then false.
+    """Writes the limits of a pair behind `count` others: what the rule says, but at least `least`,
+    and what is `braked` until then; not if nothing can be so fast, and then false.
     """
     planned = allowed_speed(distance, coming, PLAN_SHARE * rule[0], rule[1], rule[2] + room)
+    planned = max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
     if planned >= IRRELEVANT:
         return False
-    plan[count] = max(PLAN_SHARE * least, planned)
-    allowed[count] = max(least, allowed_speed(distance, coming, rule[0], rule[1], rule[2])) + SLIP
+    plan[count] = planned
+    allowed[count] = max(least, allowed_speed(distance, coming, rule[0], rule[1], rule[2])) + braked + SLIP
     return True
+
+
+@compiled
+def _carry_back(near: Vector, then: Vector, now: Vector) -> None:
+    """Moves the first point of `near` from where it is on a segment (2, 3) to the same point of the
+    segment now.
+    """
+    long = whole = 0.0
+    for i in range(3):
+        way = then[1, i] - then[0, i]
+        long += way * (near[i] - then[0, i])
+        whole += way * way
+    share = long / whole if whole > 0.0 else 0.0
+    for i in range(3):
+        near[i] = now[0, i] + share * (now[1, i] - now[0, i])
 
 
 @compiled

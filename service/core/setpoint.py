@@ -10,7 +10,8 @@ target does:
 
 * speed at most `max_speed` (as a norm), acceleration and jerk each axis at most theirs;
 * never outside the box of the workspace, nor farther than HULL_MARGIN from the box around the last
-  HULL_TIME_S of targets, but for a setpoint that was outside when it began: it only comes nearer.
+  HULL_TIME_S of targets. Where that box has moved away, or began elsewhere, the setpoint comes back
+  to it at RETURN_SHARE of the greatest speed at least: docs/bounds.md has the proof.
 """
 
 from __future__ import annotations
@@ -23,7 +24,15 @@ from scipy.linalg import solve_continuous_are
 from kmp.compiled import compiled
 from service.config import Settings
 from service.core.frame import Record, Vector
-from service.core.stops import fastest_stop
+from service.core.setpoint_bounds import (
+    BOUNDS,
+    HULL_SPANS,
+    HULL_TIME_S,
+    bounds,
+    remember,
+    take_safe,
+    what_is_wrong,
+)
 from service.core.workspace import Target
 
 REVERT_A, REVERT_V = 5.0, 150.0  # [1/s], [1/s²] with which the tracker expects the target's motion to end
@@ -33,9 +42,7 @@ STOP_BRAKE = 16.0  # [m/s²] ... nor brakes harder than this
 FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
 SHARE, SPEED_SHARE = 0.91, 0.97  # of acceleration and jerk, and of speed, that is planned with
-HULL_TIME_S, HULL_SPANS, HULL_MARGIN = 0.35, 7, 0.03  # [m]; of the spans one is always being filled
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
-BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
 PLANNED, STOPPED, WRONG = 1, 2, 3  # what a step says: a bound was met in planning; the stop was begun; one was passed
 DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
 
@@ -91,7 +98,9 @@ class SetpointGenerator:
 
         They hold by the way a step is made; this looks again, from outside.
         """
-        return BOUNDS[_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)]
+        return BOUNDS[
+            what_is_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)
+        ]
 
 
 def tracker_gains(jerk_weight: float) -> Vector:
@@ -108,64 +117,6 @@ def tracker_gains(jerk_weight: float) -> Vector:
     cost[0, 0] = 1.0
     riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
     return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], DECIMALS))
-
-
-@compiled
-def _remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int:
-    """Takes a target (3,) into the least and greatest of its span; ticks in the newest span."""
-    if ticks >= span_ticks or ticks == 0:
-        if ticks > 0:
-            for span in range(HULL_SPANS - 1, 0, -1):
-                for axis in range(3):
-                    hull[span, 0, axis], hull[span, 1, axis] = hull[span - 1, 0, axis], hull[span - 1, 1, axis]
-        for axis in range(3):
-            hull[0, 0, axis] = hull[0, 1, axis] = position[axis]
-        return 1
-    for axis in range(3):
-        hull[0, 0, axis] = min(hull[0, 0, axis], position[axis])
-        hull[0, 1, axis] = max(hull[0, 1, axis], position[axis])
-    return ticks + 1
-
-
-@compiled
-def _bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
-    """Where the setpoint may go: around the last targets, and inside the workspace."""
-    for axis in range(3):
-        least, greatest = hull[0, 0, axis], hull[0, 1, axis]
-        for span in range(1, HULL_SPANS):
-            least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
-        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN)
-        high[axis] = min(box[1, axis], greatest + HULL_MARGIN)
-
-
-@compiled
-def _wrong(
-    setpoint: Vector, before: Vector, hull: Vector, box: Vector, lowest: Vector, limits: Vector, dt: float
-) -> int:
-    """Which of BOUNDS a step from `before` (3, 3) is."""
-    fastest, hardest, sharpest = limits[0], limits[1], limits[2]
-    if not np.isfinite(setpoint).all():
-        return 1
-    speed = hardest_now = hardest_before = change = 0.0
-    for i in range(3):
-        speed += setpoint[1, i] ** 2
-        hardest_now, hardest_before = max(hardest_now, abs(setpoint[2, i])), max(hardest_before, abs(before[2, i]))
-        change = max(change, abs(setpoint[2, i] - before[2, i]))
-    if math.sqrt(speed) > max(fastest, speed_to_come(before[1], before[2], sharpest)) + 1e-9:
-        return 2
-    if hardest_now > max(hardest, hardest_before) + 1e-9:
-        return 3
-    if change > (sharpest + 1e-6) * dt:
-        return 4
-    low, high = np.empty(3), np.empty(3)
-    _bounds(hull, box, lowest, low, high)
-    farthest = 0.5 * fastest * fastest / hardest + fastest  # of a stop from outside, generously
-    for i in range(3):
-        if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
-            return 5
-        if setpoint[0, i] > max(high[i], before[0, i]) + farthest:
-            return 5
-    return 0
 
 
 @compiled
@@ -188,10 +139,10 @@ def _lead(
     """One step, in place; ticks in the newest span, and what the step says."""
     target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
     target[0], target[1], target[2] = position, velocity, acceleration
-    ticks = _remember(hull, ticks, position, span_ticks)
-    _bounds(hull, box, lowest, low, high)
+    ticks = remember(hull, ticks, position, span_ticks)
+    bounds(hull, box, lowest, low, high)
     met = _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
-    if _wrong(setpoint, before, hull, box, lowest, limits, dt):
+    if what_is_wrong(setpoint, before, hull, box, lowest, limits, dt):
         setpoint[:] = before
         return ticks, WRONG
     return ticks, met
@@ -210,33 +161,15 @@ def _step(
     dt: float,
 ) -> int:
     """The setpoint (3, 3) one period on, in place."""
-    jerk, ahead, stop = np.empty(3), np.empty((3, 3)), np.empty(6)
-    fastest, hardest, sharpest = limits[0], limits[1], limits[2]
+    jerk, ahead = np.empty(3), np.empty((3, 3))
     met = _track(setpoint, target, gains, limits, costs, slow, dt, jerk)
     for i in range(3):
         x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
-    before = speed_to_come(setpoint[1], setpoint[2], sharpest)
-    allowed = speed_to_come(ahead[1], ahead[2], sharpest) <= max(fastest, before)
-    if allowed:
-        for i in range(3):
-            fastest_stop(ahead[1, i], ahead[2, i], hardest, sharpest, dt, stop)
-            bottom, top = ahead[0, i] + stop[3], ahead[0, i] + stop[4]
-            if bottom < low[i] or top > high[i]:  # it may stay outside where it is, but go no farther
-                fastest_stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
-                if bottom < min(low[i], setpoint[0, i] + stop[3]) - 1e-12:
-                    allowed = False
-                if top > max(high[i], setpoint[0, i] + stop[4]) + 1e-12:
-                    allowed = False
-    if allowed:
-        setpoint[:] = ahead
+    if take_safe(setpoint, ahead, limits, costs, slow, low, high, dt):
         return met
-    for i in range(3):
-        fastest_stop(setpoint[1, i], setpoint[2, i], hardest, sharpest, dt, stop)
-        setpoint[0, i] += stop[2]
-        setpoint[1, i], setpoint[2, i] = stop[0], stop[1]
     return STOPPED
 
 
@@ -367,13 +300,3 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
     if speed_then >= brake * brake / change:
         return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
     return way + speed_then * math.sqrt(speed_then / change)
-
-
-@compiled
-def speed_to_come(velocity: Vector, acceleration: Vector, sharpest: float) -> float:
-    """Norm [m/s] of the axes' greatest speeds if each acceleration is brought to 0 at once."""
-    total = 0.0
-    for i in range(3):
-        then = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * sharpest)
-        total += max(abs(velocity[i]), abs(then)) ** 2
-    return math.sqrt(total)

@@ -1,116 +1,252 @@
-"""Correlations learned from a reward (the paper, section III-B and Figure 3): a 3-D letter D that
-costs the arm's joints less and less motion.
+"""Correlations adapted to a reward (the paper, section III-B and Figure 3): letters in space that
+cost the arm's joints less and less motion, and how much of that a single number would have done.
+
+The paper shows one letter, one via-point and a cost that falls. Here letters and via-points are the
+sample, and what was learned is set beside three others at the same distance from the reference: the
+best of as many random Lambda, Lambda = c I with the one number c, and what learning adds to that c.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 import rerun as rr
-from scipy.stats import ttest_1samp, wilcoxon
+from scipy.stats import wilcoxon
 
 from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, improve
 from service.config import WAM, Settings
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
-from sim.experiments.writing import write
+from sim.experiments.writing import TARGETS, write
 
 ELL, LAMBDA, SHARPNESS = 0.1, 2.0, 5.0  # the paper's ell, lambda and gamma; here over seconds and centimetres
 DURATION_S, POINTS, DEMONSTRATIONS, COMPONENTS = 10.0, 100, 4, 8
 CENTRE_CM = np.array([55.0, 0.0, 40.0])  # of the letter, frame base
 TILT = np.radians(60)  # of the plane it is written in, against the table
 DEPTH_STD_CM = 0.8
-VIA_ROW, VIA_STEP_CM, VIA_VARIANCE = 65, np.array([2.0, -3.0, 2.0]), 1e-6
+VIA_ROWS, VIA_STEP_CM, VIA_VARIANCE = (20, 80), 4.0, 1e-6  # where along the letter, how far from it, [cm²]
 JOINT_WEIGHTS = np.array([3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0])  # W: what moves much of the arm costs more
-BASES, EXPLORATION, UPDATES, ROLLOUTS, RUNS = 8, 0.25, 30, 12, 10
+BASES, EXPLORATION, UPDATES, ROLLOUTS, VIA_POINTS = 8, 0.25, 30, 12, 2
+SPREAD = (0.25, 2.0)  # of random Lambda around 1, drawn evenly in the logarithm
+BEYOND = 2.0  # times the cost at first, for each share by which the distance is overdrawn
+WITHIN, SECANTS, LEAST_SLOPE = 0.01, 8, 0.05  # how equal the distances are made, and by how many secants
+SHOWN = "D"
 TIMES = np.linspace(0.0, DURATION_S, POINTS)
-VIA_S = float(TIMES[VIA_ROW])
+METHODS = {
+    "learned": "learned",
+    "random": "best of as many\nrandom Λ",
+    "begun_at_c": "learned, begun\nat Λ = c I",
+}
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    runs, updates = max(2, round(RUNS * options.share)), max(2, round(UPDATES * options.share))
-    shown = letter()
-    demonstrations, _, base = shown
-    at = base.mean([[VIA_S]])[0] + VIA_STEP_CM
-    primitive = base.adapt(
-        [[VIA_S]], Gaussians(at[None], VIA_VARIANCE * np.eye(3)[None]), tolerance=DURATION_S / POINTS
-    )
+    names = sorted(TARGETS, key=lambda name: name != SHOWN)[: max(2, round(len(TARGETS) * options.share))]
+    via_points, updates = max(1, round(VIA_POINTS * options.share)), max(2, round(UPDATES * options.share))
     joints = Joints()
-    learned = []
-    for seed in range(runs):
-        learned.append(_learned(primitive, joints, updates=updates, seed=seed))
-        results.say(f"run {seed + 1} of {runs}: cost {learned[-1].costs[0]:.3f} to {learned[-1].costs[-1]:.3f} rad")
-    costs = np.array([one.costs for one in learned])
-    _draw(results, shown, at, learned[0].trajectories, costs)
-    _record(results, demonstrations, learned[0].trajectories, at, costs)
-    falls = costs[:, 0] - costs[:, -1]
-    final = [one.trajectories[-1] for one in learned]
+    trials: list[Trial] = []
+    for name in names:
+        one = letter(name)
+        trials += [tried(one, number, joints, updates=updates) for number in range(via_points)]
+        results.say(f"{name}: {[_said(each) for each in trials[-via_points:]]}")
+    _draw(results, letter(SHOWN), trials)
+    _record(results, letter(SHOWN), trials[0])
     return {
         "units": "s, cm, rad",
         "ell": ELL,
         "lambda": LAMBDA,
         "gamma": SHARPNESS,
-        "runs": runs,
+        "letters": names,
+        "via_points_each": via_points,
         "updates": updates,
         "rollouts": ROLLOUTS,
-        "cost_at_first_rad": float(costs[0, 0]),
-        "cost_at_last_rad": {"mean": float(costs[:, -1].mean()), "std": float(costs[:, -1].std())},
-        "fall_percent": float(100 * (falls / costs[:, 0]).mean()),
-        "wilcoxon_p": float(wilcoxon(falls, alternative="greater").pvalue),
-        "t_test_p": float(ttest_1samp(falls, 0.0, alternative="greater").pvalue),
-        "largest_miss_of_the_via_point_cm": max(one.largest_miss for one in learned),
-        "deviation_from_the_reference_rms_cm": float(
-            np.mean([np.sqrt(np.mean(np.sum((f - base.reference.mean) ** 2, axis=1))) for f in final])
-        ),
-        "deviation_before_learning_rms_cm": float(
-            np.sqrt(np.mean(np.sum((learned[0].trajectories[0] - base.reference.mean) ** 2, axis=1)))
-        ),
+        "search": "PI^BB: noise constant over a rollout, weighed by its total reward; not PI^2",
+        "cost_fall_percent": _interval([100 * (1 - t.learned.cost / t.first.cost) for t in trials], trials),
+        "distance_rms_cm": {
+            "before": float(np.mean([t.first.distance for t in trials])),
+            "learned": float(np.mean([t.learned.distance for t in trials])),
+        },
+        "c": {"median": float(np.median([t.c for t in trials])), "largest": max(t.c for t in trials)},
+        "cost_beside_c_percent": {
+            method: _interval([100 * (t.beside_c(method) - 1) for t in trials], trials) for method in METHODS
+        },
+        "correlations_whose_sign_changed_percent": 100 * float(np.mean([t.flipped for t in trials])),
+        "largest_miss_of_a_via_point_cm": max(t.largest_miss for t in trials),
+        "trials": [t.numbers() for t in trials],
     }
 
 
 class Letter(NamedTuple):
     """Demonstrations (4, 100, 3) [cm], their mixture over time and place, and the primitive."""
 
+    name: str
     demonstrations: Array
     mixture: GaussianMixture
     base: KMP
 
+    def distance(self, trajectory: Array) -> float:
+        """Of a trajectory (100, 3) from the reference, root mean square [cm]."""
+        return float(np.sqrt(np.mean(np.sum((trajectory - self.base.reference.mean) ** 2, axis=1))))
 
-class Run(NamedTuple):
-    """One run of the learning: the policy's cost [rad] and trajectory (M, 3) [cm] before the first
-    update and after each; the largest miss [cm].
+
+class Policy(NamedTuple):
+    """What a Lambda makes of a letter: the joints' cost [rad], the distance from the reference
+    [cm], and the trajectory (100, 3) [cm].
     """
 
-    costs: Array
-    trajectories: list[Array]
-    largest_miss: float
+    correlation: Correlation
+    cost: float
+    distance: float
+    trajectory: Array
 
 
-def _learned(primitive: KMP, joints: Joints, *, updates: int, seed: int) -> Run:
+class Trial(NamedTuple):
+    """One letter with one via-point: before learning, learned, and three that are equally far from
+    the reference. Only what is tried at that distance counts as a try of the random ones: the
+    trajectories by which each is brought there do not.
+    """
+
+    letter: str
+    via_s: float
+    via_cm: Array
+    first: Policy
+    learned: Policy
+    costs: Array  # (U + 1,) [rad] of the policy before the first update and after each
+    trajectories: list[Array]  # the same
+    c: float
+    constant: Policy  # Lambda = c I
+    random: Policy
+    begun_at_c: Policy
+    flipped: float  # share of the correlations of which learning changed the sign
+    largest_miss: float  # of the via-point [cm]
+
+    def beside_c(self, method: str) -> float:
+        """A method's cost as a multiple of that of Lambda = c I."""
+        return float(getattr(self, method).cost / self.constant.cost)
+
+    def numbers(self) -> dict[str, Any]:
+        """By name."""
+        policies = {name: getattr(self, name) for name in ("first", "learned", "constant", "random", "begun_at_c")}
+        return {
+            "letter": self.letter,
+            "via_s": self.via_s,
+            "c": self.c,
+            **{name: {"cost_rad": one.cost, "distance_cm": one.distance} for name, one in policies.items()},
+        }
+
+
+def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
+    """A letter with its via-point of that number, by all methods."""
+    random = np.random.default_rng([number, *map(ord, one.name)])
+    via_s = float(TIMES[random.integers(*VIA_ROWS)])
+    way = random.standard_normal(3)
+    via = one.base.mean([[via_s]])[0] + VIA_STEP_CM * way / np.linalg.norm(way)
+    desired = Gaussians(via[None], VIA_VARIANCE * np.eye(3)[None])
+    primitive = one.base.adapt([[via_s]], desired, tolerance=DURATION_S / POINTS)
+
+    def policy(correlation: Correlation) -> Policy:
+        trajectory = correlation.applied(primitive).mean(TIMES[:, None])
+        return Policy(correlation, joints.cost(trajectory), one.distance(trajectory), trajectory)
+
+    def apart(correlation: Correlation) -> float:
+        return one.distance(correlation.applied(primitive).mean(TIMES[:, None]))
+
+    neutral = Correlation.neutral(np.linspace(0, DURATION_S, BASES)[:, None], width=DURATION_S / BASES, outputs=3)
     seen: list[Array] = []
 
     def reward(trajectory: Array) -> float:
         seen.append(trajectory)
         return float(np.exp(-SHARPNESS * joints.cost(trajectory)))
 
-    centres = np.linspace(0.0, DURATION_S, BASES)[:, None]
-    start = Correlation.neutral(centres, width=DURATION_S / BASES, outputs=3)
-    found = improve(
-        primitive,
-        reward,
-        TIMES[:, None],
-        correlation=start,
-        exploration=EXPLORATION,
-        updates=updates,
-        rollouts=ROLLOUTS,
-        seed=seed,
+    searched: dict[str, Any] = {"updates": updates, "rollouts": ROLLOUTS, "seed": number}
+    found = improve(primitive, reward, TIMES[:, None], correlation=neutral, exploration=EXPLORATION, **searched)
+    learned, first = policy(found.correlation), policy(neutral)
+
+    def beyond(trajectory: Array) -> float:
+        overdrawn = max(0.0, one.distance(trajectory) / learned.distance - 1)
+        return float(np.exp(-SHARPNESS * (joints.cost(trajectory) + BEYOND * first.cost * overdrawn)))
+
+    single, c = scaled(neutral, learned.distance, apart)
+    best = min(
+        (policy(scaled(_drawn(neutral, random), learned.distance, apart, begun=c)[0]) for _ in range(len(seen))),
+        key=lambda each: each.cost,
     )
-    policies = seen[:: ROLLOUTS + 1]  # before the first update, and after the rollouts of each
-    wanted = primitive.via_points.mean[0]
-    miss = float(np.linalg.norm(found.primitive.mean([[VIA_S]])[0] - wanted))
-    return Run(-np.log(found.rewards) / SHARPNESS, policies, miss)
+    more = improve(primitive, beyond, TIMES[:, None], correlation=single, exploration=EXPLORATION * c, **searched)
+    constant, begun_at_c = policy(single), policy(more.correlation)
+    misses = [
+        each.correlation.applied(primitive).mean([[via_s]])[0] - via for each in (learned, constant, best, begun_at_c)
+    ]
+    signs = np.sign(learned.correlation(TIMES[:, None]))
+    flipped = float(np.mean([signs[:, i] * signs[:, j] < 0 for i, j in ((0, 1), (0, 2), (1, 2))]))
+    return Trial(
+        one.name,
+        via_s,
+        via,
+        first,
+        learned,
+        -np.log(found.rewards) / SHARPNESS,
+        seen[:: ROLLOUTS + 1],
+        c,
+        constant,
+        best,
+        begun_at_c,
+        flipped,
+        float(np.linalg.norm(misses, axis=1).max()),
+    )
+
+
+def scaled(
+    correlation: Correlation, distance: float, apart: Callable[[Correlation], float], *, begun: float = 1.0
+) -> tuple[Correlation, float]:
+    """The multiple of a Lambda that is so far [cm] from the reference within 1 %, and the
+    multiplier; one near to it where that is out of reach. `begun` is a first guess.
+    """
+
+    def times(log_c: float) -> Correlation:
+        return replace(correlation, theta=np.exp(log_c) * correlation.theta)
+
+    before, now = np.log(begun) - 0.3, np.log(begun)
+    off_before, off = (apart(times(x)) / distance - 1 for x in (before, now))
+    for _ in range(SECANTS):
+        if abs(off) < WITHIN:
+            break
+        slope = max((off - off_before) / (now - before), LEAST_SLOPE)
+        step = float(np.clip(-off / slope, -1.0, 1.0))
+        before, off_before, now = now, off, now + step
+        off = apart(times(now)) / distance - 1
+    return times(now), float(np.exp(now))
+
+
+def _drawn(neutral: Correlation, random: np.random.Generator) -> Correlation:
+    spread = np.exp(random.uniform(*np.log(SPREAD)))
+    return replace(neutral, theta=neutral.theta + spread * random.standard_normal(neutral.theta.shape))
+
+
+def _interval(values: list[float], trials: list[Trial]) -> dict[str, float]:
+    """The mean of a value a trial, with a 95 % interval by bootstrap over the letters, and how
+    likely such letters' means are where nothing is to be found (Wilcoxon, two-sided).
+    """
+    each: dict[str, list[float]] = {}
+    for value, trial in zip(values, trials, strict=True):
+        each.setdefault(trial.letter, []).append(value)
+    means = np.array([np.mean(of_one) for of_one in each.values()])
+    drawn = np.random.default_rng(0).choice(means, (10_000, len(means))).mean(axis=1)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return {
+        "mean": float(means.mean()),
+        "low": float(low),
+        "high": float(high),
+        "p": float(wilcoxon(means).pvalue),
+        "letters_above_0": int((means > 0).sum()),
+    }
+
+
+def _said(one: Trial) -> str:
+    others = ", ".join(f"{method} {one.beside_c(method):.3f}" for method in METHODS)
+    return f"{one.first.cost:.2f} to {one.learned.cost:.2f} rad at {one.learned.distance:.1f} cm, beside c: {others}"
 
 
 class Joints:
@@ -151,9 +287,9 @@ class Joints:
         return float(np.sqrt(np.sum(JOINT_WEIGHTS * np.diff(self.along(trajectory), axis=0) ** 2, axis=1)).sum())
 
 
-def letter() -> Letter:
-    """A letter D before the arm, from the model of handwriting."""
-    flat = write("D", count=DEMONSTRATIONS, seed=3)[:, ::2]
+def letter(name: str) -> Letter:
+    """A letter before the arm, from the model of handwriting, with some depth."""
+    flat = write(name, count=DEMONSTRATIONS, seed=3)[:, ::2]
     random = np.random.default_rng(3)
     phase = np.linspace(0, 1, flat.shape[1])
     demonstrations = []
@@ -172,20 +308,20 @@ def letter() -> Letter:
     base = KMP.fit(
         TIMES[:, None], reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=stacked.mean(axis=(0, 1))
     )
-    return Letter(stacked, mixture, base)
+    return Letter(name, stacked, mixture, base)
 
 
-def _draw(results: Results, shown_letter: Letter, via: Array, trajectories: list[Array], costs: Array) -> None:
-    demonstrations, mixture, base = shown_letter
+def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
     plt = pyplot()
-    figure = plt.figure(figsize=(12, 4.4))
-    places = figure.add_gridspec(1, 4, width_ratios=(1, 1, 0.12, 0.8))
-    first, second = (figure.add_subplot(places[i], projection="3d") for i in (0, 1))
-    third = figure.add_subplot(places[3])
-    for one in demonstrations:
-        first.plot(*one.T, color=REFERENCE, lw=0.9)
+    figure = plt.figure(figsize=(10, 7.9))
+    above, below = figure.subfigures(2, 1, height_ratios=(1.5, 1), hspace=0.06)
+    first, second = above.subplots(1, 2, subplot_kw={"projection": "3d"})
+    third, fourth = below.subplots(1, 2)
+    trial = trials[0]
+    for line in one.demonstrations:
+        first.plot(*line.T, color=REFERENCE, lw=0.9)
     sphere = _sphere()
-    for mean, covariance in zip(mixture.means[:, 1:], mixture.covariances[:, 1:, 1:], strict=True):
+    for mean, covariance in zip(one.mixture.means[:, 1:], one.mixture.covariances[:, 1:, 1:], strict=True):
         first.plot_surface(
             *(mean[:, None, None] + np.einsum("ij,jkl->ikl", np.linalg.cholesky(covariance), sphere)),
             color=ADAPTED,
@@ -193,26 +329,41 @@ def _draw(results: Results, shown_letter: Letter, via: Array, trajectories: list
             lw=0,
         )
     first.set_title("(a) demonstrations and mixture", loc="left")
-    shown = np.unique(np.linspace(0, len(trajectories) - 1, 8).round().astype(int))
+    shown = np.unique(np.linspace(0, len(trial.trajectories) - 1, 8).round().astype(int))
     for shade, k in zip(np.linspace(0.25, 1.0, len(shown)), shown, strict=True):
-        second.plot(*trajectories[k].T, color=plt.get_cmap("Blues")(shade), lw=1.4)
-    last = trajectories[-1]
-    second.plot(*base.reference.mean.T, "--", color=REFERENCE, lw=1.2, label="reference")
+        label = "learned, from light to dark" if k == shown[-1] else None
+        second.plot(*trial.trajectories[k].T, color=plt.get_cmap("Blues")(shade), lw=1.4, label=label)
+    second.plot(*one.base.reference.mean.T, "--", color=REFERENCE, lw=1.2, label="reference")
+    label = f"Λ = {trial.c:.1f} I, as far from the reference"
+    second.plot(*trial.constant.trajectory.T, color=ADAPTED, lw=1.6, label=label)
+    last = trial.trajectories[-1]
     second.plot(*last[:1].T, "*", color="black", ms=8, label="start")
     second.plot(*last[-1:].T, "+", color="black", ms=9, mew=2, label="end")
-    second.plot(*via[:, None], "o", mfc="none", mec=DESIRED, mew=2, ms=10, label="via-point")
-    figure.legend(*second.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    second.set_title("(b) adapted, from light to dark", loc="left")
+    second.plot(*trial.via_cm[:, None], "o", mfc="none", mec=DESIRED, mew=2, ms=10, label="via-point")
+    second.set_title("(b) learned, and loosened by one number", loc="left")
+    above.legend(*second.get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     for axes in (first, second):
-        equal_box(axes, np.concatenate([demonstrations.reshape(-1, 3), *trajectories]))
+        lines = [one.demonstrations.reshape(-1, 3), *trial.trajectories, trial.constant.trajectory]
+        equal_box(axes, np.concatenate(lines))
         axes.view_init(elev=18, azim=-30)
         axes.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]")
         axes.tick_params(labelsize=7)
-    third.errorbar(
-        range(costs.shape[1]), costs.mean(axis=0), costs.std(axis=0), color=OTHER, ecolor="#56B4E9", capsize=2
+    falls = np.array([100 * t.costs / t.costs[0] for t in trials])
+    third.plot(falls.T, color=OTHER, lw=0.6, alpha=0.35)
+    third.plot(falls.mean(axis=0), color=OTHER, lw=2.2, label="mean")
+    third.set(xlabel="updates", ylabel="cost of the joints' motion [% of the first]", ylim=(0, None), xlim=(0, None))
+    third.set_title(f"(c) {len(trials)} trials: letters and via-points", loc="left")
+    for row, method in enumerate(METHODS):
+        values = np.array([t.beside_c(method) for t in trials])
+        aside = np.random.default_rng(row).uniform(-0.25, 0.25, len(values))
+        fourth.plot(values, row + aside, ".", color=OTHER, alpha=0.6)
+        fourth.plot([values.mean()] * 2, [row - 0.36, row + 0.36], color="black", lw=2)
+    fourth.axvline(1.0, color=ADAPTED, lw=1.6)
+    fourth.set(
+        yticks=range(len(METHODS)), yticklabels=METHODS.values(), xlim=(0, None), ylim=(len(METHODS) - 0.5, -0.5)
     )
-    third.set(xlabel="updates", ylabel="cost of the joints' motion [rad]")
-    third.set_title(f"(c) {len(costs)} runs: mean, standard deviation", loc="left")
+    fourth.set(xlabel="cost, times that of Λ = c I at the same distance from the reference")
+    fourth.set_title("(d) what is left beside one number (bars: means)", loc="left")
     results.figure(figure)
 
 
@@ -221,16 +372,18 @@ def _sphere() -> Array:
     return np.array([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
 
 
-def _record(results: Results, demonstrations: Array, trajectories: list[Array], via: Array, costs: Array) -> None:
+def _record(results: Results, one: Letter, trial: Trial) -> None:
     stream = results.recording()
     stream.log(
         "/letter/demonstrations",
-        rr.LineStrips3D(list(demonstrations), colors=[rgb(REFERENCE)], radii=[0.05]),
+        rr.LineStrips3D(list(one.demonstrations), colors=[rgb(REFERENCE)], radii=[0.05]),
         static=True,
     )
-    stream.log("/letter/via_point", rr.Points3D([via], colors=[rgb(DESIRED)], radii=[0.4]), static=True)
-    for k, trajectory in enumerate(trajectories):
+    stream.log("/letter/via_point", rr.Points3D([trial.via_cm], colors=[rgb(DESIRED)], radii=[0.4]), static=True)
+    constant = rr.LineStrips3D([trial.constant.trajectory], colors=[rgb(ADAPTED)], radii=[0.1])
+    stream.log("/letter/constant", constant, static=True)
+    for k, (trajectory, cost) in enumerate(zip(trial.trajectories, trial.costs, strict=True)):
         stream.set_time("update", sequence=k)
         stream.log("/letter/adapted", rr.LineStrips3D([trajectory], colors=[rgb(OTHER)], radii=[0.1]))
-        stream.log("/cost", rr.Scalars(costs[:, k].tolist()))
+        stream.log("/cost", rr.Scalars(float(cost)))
     stream.disconnect()

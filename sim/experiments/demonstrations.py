@@ -14,11 +14,11 @@ from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.via_points import adapted
+from sim.experiments.beside_the_paper import at_the_events
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.scenes import OFFSET_M, draw
-from sim.scene import GRASP_DISTANCE, TOOL_FROM_HAND, Scene
-from sim.script import HandScript
+from sim.experiments.scenes import draw
+from sim.scene import GRASP_DISTANCE, Scene
 
 MOST, DRAWS, HELD_OUT, SCENES = 10, 4, 5, 40
 EVERY = 4  # of the samples, to save time
@@ -79,7 +79,7 @@ def _reproduction_mm(skill: Skill, held_out: list[Demonstration]) -> float:
 
 
 def _floor_mm(known: list[Demonstration], held_out: list[Demonstration]) -> float:
-    """What no skill can better: the distance of held-out demonstrations from the mean of all known
+    """The demonstrations' own scatter: the distance of held-out ones from the mean of all known
     ones at the same time.
     """
     mean = np.mean([one.tool[:, :3] for one in known], axis=0)
@@ -92,10 +92,7 @@ def _events_mm(skill: Skill, number: int) -> Array:
     """
     scene = draw(number).scene
     taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
-    script = HandScript(scene, seed=number, offset_std=OFFSET_M)
-    at = [script.truth(end) for _, end in scene.dwells]
-    hands = np.array([np.concatenate([one.left.position, one.right.position]) for one in at])
-    wanted = np.array([at[0].left.position + TOOL_FROM_HAND, scene.glass, scene.carry])
+    hands, wanted = at_the_events(scene, number)
     return np.asarray(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
 
 

@@ -15,6 +15,7 @@ from service.learning.demonstration import Demonstration
 from service.recorder.recording import Recording
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
+from sim.experiments.beside_the_paper import differences
 from sim.experiments.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
@@ -80,6 +81,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         },
         "attempts": tries,
         **{name: _numbers(ran) for name, (ran, _) in found.items() if ran is not None},
+        "beside_the_paper": differences(options.share),
     }
 
 

@@ -16,6 +16,8 @@ COMPONENTS, SEED = 8, 0
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
 TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
+HALF_CM = 12.5  # of what is drawn of a letter, either way
+SETS = {"model": "modelled", "recorded": "recorded"}
 NEAR_S = 0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
 
 
@@ -103,6 +105,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "unit": "cm",
     }
     stream = results.recording()
+    sets: dict[str, list[Letter]] = {}
     for name, letters in gathered(options).items():
         rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
         results.say(f"{len(rows)} letters learned ({name})")
@@ -114,10 +117,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             "largest_deviation_elsewhere_cm": max(one["largest_elsewhere_cm"] for one in flat),
             "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
         }
-        _draw(results, rows, name)
+        sets[SETS[name]] = rows
         for row in rows:
             _record(stream, row, name)
     stream.disconnect()
+    _draw(results, sets)
     return numbers
 
 
@@ -132,38 +136,58 @@ def _measured(letter: Letter, case: Case) -> dict[str, Any]:
     }
 
 
-def _draw(results: Results, letters: list[Letter], name: str) -> None:
+def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
+    """A row a letter and a block of four a set: demonstrations and mixture, and three cases."""
     plt = pyplot()
-    figure, grid = plt.subplots(len(letters), 4, figsize=(9, 2.15 * len(letters)), squeeze=False)
-    for axes, letter in zip(grid, letters, strict=True):
-        for demonstration in letter.demonstrations:
-            axes[0].plot(*demonstration.T, color=REFERENCE, lw=0.8)
-        for mean, covariance in zip(letter.mixture.means[:, 1:], letter.mixture.covariances[:, 1:, 1:], strict=True):
-            ellipse(axes[0], mean, covariance, facecolor=ADAPTED, edgecolor=ADAPTED, alpha=0.35)
-            axes[0].plot(*mean, ".", color=ADAPTED, ms=3)
-        axes[0].set_ylabel("y [cm]")
-        axes[0].text(-0.32, 1.0, letter.name, transform=axes[0].transAxes, fontweight="bold", fontsize=13)
-        for one, case in zip(axes[1:], cases(letter), strict=True):
-            one.plot(*letter.reference.T, "--", color=REFERENCE, lw=1.2)
-            one.plot(*adapted(letter, case).mean(TIMES[:, None]).T, color=ADAPTED, lw=1.6)
-            one.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8)
-        for one in axes:
-            one.set_aspect("equal", adjustable="datalim")
-    for one, title in zip(
-        grid[0], ("demonstrations, mixture", "start, via-point", "via-point, end", "start, via-point, end"), strict=True
-    ):
-        one.set_title(title, fontsize=9)
-    for one in grid[-1]:
-        one.set_xlabel("x [cm]")
+    names = sorted({row.name for rows in sets.values() for row in rows})
+    figure, grid = plt.subplots(
+        len(names), 4 * len(sets), figsize=(5.2 * len(sets), 0.3 + 1.12 * len(names)), squeeze=False
+    )
+    for axes in grid.flat:
+        axes.set_axis_off()
+        axes.set_aspect("equal", adjustable="datalim")
+    for block, (name, rows) in enumerate(sets.items()):
+        columns = grid[:, 4 * block : 4 * block + 4]
+        columns[0, 0].set_title(f"{name}\ndemonstrations", fontsize=8.5, loc="left")
+        for axes, title in zip(columns[0, 1:], ("start,\nvia-point", "via-point,\nend", "all three"), strict=True):
+            axes.set_title(title, fontsize=8.5, loc="left")
+        for letter in rows:
+            _draw_letter(columns[names.index(letter.name)], letter)
+    first = next(iter(sets.values()))[-1]
+    x, y = _middle(first)
+    axes = grid[names.index(first.name), 0]
+    axes.plot([x - 5, x + 5], [y - HALF_CM, y - HALF_CM], color="black", lw=1.5, clip_on=False)
+    axes.text(x, y - HALF_CM - 0.5, "10 cm", ha="center", va="top", fontsize=7)
     handles = [
         plt.Line2D([], [], color=REFERENCE, lw=0.8, label="demonstrations"),
         plt.Line2D([], [], color=ADAPTED, marker="o", ms=7, lw=0, alpha=0.5, label="Gaussians, 1 standard deviation"),
         plt.Line2D([], [], color=REFERENCE, ls="--", label="reference (GMR)"),
         plt.Line2D([], [], color=ADAPTED, label="adapted (KMP)"),
-        plt.Line2D([], [], color=DESIRED, marker="o", mfc="none", mew=2, ms=8, lw=0, label="desired points"),
+        plt.Line2D([], [], color=DESIRED, marker="o", mfc="none", mew=1.6, ms=6, lw=0, label="desired points"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
-    results.figure(figure, "" if name == "model" else name)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=5 if len(sets) > 1 else 3, frameon=False, fontsize=8
+    )
+    results.figure(figure)
+
+
+def _middle(letter: Letter) -> tuple[float, float]:
+    x, y = (letter.reference.min(axis=0) + letter.reference.max(axis=0)) / 2
+    return float(x), float(y)
+
+
+def _draw_letter(row: Any, letter: Letter) -> None:
+    for demonstration in letter.demonstrations:
+        row[0].plot(*demonstration.T, color=REFERENCE, lw=0.7)
+    for mean, covariance in zip(letter.mixture.means[:, 1:], letter.mixture.covariances[:, 1:, 1:], strict=True):
+        ellipse(row[0], mean, covariance, facecolor=ADAPTED, edgecolor=ADAPTED, alpha=0.35)
+    for axes, case in zip(row[1:], cases(letter), strict=True):
+        axes.plot(*letter.reference.T, "--", color=REFERENCE, lw=0.9)
+        axes.plot(*adapted(letter, case).mean(TIMES[:, None]).T, color=ADAPTED, lw=1.3)
+        axes.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=1.4, ms=5, clip_on=False)
+    x, y = _middle(letter)
+    for axes in row:
+        axes.set(xlim=(x - HALF_CM, x + HALF_CM), ylim=(y - HALF_CM, y + HALF_CM))
 
 
 def _record(stream: rr.RecordingStream, letter: Letter, name: str) -> None:

@@ -1,5 +1,5 @@
-"""No segmentation and no phase: hands that pause pause the robot, hands that go back take it back,
-where a trajectory over time goes on.
+"""No segmentation and no phase: hands that pause pause the robot, hands that go back take it back
+(behind them by its lag, either way), where a trajectory over time goes on.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def _draw(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None
             label=f"{name}, ProMP over time",
         )
     middle.set(ylabel="tool [m]", xlabel="time [s]")
-    middle.legend(ncols=3, frameon=False, fontsize=8)
+    middle.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, frameon=False, fontsize=8)
     for axes in (top, middle):
         axes.axvspan(STOP.at_s, STOP.at_s + STOP.lasts_s, color=REFERENCE, alpha=0.2, lw=0)
         axes.axvspan(BACK.at_s, BACK.at_s + BACK.lasts_s, color=OTHER, alpha=0.15, lw=0)
@@ -122,7 +122,9 @@ def _draw(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None
                 lw=1.8,
                 label=label if axis == 2 else None,
             )
-    bottom.set(ylabel="tool, ours [m]", xlabel="progress of the hands [s]: the same place, whichever way they come")
+    bottom.set(
+        ylabel="tool, ours [m]", xlabel="progress of the hands [s]; the tool is behind them by its lag, either way"
+    )
     bottom.legend(frameon=False, fontsize=8)
     results.figure(figure)
 

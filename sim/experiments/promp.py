@@ -5,18 +5,21 @@ input's dimension grows.
 from __future__ import annotations
 
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture
-from sim.experiments.letters import Case, Letter, adapted, cases, elsewhere, gathered, learned
+from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
 from sim.experiments.rivals import RIDGE, learned_promp
 from sim.experiments.writing import DURATION_S, TIMES
 
 BASES = 20  # for each of x and y
+COLUMNS = 5  # of the figure
+STYLES = (("o-", ADAPTED), ("x-", DESIRED), ("v--", "#009E73"), ("s:", "#56B4E9"), ("^--", OTHER), ("D-.", "black"))
 VIA_VARIANCE = 1e-6  # [cm²] as for KMP
 
 DIMENSIONS = (1, 2, 3, 6)
@@ -24,6 +27,7 @@ PER_DIMENSION = (3, 5, 10)  # basis functions along each input
 MOST_BYTES = 2**30  # for the covariance of the weights; beyond it, it is not made
 ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
+WEIGHT_RIDGE = 1e-6  # the functions are known without noise
 FUNCTIONS = 5  # random ones, over which times and errors are averaged
 OUTPUTS = 3
 
@@ -32,6 +36,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     numbers: dict[str, Any] = {"unit": "cm", "promp_bases_per_output": BASES, "promp_ridge": RIDGE}
     stream = results.recording()
+    sets: dict[str, Drawn] = {}
     for name, letters in gathered(options).items():
         rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
         results.say(f"{len(rows)} letters learned ({name})")
@@ -41,10 +46,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             **_summary([one for per in found.values() for one in per]),
             "promp_without_ridge": _bare(rows),
         }
-        _draw_letters(results, rows, found, name)
+        sets[SETS[name]] = (rows, found)
         for row in rows:
             _record(stream, row, found[row.name], name)
     stream.disconnect()
+    _draw_letters(results, sets)
     functions = max(1, round(FUNCTIONS * options.share))
     dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, seed) for seed in range(functions)])]
     results.say("dimensions done")
@@ -63,12 +69,13 @@ class Compared(NamedTuple):
     promp: Array
     miss: tuple[float, float]
     deviation: tuple[float, float]  # rms from the mean of the demonstrations, far from the desired points
+    largest: tuple[float, float]  # the same, the largest
     everywhere: tuple[float, float]  # rms from it, everywhere
 
     def numbers(self) -> dict[str, Any]:
         """By name."""
-        names = ("miss_cm", "rms_deviation_elsewhere_cm", "rms_deviation_cm")
-        values = (self.miss, self.deviation, self.everywhere)
+        names = ("miss_cm", "rms_deviation_elsewhere_cm", "largest_deviation_elsewhere_cm", "rms_deviation_cm")
+        values = (self.miss, self.deviation, self.largest, self.everywhere)
         return {"case": self.case.name, **{n: {"kmp": v[0], "promp": v[1]} for n, v in zip(names, values, strict=True)}}
 
 
@@ -81,8 +88,11 @@ def _compared(letter: Letter, case: Case) -> Compared:
     def miss(line: Array) -> float:
         return float(np.linalg.norm(line[at] - case.points, axis=1).max())
 
+    def off(line: Array, where: Any) -> Array:
+        return np.asarray(np.linalg.norm((line - mean)[where], axis=1))
+
     def rms(line: Array, where: Any) -> float:
-        return float(np.sqrt(np.mean(np.sum((line - mean)[where] ** 2, axis=1))))
+        return float(np.sqrt(np.mean(off(line, where) ** 2)))
 
     everywhere = slice(None)
     return Compared(
@@ -91,8 +101,13 @@ def _compared(letter: Letter, case: Case) -> Compared:
         other,
         (miss(kmp), miss(other)),
         (rms(kmp, away), rms(other, away)),
+        (float(off(kmp, away).max()), float(off(other, away).max())),
         (rms(kmp, everywhere), rms(other, everywhere)),
     )
+
+
+Drawn: TypeAlias = tuple[list[Letter], dict[str, list[Compared]]]
+"""The letters of a set, and what was found for each."""
 
 
 def _conditioned(letter: Letter, case: Case, *, ridge: float) -> Array:
@@ -122,10 +137,16 @@ def _bare(letters: list[Letter]) -> dict[str, float]:
 
 
 def _summary(rows: list[Compared]) -> dict[str, Any]:
+    nearer = sum(one.deviation[0] < one.deviation[1] for one in rows)
     return {
+        "adaptations": len(rows),
+        "kmp_leaves_the_rest_better_alone": nearer,
+    } | {
         who: {
             "largest_miss_cm": max(one.miss[i] for one in rows),
             "mean_rms_deviation_elsewhere_cm": float(np.mean([one.deviation[i] for one in rows])),
+            "mean_largest_deviation_elsewhere_cm": float(np.mean([one.largest[i] for one in rows])),
+            "largest_deviation_elsewhere_cm": max(one.largest[i] for one in rows),
             "mean_rms_deviation_cm": float(np.mean([one.everywhere[i] for one in rows])),
         }
         for i, who in enumerate(("kmp", "promp"))
@@ -160,7 +181,7 @@ def averaged(runs: list[list[Grown]]) -> list[Grown]:
 
 
 def grown(inputs: int, seed: int) -> list[Grown]:
-    """Both methods on a smooth function of so many inputs, known along five demonstrations, tried
+    """The methods on a smooth function of so many inputs, known along five demonstrations, tried
     along a sixth.
     """
     random = np.random.default_rng([seed, inputs])
@@ -170,45 +191,46 @@ def grown(inputs: int, seed: int) -> list[Grown]:
     y, wanted = function(train), function(test)
     scale = float(np.sqrt(np.mean((wanted - wanted.mean(axis=0)) ** 2)))
 
-    began = time.process_time()
-    mixture = GaussianMixture.fit(np.hstack([train, y]), components=COMPONENTS, seed=seed)
-    at = mixture.sample_inputs(POINTS, dimensions=inputs, seed=seed)
-    primitive = KMP.fit(
-        at, mixture.regress(at), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=y.mean(axis=0)
-    )
-    error = float(np.sqrt(np.mean((primitive.mean(test) - wanted) ** 2))) / scale
-    rows = [Grown("KMP", inputs, POINTS, 8.0 * (POINTS * OUTPUTS) ** 2, time.process_time() - began, error)]
+    def tried(method: str, functions: int, size: float, guess: Callable[[], Array]) -> Grown:
+        began = time.process_time()
+        error = float(np.sqrt(np.mean((guess() - wanted) ** 2))) / scale
+        return Grown(method, inputs, functions, size, time.process_time() - began, error)
+
+    def kmp() -> Array:
+        mixture = GaussianMixture.fit(np.hstack([train, y]), components=COMPONENTS, seed=seed)
+        at = mixture.sample_inputs(POINTS, dimensions=inputs, seed=seed)
+        reference = mixture.regress(at)
+        kernel, centre = GaussianKernel(ELL), y.mean(axis=0)
+        return KMP.fit(at, reference, kernel=kernel, lambda_mean=LAMBDA, prior_mean=centre).mean(test)
+
+    some = slice(None, None, len(train) // POINTS)
+
+    def kernel_ridge() -> Array:
+        kernel, centre = GaussianKernel(ELL), y.mean(axis=0)
+        gram = kernel(train[some], train[some]) + WEIGHT_RIDGE * np.eye(POINTS)
+        return np.asarray(kernel(test, train[some]) @ np.linalg.solve(gram, y[some] - centre) + centre)
+
+    def promp(phi: Callable[[Array], Array]) -> Callable[[], Array]:
+        return lambda: _promp([phi(line) for line in lines[:-1]], y.reshape(DEMONSTRATIONS, -1, OUTPUTS), phi(test))
+
+    size = 8.0 * (POINTS * OUTPUTS) ** 2
+    rows = [
+        tried("KMP", POINTS, size, kmp),
+        tried("kernel ridge, 200 samples", POINTS, 8.0 * POINTS**2, kernel_ridge),
+        tried("ProMP, at 200 samples", POINTS, size, promp(lambda s: GaussianKernel(ELL)(s, train[some]))),
+    ]
     for each in PER_DIMENSION:
-        functions = each**inputs
+        functions, method = each**inputs, f"ProMP, {each} per input"
         size = 8.0 * (functions * OUTPUTS) ** 2
         if size > MOST_BYTES:
-            rows.append(Grown(f"ProMP, {each} per input", inputs, functions, size, None, None))
-            continue
-        began = time.process_time()
-        guess = _basis_functions(lines, y.reshape(len(lines) - 1, SAMPLES, OUTPUTS), each)
-        seconds = time.process_time() - began
-        rows.append(
-            Grown(
-                f"ProMP, {each} per input",
-                inputs,
-                functions,
-                size,
-                seconds,
-                float(np.sqrt(np.mean((guess - wanted) ** 2))) / scale,
-            )
-        )
+            rows.append(Grown(method, inputs, functions, size, None, None))
+        else:
+            rows.append(tried(method, functions, size, promp(_grid(inputs, each))))
     return rows
 
 
-def _basis_functions(lines: Array, y: Array, each: int) -> Array:
-    """What a ProMP with a grid of basis functions over the inputs predicts along the last line:
-
-    (200, O).
-
-    Weights by ridge regression for each demonstration, then their mean and covariance, as the
-    paper's section IV describes it.
-    """
-    inputs = lines.shape[2]
+def _grid(inputs: int, each: int) -> Callable[[Array], Array]:
+    """Normalised basis functions on a grid over the inputs: from (M, I) to (M, each^I)."""
     grid = np.linspace(0, 1, each)
     width = grid[1] - grid[0]
 
@@ -219,17 +241,29 @@ def _basis_functions(lines: Array, y: Array, each: int) -> Array:
             rows = (rows[:, :, None] * (bumps / bumps.sum(axis=1, keepdims=True))[:, None, :]).reshape(len(s), -1)
         return rows
 
-    weights = []
-    for line, wanted in zip(lines[:-1], y, strict=True):
-        design = phi(line)
-        dual = np.linalg.solve(
-            design @ design.T + 1e-6 * np.eye(len(design)), wanted
-        )  # ridge, in whichever form is smaller
-        weights.append((design.T @ dual).ravel())
-    stacked = np.array(weights)
-    covariance = np.cov(stacked.T)  # of all weights: what conditioning needs
-    assert covariance.shape == (stacked.shape[1],) * 2
-    return np.asarray(phi(lines[-1]) @ stacked.mean(axis=0).reshape(-1, OUTPUTS))
+    return phi
+
+
+def _promp(designs: list[Array], y: Array, query: Array) -> Array:
+    """What a ProMP with such basis functions, rows of demonstrations (200, B) with outputs (H, 200,
+    O), predicts at the rows of a query (M, B): (M, O).
+
+    The weights' mean is the ridge regression of all demonstrations, each demonstration's weights
+    that of what the mean leaves of it: few demonstrations do not reach every basis function, and
+    their own weights alone would average to less than what any of them shows.
+    """
+
+    def ridge(design: Array, wanted: Array) -> Array:
+        gram = design @ design.T + WEIGHT_RIDGE * np.eye(len(design))  # the dual: fewer rows than functions
+        return np.asarray(design.T @ np.linalg.solve(gram, wanted))
+
+    mean = ridge(np.concatenate(designs), np.concatenate(list(y)))
+    weights = [
+        (mean + ridge(design, wanted - design @ mean)).ravel() for design, wanted in zip(designs, y, strict=True)
+    ]
+    covariance = np.cov(np.array(weights).T)  # of all weights: what conditioning needs
+    assert covariance.shape == (mean.size,) * 2
+    return np.asarray(query @ mean)
 
 
 def _lines(inputs: int, random: np.random.Generator) -> Array:
@@ -254,37 +288,35 @@ def _function(inputs: int, random: np.random.Generator) -> Any:
     return lambda s: np.sin(s @ directions.T + phases) @ sizes
 
 
-def _draw_letters(results: Results, letters: list[Letter], found: dict[str, list[Compared]], name: str) -> None:
+def _draw_letters(results: Results, sets: dict[str, Drawn]) -> None:
     plt = pyplot()
-    columns = min(4, len(letters))
-    figure, grid = plt.subplots(
-        -(-len(letters) // columns), columns, figsize=(2.4 * columns, 2.5 * -(-len(letters) // columns)), squeeze=False
-    )
-    for axes, letter in zip(grid.flat, letters, strict=False):
-        one = found[letter.name][2]
-        axes.plot(
-            *letter.demonstrations.mean(axis=0).T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations"
-        )
-        axes.plot(*one.promp.T, color=OTHER, lw=1.8, label="ProMP")
-        axes.plot(*one.kmp.T, color=ADAPTED, lw=1.3, label="KMP")
-        axes.plot(*one.case.points.T, "o", mfc="none", mec=DESIRED, mew=2, ms=8, label="desired points")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_title(letter.name, loc="left", fontweight="bold")
-    for axes in grid.flat[len(letters) :]:
-        axes.set_axis_off()
-    for axes in grid[:, 0]:
-        axes.set_ylabel("y [cm]")
-    for axes in grid[-1]:
-        axes.set_xlabel("x [cm]")
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    results.figure(figure, "" if name == "model" else name)
+    lines = {name: -(-len(rows) // COLUMNS) for name, (rows, _) in sets.items()}
+    figure = plt.figure(figsize=(9.5, 0.3 + 2.05 * sum(lines.values())))
+    blocks = np.atleast_1d(figure.subfigures(len(sets), 1, height_ratios=list(lines.values()), squeeze=True))
+    for block, (name, (rows, found)) in zip(blocks, sets.items(), strict=True):
+        grid = block.subplots(lines[name], COLUMNS, squeeze=False)
+        block.supylabel(f"{name} [cm]", fontsize=9)
+        for axes, letter in zip(grid.flat, rows, strict=False):
+            one, mean = found[letter.name][2], letter.demonstrations.mean(axis=0)
+            axes.plot(*mean.T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations")
+            axes.plot(*one.promp.T, color=OTHER, lw=1.8, label="ProMP")
+            axes.plot(*one.kmp.T, color=ADAPTED, lw=1.3, label="KMP")
+            axes.plot(*one.case.points.T, "o", mfc="none", mec=DESIRED, mew=1.8, ms=7, label="desired points")
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_title(letter.name, loc="left", fontweight="bold", fontsize=9)
+            axes.tick_params(labelsize=7)
+        for axes in grid.flat[len(rows) :]:
+            axes.set_axis_off()
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    results.figure(figure)
 
 
 def _draw_dimensions(results: Results, rows: list[Grown]) -> None:
     plt = pyplot()
     figure, (functions, seconds, error) = plt.subplots(1, 3, figsize=(10, 3.4))
     methods = list(dict.fromkeys(one.method for one in rows))
-    styles = dict(zip(methods, (("o-", ADAPTED), ("s:", "#56B4E9"), ("^--", OTHER), ("D-.", "black")), strict=True))
+    styles = dict(zip(methods, STYLES, strict=True))
     for method in methods:
         mine = [one for one in rows if one.method == method]
         style, colour = styles[method]
@@ -299,7 +331,7 @@ def _draw_dimensions(results: Results, rows: list[Grown]) -> None:
         )
     at = (MOST_BYTES / 8) ** 0.5 / OUTPUTS
     functions.axhline(at, color=REFERENCE, lw=0.8)
-    functions.text(1, at * 1.4, "above: more than 1 GiB for the weights' covariance", fontsize=7.5, color=REFERENCE)
+    functions.text(0.9, at * 1.5, "above: more than 1 GiB\nfor their covariance", fontsize=7.5, color=REFERENCE)
     functions.set(yscale="log", ylabel="basis functions, or reference points")
     seconds.set(yscale="log", ylabel="time to learn [s]")
     error.set(yscale="log", ylabel="error along a held-out demonstration\n[% of the output's deviation]")

@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import rerun as rr
@@ -33,7 +33,7 @@ LEFT, RIGHT, TOOL = (
     "#009E73",
 )  # as in the paper: the left hand red, the right one blue, the robot green
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 DPI, COLOURS = 110, 256
 
 
@@ -46,7 +46,8 @@ class Options:
     """What the command line says for all experiments."""
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
-    hands: Path | None = None  # a folder of recorded hands, for `motion`
+    hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
+    group: Literal["tuning", "test"] = "test"  # of people, for `people`
     workers: int = 1  # processes
     share: float = 1.0  # of the full size, for a quick look
 

@@ -25,6 +25,8 @@ from service.learning.demonstration import Demonstration
 from service.learning.via_points import adapted, neighbourhoods
 from sim.bench import Bench
 from sim.experiments.results import Array, ExperimentError
+from sim.experiments.trials import Model
+from sim.people import Places
 from sim.scene import Scene
 
 Law: TypeAlias = Callable[[Array], Array]
@@ -139,9 +141,23 @@ def paper(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     return adapt
 
 
-def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstration], *, every: int = 20) -> Adapt:
+def of_model(skill: Skill, model: Model) -> Adapt:
+    """A model of `people`, told a scene's places and its start, exactly."""
+
+    def adapt(scene: Scene) -> Callable[[Bench], Skill]:
+        s = scene
+        points = (s.left_start, s.right_start, s.handover, s.glass, s.soldering, s.iron, s.robot_start)
+        placed = model.place(Places._make([*(np.array(point) for point in points), 0.0]))
+        return lambda bench: _rival(skill, placed.mean)
+
+    return adapt
+
+
+def gaussian_process(
+    skill: Skill, demonstrations: Sequence[Demonstration], *, every: int = 20, ell: float | None = None
+) -> Adapt:
     """A Gaussian process of the demonstrations' samples, its lengths and noise by maximum
-    likelihood.
+    likelihood, or with one length for all, as `ell` [1/m²] says.
 
     It is told the same neighbourhoods of places as our skill, as data with 1 mm of noise that
     replace the samples near them.
@@ -152,6 +168,8 @@ def gaussian_process(skill: Skill, demonstrations: Sequence[Demonstration], *, e
     samples = _samples(demonstrations)[::every]
     inputs, outputs, centre = samples[:, :6], samples[:, 6:], samples[:, 6:].mean(axis=0)
     kernel = ConstantKernel(0.05, (1e-4, 1e2)) * RBF(np.full(6, 0.3), (0.03, 10.0)) + WhiteKernel(1e-4, (1e-6, 1e-2))
+    if ell is not None:
+        kernel = ConstantKernel(0.05) * RBF(np.full(6, (2 * ell) ** -0.5), "fixed") + WhiteKernel(1e-4, "fixed")
     found = GaussianProcessRegressor(kernel, random_state=SEED).fit(inputs, outputs - centre).kernel_
     size, lengths, noise = (
         float(found.k1.k1.constant_value),

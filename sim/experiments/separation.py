@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from kmp.compiled import compiled
@@ -28,11 +29,11 @@ from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
-from sim.script import HandMotions, HandScript, Motion, Teacher
+from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
 SCENES, RATE_HZ = 100, 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
-REACH_S, STAY_S = (0.35, 0.7), 0.6  # of a thrust
+REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
@@ -41,23 +42,37 @@ UNHEEDED_EVERY = 4  # scenes: only to tell what it costs to heed anyone
 
 
 class ThrustScript(HandScript):
-    """Hands of a random scene; one is thrust in the tool's way once, stays, and goes back."""
+    """Hands of a random scene; one is thrust in the tool's way once, stays, and goes back.
+
+    Meanwhile the task goes back to where it was, so that nothing of it is missed.
+    """
 
     def __init__(self, drawn: Drawn) -> None:
-        super().__init__(
-            drawn.scene, seed=drawn.seed, speed=drawn.speed, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M
-        )
         random = np.random.default_rng([drawn.seed, 7])
-        teacher = Teacher(drawn.scene, seed=drawn.seed, clock=self.clock)
+        clock = Clock(speed=drawn.speed, pauses=drawn.pauses)
+        teacher = Teacher(drawn.scene, seed=drawn.seed, clock=clock)
         self.side, self.lasts_s = int(random.integers(2)), float(random.uniform(*REACH_S))
+        self.away_s = 2 * self.lasts_s + STAY_S
         while True:
-            self.at_s = float(random.uniform(0.5, self.duration_s - 1.0))
+            self.at_s = float(random.uniform(0.5, clock.elapsed(drawn.scene.duration_s) - 1.0))
             here = teacher.truth(self.at_s).position
             way = [teacher.truth(t).position for t in self.at_s + np.arange(0.0, 1.5, 0.02)]
             ahead = [at for at in way if np.linalg.norm(at - here) >= AHEAD_M]
-            if ahead:
+            there_s = self.at_s + self.lasts_s
+            if ahead and all(p.at_s + p.lasts_s <= self.at_s or p.at_s >= there_s for p in drawn.pauses):
                 self._place = ahead[0]
                 break
+        later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
+        back = Pause(there_s, self.lasts_s + STAY_S, 2.0)  # by as much as the task went on since at_s
+        super().__init__(
+            drawn.scene,
+            seed=drawn.seed,
+            speed=drawn.speed,
+            pauses=(*later, back),
+            offset_std=OFFSET_M,
+            tremor_rms=TREMOR_M,
+            noise_std=NOISE_M,
+        )
 
     def truth(self, t: float) -> HandMotions:
         """Both hands' motion, the thrust included."""
@@ -90,11 +105,13 @@ class Outcome(NamedTuple):
     success: bool
     errors_mm: tuple[float, float, float]
     times_s: tuple[float, float, float]  # of the events
+    away_s: float  # that a hand was thrust in the way
     closest_mm: float  # of the arm's and the hands' shapes in the simulation; below 0 they overlap
     pushed_mm: float  # that a part of the arm went toward a hand that it touched
     excess_at_once: float  # [m/s] over the rule, the most
     excess_after_reaction: float  # over the most that the rule allowed within the reaction time
     excess_hurried: float  # the same at hands that were faster meanwhile than the rule had assumed
+    excess_lasts_s: float  # that a part is above the rule at once by more than SLIP without a break
     fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
     limited_s: float  # in which separation held the arm back
     self_mm: float  # nearest that links come to each other, which are kept apart
@@ -122,10 +139,13 @@ def run_one(task: tuple[str, int]) -> Outcome:
             done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
     else:
         done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
-    return _judged(kind, number, drawn, done, nearest)
+    away_s = script.away_s if isinstance(script, ThrustScript) else 0.0
+    return _judged(kind, number, drawn, away_s, done, nearest)
 
 
-def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list[tuple[float, float]]) -> Outcome:
+def _judged(
+    kind: str, number: int, drawn: Drawn, away_s: float, done: Rehearsed, nearest: list[tuple[float, float]]
+) -> Outcome:
     settings = Settings()
     people, body, dt = settings.people, body_of(settings, robot_description(settings)), 1 / RATE_HZ
     velocities = np.gradient(done.hands, dt, axis=0)
@@ -146,7 +166,7 @@ def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
     lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
-    assumed = hurried <= _later_by(2 * half, coming) + HURRY
+    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, people.unknown_speed)
     over = speed - lately
     began = np.flatnonzero(done.time_s > 0)
     pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
@@ -159,17 +179,28 @@ def _judged(kind: str, number: int, drawn: Drawn, done: Rehearsed, nearest: list
         done.events.success,
         done.errors_mm,
         tuple(getattr(done.events, name).time_s for name in TaskEvents.__struct_fields__),
+        away_s,
         1000 * min(map(min, nearest)),
         1000 * float(pushed.max()),
         float((speed - allowed)[began].max()),
         float(np.where(assumed, over, -1.0)[began].max()),
         float(np.where(assumed, -1.0, over)[began].max()),
+        dt * _longest(((speed - allowed > SLIP) & assumed)[began]),
         float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
         1000 * float(own.min()),
         1000 * float(table.min()),
         picked[began][::10],
     )
+
+
+def _longest(found: NDArray[np.bool_]) -> int:
+    """The most ticks in a row in which something is found, (T, ...)."""
+    run, most = np.zeros(found.shape[1:], np.int64), 0
+    for now in found:
+        run = (run + 1) * now
+        most = max(most, int(run.max()))
+    return most
 
 
 def _later_by(ticks: int, values: Array) -> Array:
@@ -249,6 +280,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "slip_m_per_s": SLIP,
         **{kind: _summary(rows) for kind, rows in found.items()},
         "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
+        "later_for_a_thrust_s": _later_for(found["thrust"], found["random"]),
         "worst_scene": {
             kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
         },
@@ -266,6 +298,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "excess_at_once": max(one.excess_at_once for one in rows),
         "excess_after_reaction": max(one.excess_after_reaction for one in rows),
         "excess_hurried": max(one.excess_hurried for one in rows),
+        "excess_lasts_s": max(one.excess_lasts_s for one in rows),
         "above_after_reaction": sum(one.excess_after_reaction > SLIP for one in rows),
         "fastest_hand": max(one.fastest_hand for one in rows),
         "limited_s": float(np.mean([one.limited_s for one in rows])),
@@ -281,6 +314,16 @@ def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
         name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())}
         for i, name in enumerate(TaskEvents.__struct_fields__)
     }
+
+
+def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:
+    """By how much the task ends later for a thrust than for its scene alone, beyond the time in
+    which the hand was away [s], where both succeed.
+    """
+    both = [(one, other) for one, other in zip(thrust, undisturbed, strict=True) if one.success and other.success]
+    late = np.array([one.times_s[-1] - other.times_s[-1] - one.away_s for one, other in both])
+    away = float(np.mean([one.away_s for one in thrust]))
+    return {"away": away, "mean": float(late.mean()), "least": float(late.min()), "most": float(late.max())}
 
 
 def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:

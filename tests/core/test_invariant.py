@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bounds import bounds_hold
+from explained import Explained
 from hypothesis import HealthCheck
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
@@ -23,8 +25,7 @@ from wam import JOINT_NAMES, URDF
 
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
-from service.contract.records import SIDES, Mode, Reason
-from service.core.arm import Arm
+from service.contract.records import SIDES
 from service.core.controller import Controller
 from service.core.frame import Event, Frame, Tick, Vector, order
 from service.learning.skill_file import decoded
@@ -33,12 +34,6 @@ from sim.scene import Scene
 
 SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s
-LIMITS, TOOL = SETTINGS.joints, SETTINGS.tool
-LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
-SPEED, ACCELERATION, JERK = (np.array(of) for of in (LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk))
-EXACT, OVER_M = 1e-9, 0.05
-SOME = 3  # of the frames the tool's speed is looked at
-ARM = Arm(SETTINGS, URDF)
 SHIPPED = decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="soldering")
 SKILLS = (SHIPPED, adapted(SHIPPED, Scene().via_points(), tolerance=0.05), replace(SHIPPED, threshold=math.inf))
 EXAMPLES = int(os.environ.get("THIRDHAND_EXAMPLES", "500"))
@@ -65,6 +60,7 @@ class Cell(RuleBasedStateMachine):
     @initialize(skill=st.integers(0, len(SKILLS) - 1), hands=st.booleans())
     def start(self, skill: int, hands: bool) -> None:
         self.controller = Controller(SETTINGS, SKILLS[skill], urdf=URDF)
+        self.controller._setpoint = Explained(SETTINGS)
         self.tick = 0
         self.joints: Vector = np.array(SETTINGS.arm.posture)
         self.at: Vector = np.array([LEFT, RIGHT])
@@ -159,39 +155,7 @@ class Cell(RuleBasedStateMachine):
             self.joints = frame["joints"]
 
     def teardown(self) -> None:
-        bounds_hold(np.array(self.seen), np.array(self.measured))
-
-
-def bounds_hold(seen: np.ndarray, measured: np.ndarray) -> None:
-    """Measured (T, 7) is what the arm told last, tick by tick."""
-    for name in seen.dtype.names or ():
-        assert np.isfinite(seen[name]).all(), name
-    assert (seen["reason"] != Reason.SETPOINT).all()
-    sent = seen[seen["commanded"] == 1]
-    assert (np.abs(sent["joint_velocities"]) <= SPEED * (1 + EXACT)).all()
-    assert (np.abs(sent["joint_accelerations"]) <= ACCELERATION * (1 + EXACT)).all()
-    assert (np.linalg.norm(sent["setpoint_velocity"], axis=1) <= TOOL.max_speed * (1 + EXACT)).all()
-    both = (seen["commanded"][1:] == 1) & (seen["commanded"][:-1] == 1)
-    before, after = seen[:-1][both], seen[1:][both]
-    outside, was = (np.maximum(of["joints"] - UPPER, LOWER - of["joints"]) for of in (after, before))
-    assert (outside <= np.maximum(0.0, was)).all(), "joints beyond their limits, and not on their way back"
-    way = after["joints"] - before["joints"]
-    way -= PERIOD_S * (before["joint_velocities"] + after["joint_velocities"]) / 2
-    jumps = (np.abs(way) > JERK * PERIOD_S**3 + EXACT).any(axis=1)
-    assert not before["joint_velocities"][jumps].any(), "a jump in motion"
-    there = np.abs(after["joints"] - measured[1:][both]).max(axis=1) < 1e-4
-    assert there[jumps].all(), "a jump to where the arm is not"
-    jerks = (after["joint_accelerations"] - before["joint_accelerations"]) / PERIOD_S
-    assert (np.abs(jerks) <= JERK * (1 + EXACT) + EXACT / PERIOD_S).all()
-    box = SHIPPED.workspace
-    beyond = np.maximum(box[0] - seen["setpoint"], seen["setpoint"] - box[1]).max(axis=1)
-    follows = seen["mode"] == Mode.FOLLOW  # from an arm that stands outside it comes back
-    leaves = follows[1:] & follows[:-1] & (beyond[1:] > np.maximum(OVER_M, beyond[:-1] + EXACT))
-    assert not leaves.any(), "a setpoint that leaves the workspace"
-    following = seen[follows]
-    for frame in following[::SOME]:
-        here = ARM.at(frame["joints"])
-        assert ARM.speeds(here, frame["joint_velocities"], frame["joint_accelerations"])[0] <= TOOL.max_speed + 1e-6
+        bounds_hold(np.array(self.seen), np.array(self.measured), box=SHIPPED.workspace)
 
 
 TestCell = pytest.mark.timeout(60 + EXAMPLES)(Cell.TestCase)

@@ -123,11 +123,11 @@ def test_rows_are_how_fast_distances_shrink() -> None:
     apart = Separation(settings, URDF)
     state = start_state(settings, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"], state["hands"][:, 0] = 0, np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]
-    random, near = np.random.default_rng(4), np.empty(9)
+    random, near, total = np.random.default_rng(4), np.empty(9), 0
     for q, dq in zip(random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True):
         here = ARM.at(q)
         apart.look(state, q, here.position, here.jacobian)
-        assert apart.count
+        total += apart.count
         speeds = apart.rows[: apart.count] @ dq
         both = [placed(q + h * dq) for h in (-1e-6, 1e-6)]
         found = []
@@ -137,9 +137,13 @@ def test_rows_are_how_fast_distances_shrink() -> None:
                 found.append(-np.diff([between_segments(at[k], arm, near) for at in both])[0] / 2e-6)
         for i, j in BODY.pairs:
             found.append(-np.diff([between_segments(at[i], at[j], near) for at in both])[0] / 2e-6)
+        for k in np.flatnonzero(BODY.links):
+            for box in apart._boxes:
+                for share in (nearest_to_box(placed(q)[k], box), 0.0, 1.0):
+                    found.append(-np.diff([to_box(at[k], share, box, near) for at in both])[0] / 2e-6)
         expected = np.array(found)
-        close = [np.abs(expected - speed).min() < 1e-5 for speed in speeds]
-        assert np.mean(close) > 0.5  # the others are those of boxes
+        assert all(np.abs(expected - speed).min() < 1e-5 for speed in speeds)
+    assert total > 50
 
 
 class _Nothing:
@@ -278,6 +282,28 @@ def test_motion_that_leaves_a_hand_is_not_slowed() -> None:
     assert here.tasks[0] @ toward.velocity < 0.05
 
 
+@pytest.mark.parametrize("hand_speed", [0.0, 0.05, 1.5])
+def test_a_hand_that_passes_is_foreseen_where_the_arm_goes(hand_speed: float) -> None:
+    """The tool leaves the hand now, but goes where a fast one will be a tenth of a second later."""
+    apart, here, way, near = Separation(ASSUMED, URDF), ARM.at(POSTURE), np.array([0.3, 0.4, 0.0]), np.empty(9)
+    state = start_state(ASSUMED, _Nothing())  # type: ignore[arg-type]
+    state["hand_ticks"], state["hands"][:, 0] = 0, (np.add(here.position, (0.14, -0.16, 0.0)), RIGHT)
+    state["hands"][0, 1, 1] = hand_speed
+    free = ARM.step(POSTURE, here.position, way, here.rotation[:, 2])
+    state["joints"][1] = free.velocity
+    apart.look(state, POSTURE, here.position, here.jacobian)
+    kept = ARM.step(POSTURE, here.position, way, here.rotation[:, 2], apart=apart)
+    forearm = state["hands"][0, 0] + np.array([[0.0, 0.0, 0.0], [0.24, 0.0, 0.0]])
+    for k in np.flatnonzero(BODY.links == 7):
+        then = between_segments(placed(POSTURE + 1e-6 * free.velocity)[k], forearm, near)
+        assert then > between_segments(placed(POSTURE)[k], forearm, near)
+    if hand_speed < 1.0:
+        assert (kept.apart, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
+    else:
+        assert kept.apart
+        assert (here.tasks[:3] @ kept.velocity)[0] < 0.8 * (here.tasks[:3] @ free.velocity)[0]
+
+
 def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -> None:
     apart = Separation(ASSUMED, URDF)
     apart.expect(taught.via_points)
@@ -297,6 +323,11 @@ def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -
         apart.look(state, POSTURE, here.position, here.jacobian)
         allowed = apart.allowed[: apart.count] - SLIP
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
+        state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, here.position  # the other hand receives nothing
+        apart.look(state, POSTURE, here.position, here.jacobian)
+        assert not (abs(apart.allowed[: apart.count] - SLIP - 0.25) < 1e-9).any()
+        state["hands"][0, 0], state["hands"][1, 0] = here.position, Scene().right_start
+        apart.look(state, POSTURE, here.position, here.jacobian)
         assert apart.told[1] == 0.0  # no other part may come nearer
 
 

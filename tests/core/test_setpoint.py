@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import ruckig
+from explained import Explained, margin
 from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
@@ -17,13 +18,8 @@ from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
 from service.core.frame import Vector, blank
 from service.core.intake import Intake
-from service.core.setpoint import (
-    HULL_MARGIN,
-    SetpointGenerator,
-    speed_to_come,
-    stop_distance,
-    tracker_gains,
-)
+from service.core.setpoint import SetpointGenerator, stop_distance, tracker_gains
+from service.core.setpoint_bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
 from service.core.stops import fastest_stop
 from service.core.workspace import Target
 
@@ -52,8 +48,11 @@ def driven(
     costs: Vector = FREE,
     slow: float = 1.0,
 ) -> tuple[Vector, Vector]:
-    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said."""
-    generator, state = SetpointGenerator(Settings(tool=tool)), blank(STATE)
+    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
+
+    In each step the bounds are looked at from outside.
+    """
+    generator, state = Explained(Settings(tool=tool)), blank(STATE)
     generator.begin(state, at_rest(targets[0][0]) if start is None else start)
     out, said = [state["setpoint"].copy()], []
     for target in targets:
@@ -106,6 +105,23 @@ def test_targets_that_alternate_or_tremble_make_no_setpoint_run_away(
             targets.append(np.array([position, random.normal(0.0, 2.0, 3), random.normal(0.0, 50.0, 3)]))
     states, _ = driven(targets)
     assert_bounds_hold(states, targets)
+
+
+@properties
+@given(st.lists(inside, min_size=2, max_size=4), inside, st.integers(1, 40), st.sampled_from([0.0, 1e2, 1e4, 1e6]))
+def test_an_axis_that_wild_ones_starve_comes_back(
+    places: list[tuple[float, ...]], start: tuple[float, ...], ticks: int, wild: float
+) -> None:
+    """Every axis but the first is asked for all it can do; the first has moved away and rests."""
+    targets = []
+    for k in range(1500):
+        y, z = places[k // ticks % len(places)][1:]
+        sign = (-1.0) ** (k // ticks)
+        targets.append(np.array([(0.5, y, z), (0.0, 0.0, 0.0), (0.0, sign * wild, -sign * wild)]))
+    states, _ = driven(targets, start=at_rest(start))
+    back_s = (abs(start[0] - 0.5) - HULL_MARGIN) / (RETURN_SHARE * TOOL.max_speed)
+    if back_s < len(targets) * PERIOD_S - 2 * HULL_TIME_S:
+        assert abs(states[-1, 0, 0] - 0.5) <= margin(TOOL) + 1e-6
 
 
 @pytest.mark.parametrize("rate_hz", [30, 60, 100, 250, 500])
@@ -281,8 +297,8 @@ def test_more_weight_on_jerk_makes_gains_smaller() -> None:
 
 
 def test_the_speed_to_come_counts_what_an_acceleration_still_adds() -> None:
-    assert speed_to_come(np.array([0.3, 0.0, 0.4]), np.zeros(3), 200.0) == pytest.approx(0.5)
-    assert speed_to_come(np.zeros(3), np.array([4.0, 0.0, 0.0]), 200.0) == pytest.approx(0.04)
+    assert speed_to_come(np.array([0.3, 0.0, 0.4]), np.zeros(3), 200.0, 0.0) == pytest.approx(0.5)
+    assert speed_to_come(np.zeros(3), np.array([4.0, 0.0, 0.0]), 200.0, 0.0) == pytest.approx(0.04)
 
 
 def test_going_on_from_a_copy_of_the_state_gives_the_same_bits() -> None:

@@ -50,6 +50,18 @@ def test_the_covariances_are_those_of_equation_11():
         np.testing.assert_allclose(found[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9)
 
 
+def test_a_factor_below_zero_flips_signs_and_through_zero_the_covariances_stay_positive_definite():
+    primitive = letter()
+    before = primitive.base.reference.covariance
+    for factor in (-2.0, -0.05, -0.02, 0.0, 0.02, 0.05, 2.0):
+        found = Correlation([[1.0]], 1.0, [[1.0, factor]]).applied(primitive).base.reference.covariance
+        assert np.linalg.eigvalsh(found).min() > 1e-3 * 0.05**2 * before.max()
+        deviation = np.sqrt(found[:, 1, 1] / before[:, 1, 1])
+        np.testing.assert_allclose(deviation, max(abs(factor), 0.05), rtol=1e-12)
+        coefficient = found[:, 0, 1] / np.sqrt(found[:, 0, 0] * found[:, 1, 1])
+        np.testing.assert_allclose(coefficient, 0.95 * np.clip(factor / 0.05, -1, 1), atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_rewards_grow_and_the_via_point_is_still_met(seed):
     primitive = letter()

@@ -1,0 +1,134 @@
+"""Modelled people at the soldering bench: their habits and their trackers, and where things are.
+
+NumPy only, each from its number alone. People come in three groups that share nobody: who
+demonstrates, who parameters are chosen on, and who is tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from sim.scene import RIGHT_FROM_OBJECT, TOOL_FROM_OBJECT
+from sim.script import Array
+
+Group: TypeAlias = Literal["demonstrations", "tuning", "test"]
+SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3}
+PROJECT_SEED = 2024
+LEAST_DWELL_S, MOST_DWELL_S = 0.9, 1.8
+LONGEST_LEAD_S = 2.0
+HABITS_M = (0.020, 0.008, 0.008)  # each axis: a hand held out in the air, on the board, at the iron
+
+
+class Places(NamedTuple):
+    """Where things are, or are told to be [m], (3,) each; `std_m` is how sure that is, 3-D rms."""
+
+    left_start: Array
+    right_start: Array
+    handover: Array
+    glass: Array
+    board: Array
+    iron: Array
+    robot_start: Array
+    std_m: float = 0.0
+
+    @property
+    def right_final(self) -> Array:
+        """Where the right hand holds the iron at the end (3,) [m]."""
+        return self.board + RIGHT_FROM_OBJECT
+
+    @property
+    def carry(self) -> Array:
+        """Where the tool holds the glass (3,) [m]."""
+        return self.board + TOOL_FROM_OBJECT
+
+    def perceived(self, sigma_m: float, random: np.random.Generator) -> Places:
+        """The places as they are seen, each off by `sigma_m` (3-D rms); the robot knows its own."""
+        off = sigma_m / np.sqrt(3.0) * random.standard_normal((6, 3))
+        left_start, right_start, handover, glass, board, iron = np.array(self[:6]) + off
+        return Places(left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m)
+
+
+class Tracker(NamedTuple):
+    """What a tracker makes of a hand: rate, noise of each axis, jumps and dropouts a second."""
+
+    rate_hz: float = 100.0
+    noise_m: float = 0.0005
+    jumps_hz: float = 0.0
+    dropouts_hz: float = 0.0
+    residual: Array | None = None  # (M, 6) [m] of a recording, which is its noise then
+
+
+class Person(NamedTuple):
+    """A person's habits. Lengths in metres, (6,) or (2, 3) for the left and then the right hand."""
+
+    name: str
+    start: Array  # (2, 3) from where hands usually start
+    reach: Array  # (3, 3) by which they stop off what they reach for, always: handover, board, iron
+    scatter: float  # of that, each axis, each time
+    bows: Array  # (2, 2, 3) of each hand's two legs
+    speed: float
+    skew: float
+    correction: float  # share of the way that is left to a second, slower motion
+    lead_s: float  # by which the right hand is early
+    dwells: tuple[float, float]  # least and most time for which hands wait at a place
+    haste: float  # share of the left hand's time that the right hand takes to get to the iron
+    sway: float  # of a waiting hand, rms of an axis
+    strays: float  # how probable it is that a waiting hand does something else in between
+    tremor: float
+    tracker: Tracker
+    mistakes: float = 0.25  # how probable one is in a session
+    swaps: float = 0.25  # how probable it is that a tracker takes left for right for a moment
+    shapes: Sequence[tuple[Array, Array]] = ()  # recorded reaches: shares (M,), deviations (M, 3) a metre, way along x
+
+
+def person(group: Group, number: int) -> Person:
+    """One of a group's people."""
+    random = np.random.default_rng([PROJECT_SEED, SEEDS[group], number])
+    rate = (30.0, 60.0, 120.0)[number % 3]
+    bow = random.standard_normal((2, 2, 3))
+    bow[..., 2] += 0.7
+    bow *= random.uniform(0.0, 0.10, (2, 2, 1)) / np.linalg.norm(bow, axis=2, keepdims=True)
+    bow[..., 2] = np.abs(bow[..., 2])  # over things, not under the table
+    return Person(
+        name=f"{group} {number + 1}",
+        start=np.clip(0.04 * random.standard_normal((2, 3)), -0.1, 0.1) * (1.0, 1.0, 0.5) + (0.0, 0.0, 0.01),
+        reach=random.standard_normal((3, 3)) * np.array(HABITS_M)[:, None],
+        scatter=float(random.uniform(0.005, 0.012)),
+        bows=bow,
+        speed=float(2 ** random.uniform(-0.6, 0.5)),
+        skew=float(random.uniform(-0.35, 0.35)),
+        correction=float(random.uniform(0.0, 0.12)),
+        lead_s=float(random.uniform(-LONGEST_LEAD_S, LONGEST_LEAD_S)),
+        dwells=(LEAST_DWELL_S, MOST_DWELL_S),
+        haste=float(random.uniform(0.4, 1.0)),
+        sway=float(random.uniform(0.001, 0.004)),
+        strays=float(random.uniform(0.0, 0.6)),
+        tremor=float(random.uniform(0.0003, 0.0012)),
+        tracker=Tracker(
+            rate, float(random.uniform(0.001, 0.003)), float(random.uniform(0, 0.4)), float(random.uniform(0, 0.1))
+        ),
+    )
+
+
+PLAIN = Person(
+    name="plain",
+    start=np.zeros((2, 3)),
+    reach=np.zeros((3, 3)),
+    scatter=0.008,
+    bows=np.zeros((2, 2, 3)),
+    speed=1.0,
+    skew=0.0,
+    correction=0.0,
+    lead_s=0.0,
+    dwells=(0.6, 0.6),
+    haste=1.0,
+    sway=0.0015,
+    strays=0.0,
+    tremor=0.0005,
+    tracker=Tracker(),
+    mistakes=0.0,
+    swaps=0.0,
+)

@@ -1,0 +1,72 @@
+"""A session of spoilt bytes, decoded as the daemon decodes them, recorded and replayed: the same
+bit for bit, and within every bound. It is made anew from its seed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
+from wam import URDF
+
+from service.config import Settings
+from service.contract import channels
+from service.contract.messages import WireError
+from service.contract.records import Mode
+from service.contract.requests import RequestError
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick, order
+from service.core.skill import Skill
+from service.recorder.recording import Recorder
+
+SETTINGS = Settings()
+SECONDS, EVERY = 12.0, 5  # between samples [ticks]
+ORDERS = ("hold", "resume", "reset")
+
+
+def event(key: str, payload: bytes) -> Event | None:
+    """What becomes of a message's bytes, as in the daemon; None of those that are refused."""
+    channel = channels.BY_KEY[key]
+    try:
+        value = channel.codec.decode(payload)
+    except (WireError, RequestError):
+        return None
+    if channel.direction == "in":
+        return Event(key, payload, value)
+    return order(key) if key in ORDERS else None
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_session_of_spoilt_bytes_replays_within_every_bound(seed: int, skill: Skill, tmp_path: Path) -> None:
+    traffic, path = Traffic(seed), tmp_path / "fuzzed.mcap"
+    traffic.joints = np.array(SETTINGS.arm.posture)
+    controller = Controller(SETTINGS, skill, urdf=URDF)
+    count, refused = round(SECONDS / SETTINGS.period_s), 0
+    sent: list[Tick] = []
+
+    def told() -> object:
+        nonlocal refused
+        for k in range(count):
+            inbox: list[Event] = []
+            if k % EVERY == 0:
+                came = [event(*message) for message in traffic.at(k * SETTINGS.period_s, 2_000_000 * (k + 1))]
+                refused += came.count(None)
+                inbox = [one for one in came if one is not None]
+            sent.append(Tick(k, tuple(inbox)))
+            yield sent[-1]
+
+    with Recorder(path, settings=SETTINGS, skill=skill.file, state=controller.state) as recorder:
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            if frame["commanded"]:
+                traffic.joints = frame["joints"]
+            recorder.write(tick, frame, time_ns=2_000_000 * (tick.index + 1), state=None)
+
+        run(controller, told(), [keep])
+    seen = assert_recorded_session_keeps_the_bounds(path)
+    assert refused > 30
+    assert seen["rejected"][-1].sum() > 30
+    share = (seen["mode"] == Mode.FOLLOW).reshape(-1, round(2 * QUIET_S / SETTINGS.period_s))
+    assert share.mean(axis=1).min() > 0.1, "a second without spoilt bytes is followed"

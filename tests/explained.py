@@ -1,0 +1,68 @@
+"""The bound of docs/bounds.md on a setpoint, what the targets' last motion explains: asserted from
+outside in every step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.config import Settings, ToolSettings
+from service.core.frame import Record, Vector
+from service.core.setpoint import SetpointGenerator
+from service.core.setpoint_bounds import (
+    HULL_MARGIN,
+    HULL_SPANS,
+    HULL_TIME_S,
+    RETURN_SHARE,
+    farthest,
+    speed_to_come,
+)
+from service.core.workspace import Target
+
+
+def margin(tool: ToolSettings) -> float:
+    """[m] by which a setpoint may pass what the targets explain."""
+    back = RETURN_SHARE * tool.max_speed
+    stop_s = (tool.max_speed + back) / tool.max_acceleration + 2.0 * tool.max_acceleration / tool.max_jerk
+    return HULL_MARGIN + back * stop_s
+
+
+class Explained(SetpointGenerator):
+    """A setpoint generator that asserts its bound.
+
+    On each side of each axis the setpoint stays below the greatest of the last targets, and of
+    those before, each as much less as there was time to come back from it; plus `margin`.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        self._tool, self._period = settings.tool, settings.period_s
+        self._margin = margin(settings.tool)
+        self._last = np.empty((HULL_SPANS * max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)), 2, 3))
+        self._steps = -1
+        self.closest = np.inf  # [m] that a setpoint has come to its bound
+
+    def begin(self, state: Record, setpoint: Vector) -> None:
+        super().begin(state, setpoint)
+        self._steps = -1
+
+    def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
+        before, tool = state["setpoint"].copy(), self._tool
+        if self._steps < 0:
+            ends = [
+                [farthest(before, i, side, tool.max_acceleration, tool.max_jerk, 0.0) for i in range(3)]
+                for side in (1.0, -1.0)
+            ]
+            self._most, self._steps = np.array(ends), 0
+            self._last[:] = [before[0], -before[0]]
+        said = super().step(state, target, box, costs, slow)
+        self._last[self._steps % len(self._last)] = [target.position, -target.position]
+        self._steps += 1
+        back = RETURN_SHARE * tool.max_speed
+        too_fast = speed_to_come(before[1], before[2], tool.max_jerk, back) > tool.max_speed
+        share = 0.0 if too_fast else slow / max(1.0, tool.max_speed * np.abs(costs[0]).max())
+        self._most = np.maximum(self._last.max(axis=0), self._most - back * share * self._period)
+        left = self._most + self._margin - [state["setpoint"][0], -state["setpoint"][0]]
+        assert left.min() >= -1e-6, (left, said)
+        self.closest = min(self.closest, left.min())
+        return said

@@ -1,0 +1,82 @@
+"""Legal hands, an arm and requests as bytes, many of them spoilt; and what a recording of a session
+with them must be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from bounds import bounds_hold
+from explained import Explained
+from hostile_bytes import mutated
+from in_process import LEFT, RIGHT
+from wam import JOINT_NAMES
+
+from service.config import robot_description
+from service.contract import cdr
+from service.contract.messages import BASE, JointState, PoseStamped
+from service.contract.records import SIDES
+from service.core.controller import Controller
+from service.core.frame import Frame, Vector
+from service.learning.skill_file import decoded
+from service.recorder.recording import Recording
+from service.recorder.replay import replay, ticks
+
+QUIET_S = 1.0  # of every two, in which nothing is spoilt
+ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")
+DECODERS = {"via_points": "via_points", "skill": "skill_request"}  # of the others: nothing
+REQUEST = {"via_points": b'{"op": "list"}', "skill": b'{"name": "soldering"}'}
+
+
+class Traffic:
+    """Messages (key, bytes) for every moment: two hands that reach there and back at up to 1 m/s,
+    an arm that does as it is told, now and then a request; in every other second spoilt.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._random = Random(seed)
+        self.joints: Vector | None = None  # [rad] that the arm tells
+
+    def at(self, t: float, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
+        """What is sent at a time [s] since the start, stamped so."""
+        random, hostile = self._random, t % (2.0 * QUIET_S) >= QUIET_S
+        for side, rest in zip(SIDES, (LEFT, RIGHT), strict=True):
+            x, y, z = rest
+            away = 0.06 * math.sin(2.0 * math.pi * t / 1.5)
+            pose = cdr.encode_pose(
+                PoseStamped(stamp_ns, BASE, (x - abs(away), y + away, z + 0.05), (0.0, 0.0, 0.0, 1.0))
+            )
+            yield f"hands/{side}", mutated("pose", pose, random) if hostile and random.random() < 0.3 else pose
+        if self.joints is not None:
+            told = JointState(stamp_ns, JOINT_NAMES, tuple(self.joints.tolist()), (0.0,) * len(JOINT_NAMES))
+            state = cdr.encode_joints(told)
+            yield "joints/state", mutated("joints", state, random) if hostile and random.random() < 0.3 else state
+        if hostile and random.random() < 0.1:
+            key = random.choice(ASKED)
+            yield key, mutated(DECODERS.get(key, "nothing"), REQUEST.get(key, b"{}"), random)
+        if not hostile and random.random() < 0.1:
+            yield random.choice(("resume", "reset")), b"{}"
+
+
+def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
+    """Its frames (T,): they are what the core makes of the recorded bytes, bit for bit, and keep
+    every bound.
+    """
+    result = replay(path)
+    assert result.exact, result.text()
+    recording = Recording.open(path)
+    skill = decoded(recording.skill, origin=str(path), recorded=True)
+    controller = Controller(recording.settings, skill, urdf=robot_description(recording.settings))
+    controller._setpoint = Explained(recording.settings)
+    frames: list[Frame] = []
+    measured: list[Vector] = []
+    for tick in ticks(recording):
+        frames.append(controller.step(tick))
+        measured.append(controller.state["measured"].copy())
+    assert len(frames) == result.ticks
+    bounds_hold(np.array(frames), np.array(measured), box=skill.workspace)
+    return np.array(frames)
