@@ -20,6 +20,7 @@ from service.learning.skill_file import SkillError, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
+NOTED_M = 0.005  # a via-point missed or moved by more is told of
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 
 
@@ -66,6 +67,24 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
         )
         for point in skill.via_points
     )
+
+
+def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
+    """What is to be said where one skill takes another's place: which via-points are missed, and
+    which that were there already are moved, by more than 5 mm.
+    """
+    out = [
+        f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was demonstrated or taught "
+        "near it says otherwise. A smaller std makes it count more; a greater tolerance removes what was shown there"
+        for point in in_force(after)
+        if point.missed_by_m > NOTED_M
+    ]
+    for point in set(before.via_points) & set(after.via_points):
+        hands = [[*point.left, *point.right]]
+        moved_m = math.dist(before.primitive.mean(hands)[0], after.primitive.mean(hands)[0])
+        if moved_m > NOTED_M:
+            out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
+    return tuple(sorted(out))
 
 
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:
