@@ -23,8 +23,7 @@ from service.learning.skill_file import SkillError
 ELLS = 2.0 ** np.arange(-1.0, 4.0)  # [1/m²] beyond these, via-points bend everything or nothing
 NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # a reference point's variance over the kernel's, for the mean
 SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # the same, for the covariance
-AS_GOOD = 1.03  # times the least error is as good: then the smoothest is taken
-AS_LIKELY = 0.05  # [nat] the same of the likelihood: then what grows most off the data
+AS_LIKELY = 0.05  # [nat] less likely is as good: then what grows most off the data
 LOCAL_M = 0.08  # distance of hands over which demonstrations are alike in how much they differ
 SHARED = 0.15  # of the scatter that is everywhere the same, as few demonstrations tell little of one place
 REGIONS = (2.366, 7.815)  # chi-square of three degrees of freedom: the 50 and 95 % regions of a normal in space
@@ -92,8 +91,7 @@ class Choice:
             for one in (ELLS if ell is None else (ell,))
             for noise in NOISES
         ]
-        least = min(tried)[0]
-        _, ell, noise = min((t for t in tried if t[0] <= AS_GOOD * least), key=lambda t: (t[1], t[0]))
+        _, ell, noise = min(tried)
         residuals = self.residuals(ell, noise)
         spread = self._spread(ell, residuals)
         unscaled = Parameters(ell, noise, spread, 1.0)
@@ -102,11 +100,9 @@ class Choice:
             mine = self.owner == left_out
             found = self.primitive(unscaled, residuals, without=left_out).predict(self.inputs[mine])
             squares.append(mahalanobis(self.outputs[mine] - found.mean, found.covariance))
-        distances = np.concatenate(squares)
-        scale = max(float(distances.mean()) / 3, float(np.quantile(distances, 0.95)) / REGIONS[1])
         # Of H demonstrations each is predicted by H - 1 whose scatter was measured on the same few.
         few = (count + 1) / (count - 1)
-        return unscaled._replace(deviation=float(np.sqrt(few * scale)))
+        return unscaled._replace(deviation=float(np.sqrt(few * np.concatenate(squares).mean() / 3)))
 
     def residuals(self, ell: float, noise: float) -> Vector:
         """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""

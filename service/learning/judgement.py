@@ -18,7 +18,7 @@ from service.learning.choice import REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
 
-SAME_M = 0.001  # demonstrations nearer to each other, root mean square, are one that was repeated
+SAME_M = 0.003  # demonstrations nearer to each other, root mean square, are one that was repeated
 NEAR_M, APART_M = 0.02, 0.10  # hands so near that go with tools so far apart contradict each other
 COMPARED = 100  # samples of a demonstration, of which each is compared with each
 STANDS_OUT = 2.5  # times the median error of all demonstrations, and
@@ -104,8 +104,8 @@ def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
     """
     paths = []
     for hands, tool in pairs:
-        at = np.linspace(0, len(hands) - 1, COMPARED).round().astype(int)
-        paths.append(np.hstack([hands[at], tool[at, :3]]))
+        both, at = np.hstack([hands, tool[:, :3]]), np.linspace(0.0, 1.0, COMPARED)
+        paths.append(np.stack([np.interp(at, np.linspace(0.0, 1.0, len(both)), column) for column in both.T], axis=1))
     out: dict[int, int] = {}
     for i, path in enumerate(paths):
         for j in range(i):

@@ -109,7 +109,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             components=int(arrays["components"]),
             via_points=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
             tolerance=float(arrays["tolerance"]),
-            figures=msgspec.json.encode(msgspec.json.decode(str(arrays["figures"]))).decode() if kind == JUDGED else "",
+            figures=str(arrays["figures"]) if kind == JUDGED else "",
             file=bytes(data),
         )
         for fault in _faults(skill):
@@ -137,8 +137,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
-    if "figures" in arrays and (arrays["figures"].dtype.kind != "U" or len(str(arrays["figures"])) > LONGEST_FIGURES):
-        yield f"figures is no text of up to {LONGEST_FIGURES} letters"
+    if "figures" in arrays and not _is_json(arrays["figures"]):
+        yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
     if len(arrays["base_inputs"]) > MOST_POINTS:
         yield f"{len(arrays['base_inputs'])} reference points, at most {MOST_POINTS} accepted"
     if "checksum" in arrays:
@@ -146,6 +146,14 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
     elif not recorded:
         yield "no checksum: written by an earlier version, or changed; learn it anew"
+
+
+def _is_json(array: NDArray[Any]) -> bool:
+    try:
+        msgspec.json.decode(str(array))
+    except msgspec.DecodeError:
+        return False
+    return array.dtype.kind == "U" and len(str(array)) <= LONGEST_FIGURES
 
 
 def _faults(skill: Skill) -> Iterator[str]:

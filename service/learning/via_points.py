@@ -34,13 +34,22 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
     inputs, outputs, deviations = neighbourhoods(via_points)
     _check_agreement(via_points, inputs, outputs, deviations)
     try:
-        desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
+        desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
             primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
+
+
+def _weight(skill: Skill) -> float:
+    """What a via-point's variance is multiplied by.
+
+    The covariance of IJRR 2019 is N times that of a point that stands alone. Where the reference
+    was scaled to that, so that predicted deviations are true, a via-point's must be too.
+    """
+    return 1.0 if skill.components else 1.0 / len(skill.primitive.base.inputs)
 
 
 def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
