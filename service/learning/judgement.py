@@ -201,10 +201,9 @@ def _verdicts(
         )
     for what, share in (("hands swapped", found.swapped), ("hands 30 cm beside", found.beside)):
         if share < CAUGHT:
-            say(
-                f"the gate holds {share:.0f} % of {what}, at least {CAUGHT_UNSAFE:.0f} % needed",
-                bad=share < CAUGHT_UNSAFE,
-            )
+            bad = share < CAUGHT_UNSAFE
+            wanted = f"at least {CAUGHT_UNSAFE:.0f} % needed" if bad else f"{CAUGHT:.0f} % wanted"
+            say(f"the gate holds {share:.1f} % of {what}, {wanted}", bad=bad)
     for nominal, share, (low, high) in zip((50, 95), (overall.within_50, overall.within_95), COVERAGE, strict=True):
         if not low <= share <= high:
             say(f"the {nominal} % regions hold {share:.0f} % of held-out samples", bad=False)
