@@ -7,9 +7,18 @@ from service import one_blas_thread  # noqa: F401
 # isort: split
 import sys
 
-from service.cli.main import main
+from service import interrupt
 
 __all__ = ["main"]
+
+
+def main() -> int:
+    """The exit code of the command that the command line names."""
+    interrupt.watch()
+    from service.cli.main import main as run  # takes a while, and may be interrupted
+
+    return run()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -4,6 +4,7 @@ plain calls.
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import re
@@ -52,6 +53,7 @@ def open_session(
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(timeout_s * 1000),
         "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
         "adminspace/enabled": bool(listen),
         "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in
@@ -81,7 +83,8 @@ def open_session(
             secured = any(endpoint.startswith("tls/") for endpoint in connect)
             raise UnreachableError(
                 f"nobody answers at {', '.join(connect)}: is a daemon running and listening there, and not overrun?"
-                + " And is the certificate that was given, if any, of the daemon's authority?" * secured
+                + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
+                "not expired?" * secured
             ) from None
         raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
 
@@ -97,6 +100,8 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
+    _check_dates(own)
+    _check_dates(authority)
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
@@ -104,9 +109,32 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     return {f"transport/link/tls/{name}": value for name, value in settings.items()}
 
 
+def _check_dates(path: Path) -> None:
+    """Raises UnreachableError where a certificate is not valid now: Zenoh says nothing of why a
+    connection fails.
+    """
+    from cryptography import x509  # most sessions need no certificate
+
+    try:
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+    except ValueError as error:
+        raise UnreachableError(f"{path} does not hold a certificate: {error}") from None
+    begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    now = datetime.datetime.now(datetime.UTC)
+    if now > end:
+        raise UnreachableError(
+            f"{path} expired on {end:%Y-%m-%d %H:%M} UTC: a new certificate needed, by `thirdhand certificates`"
+        )
+    if now < begin:
+        raise UnreachableError(
+            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, and the clock here says {now:%Y-%m-%d %H:%M}: "
+            "is that right?"
+        )
+
+
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:
     """The endpoints at which a session really listens, with the ports that it was given."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=ENDPOINTS_TIMEOUT_S):
+    for reply in session.get(f"@/{session.zid()}/*", timeout=ENDPOINTS_TIMEOUT_S):
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
     return ()

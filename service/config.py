@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract.channels import ENDPOINT
-from service.contract.explain import explained
+from service.contract.explain import InvalidError, validated
+from service.contract.roles import DAEMON, ROLES, names
 from service.described_arm import SettingsError, check, completed
 from service.urdf import Urdf, UrdfError
 
@@ -181,18 +182,29 @@ class Network(Section, frozen=True):
     listen: tuple[str, ...] = (ENDPOINT,)
     connect: tuple[str, ...] = ()
     certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
-    allow_insecure: bool = False  # listen for other machines without TLS: whoever reaches it moves the arm
+    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
+    allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
 
     def __post_init__(self) -> None:
-        for i, endpoint in enumerate(self.listen):
+        endpoints = {f"listen[{i}]": endpoint for i, endpoint in enumerate(self.listen)}
+        endpoints |= {f"connect[{i}]": endpoint for i, endpoint in enumerate(self.connect)}
+        for name, endpoint in endpoints.items():
             if self.certificate and not endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.listen[{i}]: {endpoint} given; with a certificate tls/... needed")
+                raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
             if not self.certificate and endpoint.startswith("tls/"):
                 raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
             if not (self.certificate or self.allow_insecure or is_local(endpoint)):
                 raise ValueError(
-                    f"$.network.listen[{i}]: {endpoint} given; other machines could move the arm: an address like "
+                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an address like "
                     "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
+                )
+        if self.revoked and not self.certificate:
+            raise ValueError("$.network.revoked: given without $.network.certificate; without one nobody is told apart")
+        for i, name in enumerate(self.revoked):
+            if not any(name in names(role) for role in (*ROLES, DAEMON)):
+                raise ValueError(
+                    f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
+                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
                 )
 
 
@@ -226,52 +238,62 @@ class Settings(Section, frozen=True):
     files: Files = msgspec.field(default_factory=Files)
 
     def __post_init__(self) -> None:
-        for path, value in _numbers(msgspec.to_builtins(self), "$"):
-            if not math.isfinite(value):
-                raise ValueError(f"{path}: {value} given; a finite number needed")
+        if problems := list(self._problems()):
+            raise ValueError("\n".join(problems))
+
+    def _problems(self) -> Iterator[str]:
+        """What is wrong with values that are right each by itself."""
+        unusable = [path for path, value in _numbers(msgspec.to_builtins(self), "$") if not math.isfinite(value)]
+        yield from (f"{path}: not finite; a finite number needed" for path in unusable)
         if {".", ".."} & set(self.cell.split("/")):
-            raise ValueError(f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted")
+            yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
+        if unusable:
+            return
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
             if abs(norm - 1.0) > 1e-3:
-                raise ValueError(f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)")
+                yield f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)"
         if not math.hypot(*self.people.toward_elbow) > 1e-6:
-            raise ValueError(f"$.people.toward_elbow: {list(self.people.toward_elbow)} given; a direction needed")
+            yield f"$.people.toward_elbow: {list(self.people.toward_elbow)} given; a direction needed"
         if self.tool.fault_speed < self.tool.max_speed:
-            raise ValueError(
+            yield (
                 f"$.tool.fault_speed: {self.tool.fault_speed} given; "
                 f"at least $.tool.max_speed = {self.tool.max_speed} needed"
             )
         if self.reach.inner >= self.reach.outer:
-            raise ValueError(
-                f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
-            )
+            yield f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
+        yield from self._problems_of_joints()
+
+    def _problems_of_joints(self) -> Iterator[str]:
         count = len(self.joints.names)
         if not count or len(set(self.joints.names)) < count:
-            raise ValueError(f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed")
+            yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
+            return
         fields = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS} | {
             "$.arm.posture": self.arm.posture
         }
-        for path, values in fields.items():
-            if len(values) != count:
-                raise ValueError(f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names")
+        uneven = {path: values for path, values in fields.items() if len(values) != count}
+        for path, values in uneven.items():
+            yield f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names"
+        if uneven:
+            return
         widest = self._widest()
         for name in LIMITS:
             for i, (given, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
                 if name == "lower" and given < bound:
-                    raise ValueError(f"$.joints.lower[{i}]: {given} given; {bound} or more accepted")
+                    yield f"$.joints.lower[{i}]: {given} given; {bound} or more accepted"
                 if name == "upper" and given > bound:
-                    raise ValueError(f"$.joints.upper[{i}]: {given} given; {bound} or less accepted")
+                    yield f"$.joints.upper[{i}]: {given} given; {bound} or less accepted"
                 if name not in ("lower", "upper") and not 0 < given <= bound:
-                    raise ValueError(f"$.joints.{name}[{i}]: {given} given; above 0, up to {bound} accepted")
+                    yield f"$.joints.{name}[{i}]: {given} given; above 0, up to {bound} accepted"
         for i, (low, high, at) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
             if not low < high:
-                raise ValueError(f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed")
-            if not low <= at <= high:
-                raise ValueError(f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted")
+                yield f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed"
+            elif not low <= at <= high:
+                yield f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted"
 
     def _widest(self) -> dict[str, PerJoint]:
         """Bounds of the limits: the defaults for the shipped arm, none for others."""
@@ -322,13 +344,11 @@ def converted(given: Any, *, origin: str) -> Settings:
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
             given = completed(given, Urdf(own, origin=arm["urdf"]))
-        settings = msgspec.convert(given, Settings)
+        settings = validated(given, Settings)
         check(
             settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate
         )
-    except msgspec.ValidationError as error:
-        raise SettingsError(f"{origin}: {explained(error, given, Settings)}") from None
-    except (UrdfError, SettingsError) as error:
+    except (UrdfError, SettingsError, InvalidError) as error:
         raise SettingsError(f"{origin}: {error}") from None
     return settings
 

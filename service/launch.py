@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.contract.explain import ExplainedError
+from service.recorder.client import NOT_RECORDED
 
 START_TIMEOUT_S, LONG_START_S = 180.0, 6.0
 STOP_TIMEOUT_S = 60.0
@@ -41,6 +42,11 @@ class Launched:
             return self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise LaunchError(f"the service did not end within {timeout_s:g} s of being asked to") from None
+
+    def missing(self) -> str:
+        """What its recordings lack, by its last words; empty: nothing."""
+        said = self.log.read_text().splitlines()[-1:]
+        return "".join(line.split(maxsplit=2)[-1] for line in said if line.endswith(NOT_RECORDED))
 
 
 @contextlib.contextmanager

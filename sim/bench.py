@@ -26,6 +26,8 @@ from sim.world import BOARD_IN_TOOL, LEVEL, Floats, Pose, World, carried_by, see
 SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
 STILL_S = 0.25  # of rest is settled
 BRAKE_AFTER_S = 0.020  # without a command
+REJOIN_AFTER_S = 0.1  # without a command; then the next one must begin where the arm stands
+REJOIN_RAD, REJOIN_RADPS = 0.02, 0.05  # how nearly
 TAIL_S = 0.5  # watched after the script's end
 STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
 
@@ -105,6 +107,7 @@ class Bench:
         self._ticks_since_begin = 0
         self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
         self._since_command = 0
+        self.refused = 0  # commands that did not begin where the arm stood, after a silence
         self._still = 0
         self._lay_out()
         self._observation = self._observe()
@@ -190,7 +193,20 @@ class Bench:
         self._observation = seen
         return seen
 
+    def _begins_here(self, position: Floats, velocity: Floats | None) -> bool:
+        """Whether a command is one to stand where the arm stands, as whoever takes over sends it.
+
+        What a network held back while it was cut comes all at once when it is mended, and would
+        throw the arm along a way that is long past.
+        """
+        off = max(abs(told - is_at) for told, is_at in zip(position, self._observation.joints, strict=True))
+        return off <= REJOIN_RAD and max(map(abs, velocity or (0.0,))) <= REJOIN_RADPS
+
     def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
+        alone = self._since_command * self.period_s >= REJOIN_AFTER_S
+        if position is not None and alone and not self._begins_here(position, velocity):
+            position = None
+            self.refused += 1
         if position is not None:
             self._command = (position, velocity or (0.0,) * len(position))
             self._since_command = 0

@@ -102,6 +102,23 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[network]\nlisten = ['tcp/127.0.0.1:1', 'udp/[::]:1']", "$.network.listen[1]", "or else allow_insecure"),
         ("[network]\nlisten = ['tls/127.0.0.1:1']", "$.network.certificate", "the folder of one needed"),
         ("[network]\ncertificate = 'x'\nlisten = ['tcp/127.0.0.1:1']", "$.network.listen[0]", "tls/... needed"),
+        (
+            "[network]\nconnect = ['tcp/127.0.0.1:1', 'tcp/10.0.0.1:1']",
+            "$.network.connect[1]",
+            "or else allow_insecure",
+        ),
+        ("[network]\nconnect = ['tls/10.0.0.1:1']", "$.network.certificate", "the folder of one needed"),
+        (
+            "[network]\ncertificate = 'x'\nlisten = []\nconnect = ['tcp/127.0.0.1:1']",
+            "$.network.connect[0]",
+            "tls/... needed",
+        ),
+        ("[network]\nrevoked = ['tracker']", "$.network.revoked", "nobody is told apart"),
+        (
+            "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', 'tracer']",
+            "$.network.revoked[1]",
+            "with a number, like tracker-2",
+        ),
     ],
 )
 def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, accepted: str) -> None:
@@ -129,6 +146,43 @@ def test_a_number_that_is_not_finite_is_refused(text: str, path: str) -> None:
 
 def test_a_reach_without_room_is_refused() -> None:
     assert "reach.inner" in refusal("[reach]\ninner = 0.9\nouter = 0.5")
+
+
+def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
+    text = """
+    rate_hz = 7
+    a-b = 1
+    [tool]
+    max_speed = -1
+    colour = 'red'
+    [hands]
+    unit = 'ft'
+    [network]
+    listen = ['tcp/0.0.0.0:1']
+    [reach]
+    inner = 3
+    outer = 2
+    [joints]
+    jerk = [1, 1, 0, 1, 1, 1, 1]
+    velocity = [9, 1, 1, 1, 1, 1, 8]
+    """
+    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
+    assert sorted(line.split(":")[0] for line in lines) == [
+        "$",
+        "$.hands.unit",
+        "$.joints.jerk[2]",
+        "$.joints.velocity[0]",
+        "$.joints.velocity[6]",
+        "$.network.listen[0]",
+        "$.rate_hz",
+        "$.reach.inner",
+        "$.tool",
+        "$.tool.max_speed",
+    ]
+
+
+def test_what_follows_from_another_error_is_not_told() -> None:
+    assert "posture" not in refusal("[joints]\nnames = 3\n[arm]\nposture = [0, 0, 0]")
 
 
 def test_a_toml_error_is_told_with_its_place() -> None:
@@ -174,6 +228,8 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
     assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
     insecure = parse("[network]\nlisten = ['tcp/0.0.0.0:1']\nallow_insecure = true", origin="cell.toml")
     assert insecure.network.listen == ("tcp/0.0.0.0:1",)
+    routed = parse("[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml")
+    assert routed.network.connect == ("tcp/10.0.0.1:1",)
 
 
 def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:

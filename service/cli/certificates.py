@@ -1,4 +1,6 @@
-"""`thirdhand certificates`: a small authority of one's own, and a certificate for each role."""
+"""`thirdhand certificates`: a small authority of one's own, a certificate for each role, and more
+by the same authority.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from service.cli.usage import UsageError
 from service.client import AUTHORITY, CERTIFICATE, KEY
 from service.contract.explain import ExplainedError
-from service.shell.roles import DAEMON, ROLES
+from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, names
 
 DAYS = 3650
+AUTHORITY_KEY = "authority.key"
 CLOCKS_DIFFER = datetime.timedelta(days=1)
 
 
@@ -27,48 +30,109 @@ def certificates(args: argparse.Namespace) -> int:
     """Exit code 0 once all are written."""
     if not 1 <= args.days <= 10 * DAYS:
         raise UsageError(f"--days {args.days}: 1 to {10 * DAYS} accepted")
+    if args.name and not args.role:
+        raise UsageError(f"--name {args.name}: the --role that it is to have needed too")
     folder: Path = args.folder
-    if folder.exists() and any(folder.iterdir()):
-        raise ExplainedError(f"{folder} is not empty: a new or empty folder needed, certificates are not written over")
     hosts = list(dict.fromkeys(["localhost", "127.0.0.1", "::1", socket.gethostname(), *(args.host or [])]))
-    write(folder, hosts=hosts, days=args.days)
-    print(f"{folder / DAEMON}: for the daemon, as {', '.join(hosts)}")
-    for name, role in ROLES.items():
-        print(f"{folder / name}: its holder {role.about}")
-    print(f"{folder / 'authority.key'}: who has it can make more; keep it apart")
+    if args.role:
+        authority, key = _authority_in(folder)
+        made = [_free_name(folder, args.role, args.name)]
+        about = [f"{made[0]}, of role {args.role}"]
+    else:
+        if folder.exists() and any(folder.iterdir()):
+            raise ExplainedError(
+                f"{folder} is not empty: a new or empty folder needed, certificates are not written over; "
+                "--role makes one more by the authority that is there"
+            )
+        authority, key = _new_authority(folder, args.days)
+        made = [DAEMON, *ROLES]
+        about = [f"for the daemon, as {', '.join(hosts)}", *(f"its holder {role.about}" for role in ROLES.values())]
+    for name, what in zip(made, about, strict=True):
+        until = _write(folder / name, authority, key, hosts=hosts, days=args.days)
+        print(f"{folder / name}: {what}; valid until {until:%Y-%m-%d}")
+    print(f"{folder / AUTHORITY_KEY}: who has it can make more; keep it apart")
     return 0
 
 
-def write(folder: Path, *, hosts: list[str], days: int) -> None:
-    """An authority, and for the daemon (which clients reach as `hosts`) and each role a folder with
-    certificate, key and the authority's certificate, all private to their user.
-    """
+def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """An authority, its key in the folder."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("thirdhand authority")
     authority = (
-        _builder(name, name, key, days)
+        _builder(name, name, key, _days_from_now(days))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
         .sign(key, hashes.SHA256())
     )
-    _save(folder / "authority.key", _pem(key))
-    for role in (DAEMON, *ROLES):
-        own = ec.generate_private_key(ec.SECP256R1())
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * (role == DAEMON)
-        builder = (
-            _builder(_name(role), name, own, days)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_usage(signs_certificates=False), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key()), critical=False)
+    _save(folder / AUTHORITY_KEY, _pem(key))
+    return authority, key
+
+
+def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """The authority that this command made in a folder before. Raises ExplainedError."""
+    try:
+        key = serialization.load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
+        beside = next(iter(sorted(folder.glob(f"*/{AUTHORITY}"))), folder / DAEMON / AUTHORITY)
+        authority = x509.load_pem_x509_certificate(beside.read_bytes())
+    except (OSError, ValueError) as error:
+        raise ExplainedError(
+            f"no authority in {folder} ({error}): {AUTHORITY_KEY} and {DAEMON}/{AUTHORITY} needed, "
+            f"as `thirdhand certificates {folder}` made them"
+        ) from None
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
+        raise ExplainedError(f"{folder / AUTHORITY_KEY} is not the key of {beside}")
+    if authority.not_valid_after_utc <= now():
+        raise ExplainedError(
+            f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: make all anew"
         )
-        if role == DAEMON:
-            builder = builder.add_extension(
-                x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False
-            )
-        _save(folder / role / KEY, _pem(own))
-        _save(folder / role / CERTIFICATE, _public(builder.sign(key, hashes.SHA256())))
-        _save(folder / role / AUTHORITY, _public(authority))
+    return authority, key
+
+
+def _free_name(folder: Path, role: str, wanted: str | None) -> str:
+    """A name that no certificate of the role had: who is revoked by name stays so."""
+    taken = {path.name for path in folder.iterdir()}
+    if wanted is not None and wanted not in names(role):
+        raise UsageError(f"--name {wanted}: {role} with a number needed, {names(role)[1]} to {names(role)[-1]}")
+    if wanted in taken:
+        raise ExplainedError(f"{folder / str(wanted)} is there: a name that was not given before needed")
+    free = wanted or next((name for name in names(role) if name not in taken), None)
+    if free is None:
+        raise ExplainedError(f"{folder} holds {MOST_OF_A_ROLE} certificates of role {role}, and no more are accepted")
+    return free
+
+
+def _write(
+    folder: Path, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey, *, hosts: list[str], days: int
+) -> datetime.datetime:
+    """A folder, named as its holder, with certificate, key and the authority's certificate, all
+    private to their user; until when it is valid. A daemon's is for what clients reach as `hosts`.
+    """
+    own = ec.generate_private_key(ec.SECP256R1())
+    is_daemon = folder.name in names(DAEMON)
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * is_daemon
+    until = min(_days_from_now(days), authority.not_valid_after_utc)
+    builder = (
+        _builder(_name(folder.name), authority.subject, own, until)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key()), critical=False)
+    )
+    if is_daemon:
+        builder = builder.add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
+    _save(folder / KEY, _pem(own))
+    _save(folder / CERTIFICATE, _public(builder.sign(key, hashes.SHA256())))
+    _save(folder / AUTHORITY, _public(authority))
+    return until
+
+
+def now() -> datetime.datetime:
+    """The time by which certificates are made."""
+    return datetime.datetime.now(datetime.UTC)
+
+
+def _days_from_now(days: int) -> datetime.datetime:
+    return now() + datetime.timedelta(days=days)
 
 
 def _name(common: str) -> x509.Name:
@@ -83,17 +147,16 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime.datetime
 ) -> x509.CertificateBuilder:
-    now = datetime.datetime.now(datetime.UTC)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - CLOCKS_DIFFER)
-        .not_valid_after(now + datetime.timedelta(days=days))
+        .not_valid_before(now() - CLOCKS_DIFFER)
+        .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
 

@@ -49,17 +49,21 @@ def status(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(now, indent=2))
         return 0
+    begun = now["tick"] >= 0
+    granted = ("real time" if now["realtime"] else "ordinary: real time was not granted") + (
+        ", memory locked" if now["memory_locked"] else ", memory not locked"
+    )
+    near = f"{100 * now['hand_distance_m']:.1f} cm to a hand, toward which {now['hand_limit_m_s']:.2f} m/s are allowed"
     rows = {
         "mode": now["mode"]
         + (f" ({now['reason']})" if now["reason"] else "")
-        + (f"  {', '.join(now['flags'])}" if now["flags"] else ""),
+        + (f"  {', '.join(now['flags'])}" if now["flags"] else "")
+        + ("" if begun else "  it starts: nothing has been decided yet"),
         "skill": f"{now['skill']}; via-points: {', '.join(now['places']) or 'none'}",
-        "loop": f"{now['rate_hz']:.2f} Hz, tick {now['tick']}, {now['missed']} missed",
-        "scheduling": ("real time" if now["realtime"] else "ordinary: real time was not granted")
-        + (", memory locked" if now["memory_locked"] else ", memory not locked"),
+        "loop": f"{now['rate_hz']:.2f} Hz, tick {now['tick']}, {now['missed']} missed" if begun else "no tick yet",
+        "scheduling": granted if begun else "not known yet",
         "hands": ", ".join(f"{side} {age:.0f} ms old" for side, age in now["hand_age_ms"].items()) or "none seen",
-        "nearest": f"{100 * now['hand_distance_m']:.1f} cm to a hand, toward which {now['hand_limit_m_s']:.2f} m/s "
-        "are allowed",
+        "nearest": near if now["hand_age_ms"] else "no hand seen",
         "rejected": ", ".join(f"{count} {cause}" for cause, count in now["rejected"].items()) or "none",
         "recording": now["scribe"].get("recording") or f"none ({now['scribe'].get('state', 'off')})",
         **({"lost": f"{now['scribe']['lost']} ticks are not recorded"} if now["scribe"].get("lost") else {}),

@@ -9,16 +9,19 @@ are heavy.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import sys
 from pathlib import Path
 
+from service import interrupt
 from service.cli.usage import UsageError
 from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
+from service.contract.roles import DAEMON, ROLES
 
 RUN_BY = {
     "demo": "demo",
@@ -35,6 +38,7 @@ RUN_BY = {
     "certificates": "certificates",
     "bench": "bench",
 }
+PUT_AWAY_FIRST = ("demo", "bench", "view")  # what they started or wrote for a while, before Ctrl-C ends them
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
 
@@ -223,13 +227,16 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "certificates",
-        "Makes an authority, and a certificate for the daemon and for each role on a network.",
+        "Makes an authority, and a certificate for the daemon and for each role on a network; with --role, one more "
+        "certificate by the authority that is there.",
         "thirdhand certificates secrets --host bench.local",
     )
-    c.add_argument("folder", metavar="DIR", type=Path, help="a new folder, private to its user")
+    c.add_argument("folder", metavar="DIR", type=Path, help="a new folder, private to its user; with --role an old one")
     c.add_argument(
         "--host", metavar="NAME", action="append", help="or address at which clients reach the daemon; may be repeated"
     )
+    c.add_argument("--role", choices=(*ROLES, DAEMON), help="of one more certificate")
+    c.add_argument("--name", metavar="ROLE-N", help="of that one, like tracker-2 (default: the first that is free)")
     c.add_argument("--days", metavar="N", type=int, default=3650, help="that they are valid (default: %(default)s)")
 
     c = client(
@@ -270,7 +277,9 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     module, function = args.run.split(".")
     try:
-        return int(getattr(importlib.import_module(f"service.cli.{module}"), function)(args))
+        run = getattr(importlib.import_module(f"service.cli.{module}"), function)
+        with interrupt.put_away_first() if args.command in PUT_AWAY_FIRST else contextlib.nullcontext():
+            return int(run(args))
     except UsageError as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 2
@@ -278,7 +287,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        interrupt.end_at_once()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1

@@ -13,6 +13,7 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.learning.learn import learn as learned
 from service.recorder.demonstrations import iter_hands, read_demonstration
+from service.recorder.mcap_file import ends_early
 from service.recorder.replay import replay as replayed
 
 
@@ -38,6 +39,8 @@ def play(args: argparse.Namespace) -> int:
                     f"nobody listens to {channels.key(args.cell, 'hands/left')}: is a daemon running in this cell?"
                 )
             time.sleep(0.02)
+        if ends_early(args.file):
+            print(f"{args.file} is cut: its end is missing, and what is there is played", file=sys.stderr)
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
         while True:
             begin = time.monotonic()
@@ -72,7 +75,7 @@ def learn(args: argparse.Namespace) -> int:
     """Exit code 0 once the skill is written."""
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
-        demonstration = read_demonstration(path)
+        demonstration = read_demonstration(path, say=lambda line: print(line, file=sys.stderr, flush=True))
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)

@@ -19,7 +19,9 @@ from service.shell import daemon
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Exit code 0 once it was asked to stop and has closed everything."""
+    """Exit code 0 once it was asked to stop and has closed everything, 1 where its recordings lack
+    ticks.
+    """
     os.umask(0o077)  # what it writes is its user's
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(load(args.config) if args.config else Settings(), args)
@@ -31,10 +33,13 @@ def serve(args: argparse.Namespace) -> int:
         where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
         print(f"listening on {where} as cell {settings.cell}", flush=True)
 
-    daemon.serve(settings, args.skill or skills / SHIPPED_SKILL, skills=skills, scribe=scribe, announce=announce)
+    skill = args.skill or skills / SHIPPED_SKILL
+    missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, announce=announce)
     sys.stdout.flush()
     logging.shutdown()
-    os._exit(0)  # all is closed; libraries that complain of what their own threads still hold are not waited for
+    os._exit(
+        1 if missing else 0
+    )  # all is closed; libraries that complain of what their own threads still hold are not waited for
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:

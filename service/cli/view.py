@@ -22,6 +22,7 @@ from service.cli.usage import UsageError, free_port
 from service.contract.explain import ExplainedError
 from service.recorder.recording import Recording
 from service.recorder.sinks import Viewer, ViewerError
+from service.recorder.steps import Gap
 
 
 def view(args: argparse.Namespace) -> int:
@@ -38,7 +39,7 @@ def view(args: argparse.Namespace) -> int:
         return _show(str(path), args)
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / f"{path.stem}.rrd"
-        convert(path, drawn)
+        convert(path, drawn, say=lambda line: print(line, file=sys.stderr, flush=True))
         return _show(str(drawn), args)
 
 
@@ -50,10 +51,11 @@ def _show(source: str, args: argparse.Namespace) -> int:
     return int(show(source))
 
 
-def convert(recording_path: str | Path, rrd_path: str | Path) -> int:
+def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[str], None] = lambda line: None) -> int:
     """The number of ticks of a recording drawn into a Rerun file.
 
-    Raises RecordingError and ViewerError.
+    What the recording lacks is told to `say`, and shown in the log where it is missing; all else is
+    drawn. Raises RecordingError and ViewerError.
     """
     recording = Recording.open(recording_path)
     with tempfile.TemporaryDirectory() as folder:
@@ -62,17 +64,32 @@ def convert(recording_path: str | Path, rrd_path: str | Path) -> int:
         viewer = Viewer(urdf=urdf, settings=recording.settings, rrd=Path(rrd_path))
         notes = recording.notes("requests", "log")
         note = next(notes, None)
-        count = 0
+        count, time_ns, last = 0, 0, None
+        gaps: list[Gap] = []
+        unshown = 0
         for step in recording.steps():
+            if step.lost or step.damage:
+                gaps.append(Gap(last, step.tick, step.lost, step.damage))
+            last = step.tick
             if step.frame is None:
                 continue
             time_ns = step.time_ns
+            for gap in gaps[unshown:]:
+                viewer.log(str(gap), "WARN", time_ns)
+            unshown = len(gaps)
             while note is not None and note[2] <= time_ns:
                 viewer.log(note[1], "INFO" if note[0] == "requests" else "WARN", note[2])
                 note = next(notes, None)
             viewer.add(step.frame, time_ns, step.timing)
             count += 1
+        missing = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
+        for text in missing[unshown:]:
+            viewer.log(text, "WARN", time_ns)
         viewer.close()
+    for text in missing:
+        say(text)
+    if missing:
+        say(f"{count} ticks are there and shown")
     if viewer.problems:
         raise ViewerError("; ".join(viewer.problems))
     return count

@@ -4,19 +4,67 @@ accepted.
 
 from __future__ import annotations
 
+import copy
 import re
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec import inspect
 
 LONGEST = 300  # characters of what others say is wrong
+MOST_PROBLEMS = 50  # told at once
+T = TypeVar("T")
 
 
 class ExplainedError(Exception):
     """An error whose message tells people what failed, what was given and what is accepted:
     commands print it and exit 1.
     """
+
+
+class InvalidError(ExplainedError, ValueError):
+    """What does not pass validation: all that is wrong with it, a line each."""
+
+
+def validated(given: Any, kind: type[T]) -> T:
+    """A struct of structs from what a file holds. Raises InvalidError with all that is wrong.
+
+    What is wrong is left out and the rest looked at again. The checks of several values come last;
+    what they say of a section in which something was left out is not told.
+    """
+    rest, problems, doubted = copy.deepcopy(given), list[str](), set[str]()
+    while len(problems) < MOST_PROBLEMS:
+        try:
+            value = msgspec.convert(rest, kind)
+        except msgspec.ValidationError as error:
+            lines = explained(error, rest, kind).splitlines()
+            if str(error).startswith("$.") and " - at `" not in str(error):
+                problems += [line for line in lines if not any(f"$.{name}" in line for name in doubted)]
+                break
+            problems += lines
+            left_out = _leave_out(rest, lines[0])
+            if not left_out:
+                break
+            doubted.add(left_out)
+        else:
+            if not problems:
+                return value
+            break
+    raise InvalidError("\n".join(problems))
+
+
+def _leave_out(given: Any, said: str) -> str:
+    """Takes away the value that an error tells of; in which section it stood, or nothing."""
+    found = re.match(r"\$(?:\.(\w+))?(?:\.(\w+))?[^:]*: (?:unknown field '(.*)'; known)?", said)
+    section, name, unknown = found.groups() if found else (None, None, None)
+    inner = given.get(section) if isinstance(given, dict) and section else given
+    if isinstance(inner, dict) and (key := unknown or name) in inner:
+        del inner[key]
+        return section or str(key)
+    if isinstance(given, dict) and section in given:
+        del given[section]
+        return str(section)
+    return ""
 
 
 def explained(error: Exception, given: Any, kind: Any) -> str:

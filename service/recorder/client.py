@@ -30,8 +30,10 @@ from service.recorder.protocol import LARGEST_MESSAGE, Report, Task, pack, pack_
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
-READY_TIMEOUT_S = 15.0
+READY_TIMEOUT_S = 15.0  # to listen; one that was replaced for it is followed by one with twice the time
+LONGEST_READY_S = 240.0
 RESTART_S = 1.0
+NOT_RECORDED = "ticks are not recorded"
 SILENT_S = 5.0  # a scribe reports twice a second
 
 
@@ -56,8 +58,10 @@ class Scribe:
         live_port: int | None = None,
         restart_s: float = RESTART_S,
         silent_s: float = SILENT_S,
+        ready_s: float = READY_TIMEOUT_S,
     ) -> None:
         self._settings = settings
+        self._ready_s = self._first_ready_s = ready_s
         self._restart_s, self._silent_s = restart_s, silent_s
         self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
         self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
@@ -79,7 +83,7 @@ class Scribe:
             return
         self._say_all = state is None
         self._child = self._spawn(skill, state)
-        if not self.ready(READY_TIMEOUT_S):
+        if not self.ready(self._ready_s):
             ended = self._child.process.poll()
             self._errors.append(
                 "the scribe does not listen yet"
@@ -176,8 +180,10 @@ class Scribe:
         self._listen(timeout_s=0.0)
         process, now = self._child.process, time.monotonic()
         if process.poll() is None:
-            patience_s = READY_TIMEOUT_S if self._socket is None else self._silent_s
+            patience_s = self._ready_s if self._socket is None else self._silent_s
             if now - self._heard > patience_s:
+                if self._socket is None:
+                    self._ready_s = min(2.0 * self._ready_s, LONGEST_READY_S)
                 self._heard = now
                 self._errors.append(f"the scribe was silent for {patience_s:g} s and is replaced")
                 process.kill()
@@ -247,8 +253,8 @@ class Scribe:
             for _, fd in self._memory.values():
                 os.close(fd)
             self._memory = {}
-        lost = self._lost + self._buried
-        return f"{lost} of {self._sent + self._lost} ticks are not recorded" if lost else ""
+        lost = self._lost + self._buried if self._folder is not None or self._recording is not None else 0
+        return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
         """A process that was given its task and is not told anything yet."""
@@ -286,4 +292,4 @@ class Scribe:
                 self._errors.extend(self._report.errors)
                 if self._socket is None:
                     self._say_all = self._say_all or self._restarts > 0
-                    self._socket = source
+                    self._socket, self._ready_s = source, self._first_ready_s

@@ -4,7 +4,7 @@ come to common stamps.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +46,10 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         file.close()
 
 
-def read_demonstration(path: str | Path) -> Demonstration:
+def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda line: None) -> Demonstration:
     """The demonstration in an MCAP file: the hands and the tool at the tool's stamps, as far as all
-    three reach. Raises RecordingError.
+    three reach. Raises RecordingError, also where there is damage: what it took may lie amid a
+    motion. A file that was cut ends early, and that is told to `say`.
 
     Topics are found by their ends, whatever the cell. Where the streams have stamps of their own,
     the hands are interpolated linearly.
@@ -67,8 +68,12 @@ def read_demonstration(path: str | Path) -> Demonstration:
             if not finite(pose.position + pose.orientation):
                 raise RecordingError(f"{path}: {channel.topic}: a pose that is not finite, at stamp {pose.stamp_ns} ns")
             rows[name].append(pose)
-    if damage := [str(fault) for fault in messages.faults if not fault.cut]:
-        raise RecordingError(f"{path}: {'; '.join(damage)}; nothing is learned from it")
+    there = ", ".join(f"{len(poses)} poses on {name}" for name, poses in rows.items())
+    faults = "; ".join(map(str, messages.faults))
+    if any(not fault.cut for fault in messages.faults):
+        raise RecordingError(f"{path}: {faults}; {there} can be read; nothing is learned from it")
+    if faults:
+        say(f"{path}: {faults}; {there} are there")
     tracks = []
     for name, poses in rows.items():
         if not poses:

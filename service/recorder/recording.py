@@ -9,7 +9,7 @@ reading.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,7 +24,7 @@ from service.core.frame import Record, Tick, encode
 from service.core.outputs import outgoing
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recorder.mcap_reader import Fault, Messages
-from service.recorder.steps import REPLAYED, Step, steps
+from service.recorder.steps import REPLAYED, Gap, Step, steps
 from service.urdf import Urdf
 
 FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
@@ -265,6 +265,12 @@ class Recording:
         yield from steps(messages, self.settings, outputs=outputs)
         self.faults = messages.faults
         self.truncated = any(fault.cut for fault in messages.faults)
+
+    def unsaid(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
+        """What is damaged or cut besides the gaps, once all steps are read up to tick `last`."""
+        said = "".join(gap.why for gap in gaps)
+        read = "no tick was read" if last is None else f"the last tick read is {last}"
+        return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in said]
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
         """Key, text and time [ns] of the notes under the keys, in order."""

@@ -19,32 +19,21 @@ from service.core.skill import Skill
 from service.learning.skill_file import SkillError, decoded
 from service.recorder.mcap_file import RecordingError, machine
 from service.recorder.recording import Recording
-from service.recorder.steps import Step
+from service.recorder.steps import Gap, Step
 
 TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
 POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
 
 
 @dataclass
-class Gap:
-    """Ticks that are not there: between which they would be (None: the beginning, the end), how
-    many were counted as lost, why, and from which state the replay went on.
-    """
+class Pause(Gap):
+    """A gap, and the tick from whose state the replay went on."""
 
-    after: int | None
-    before: int | None
-    lost: int
-    why: str
     resumed: int | None = None
 
     def __str__(self) -> str:
-        where = "before the first tick" if self.after is None else f"after tick {self.after}"
-        if self.before is not None:
-            where = f"before tick {self.before}" if self.after is None else f"{where}, before tick {self.before}"
-        lost = f"{self.lost} tick{'s' * (self.lost != 1)} not recorded" if self.lost else ""
-        what = "; ".join(part for part in (lost, self.why) if part)
         went_on = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
-        return f"gap {where}: {what}; {went_on}"
+        return f"{super().__str__()}; {went_on}"
 
 
 @dataclass
@@ -55,7 +44,7 @@ class Replay:
 
     ticks: int = 0
     identical: int = 0
-    missing: list[Gap] = field(default_factory=list)
+    missing: list[Pause] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     truncated: bool = False
     joined: int = 0
@@ -117,10 +106,7 @@ def replay(
         for i, recording in enumerate(recordings):
             pieces = _Pieces(recording, result, after=after, before=before, follows=i > 0, progress=progress)
             before = pieces.compared()
-            said = "".join(gap.why for gap in result.missing)
-            last = "no tick was read" if before is None else f"the last tick read is {before.tick}"
-            unsaid = [str(fault) for fault in recording.faults if str(fault) not in said]
-            result.faults += [f"{recording.path}: {fault}; {last}" for fault in unsaid]
+            result.faults += recording.unsaid(result.missing, last=None if before is None else before.tick)
             result.truncated = result.truncated or recording.truncated
     return result
 
@@ -215,7 +201,7 @@ class _Pieces:
 
     def _note(self, step: Step, why: str) -> None:
         before = None if self._step is None else self._step.tick
-        self._result.missing.append(Gap(before, step.tick, step.lost, why))
+        self._result.missing.append(Pause(before, step.tick, step.lost, why))
 
     def _resumes(self, step: Step) -> bool:
         """Whether a controller can go on from the state of a step."""

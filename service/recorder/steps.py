@@ -5,6 +5,7 @@ decided, and where ticks are missing.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from service.config import Settings
@@ -37,6 +38,25 @@ class Step(NamedTuple):
     lost: int = 0
     time_ns: int = 0
     damage: str = ""
+
+
+@dataclass
+class Gap:
+    """Ticks that are not there: between which they would be (None: the beginning, the end), how
+    many were counted as lost, and why.
+    """
+
+    after: int | None
+    before: int | None
+    lost: int
+    why: str
+
+    def __str__(self) -> str:
+        where = "before the first tick" if self.after is None else f"after tick {self.after}"
+        if self.before is not None:
+            where = f"before tick {self.before}" if self.after is None else f"{where}, before tick {self.before}"
+        lost = f"{self.lost} tick{'s' * (self.lost != 1)} not recorded" if self.lost else ""
+        return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
 
 
 def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[Step]:

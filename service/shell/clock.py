@@ -10,7 +10,7 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ DRAW = 256  # deadlines in which a smaller difference goes down to a third
 CREEP_NS = 1_000  # from stamp to stamp while time catches up
 _LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
+NETWORK_NICE = -15  # of -20 to 19: counts 28 times as much as an ordinary thread
 
 
 class Deadlines:
@@ -131,6 +132,23 @@ def run_beside_real_time() -> None:
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
+
+
+@contextlib.contextmanager
+def ahead_of_others() -> Iterator[None]:
+    """Threads that are started within it run before those of other processes, if that is granted:
+    the network's, which a machine with more to do than cores else lets wait for 100 ms.
+
+    They have no real-time scheduling, with which a flood of messages could use up what the system
+    grants to all that has.
+    """
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, min(before, NETWORK_NICE))
+    try:
+        yield
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, before)
 
 
 class Window:

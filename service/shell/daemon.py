@@ -26,18 +26,28 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import Attachment, WireError
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
+from service.contract.roles import access_control
 from service.core.controller import Controller, rehearse, run
 from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import outgoing
+from service.core.separation import FARTHEST, IRRELEVANT
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 from service.recorder.client import Scribe
 from service.shell import watch
-from service.shell.clock import PREPARE_NS, SPIN_NS, Deadlines, Granted, Window, ask_for_real_time, run_beside_real_time
-from service.shell.door import BOUNDS, OccupiedError, allow_descriptors, occupy
+from service.shell.clock import (
+    PREPARE_NS,
+    SPIN_NS,
+    Deadlines,
+    Granted,
+    Window,
+    ahead_of_others,
+    ask_for_real_time,
+    run_beside_real_time,
+)
+from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
-from service.shell.roles import access_control
-from service.shell.saved_via_points import SavedViaPoints
+from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
@@ -60,7 +70,9 @@ class Daemon:
     `serve` runs until it is asked to stop, then stops the arm and closes everything.
     """
 
-    def __init__(self, settings: Settings, skill: Skill, *, workshop: Workshop, skills: Path, scribe: Scribe) -> None:
+    def __init__(
+        self, settings: Settings, skill: Skill, *, workshop: Workshop, skills: Path, scribe: Scribe, lock: Lock
+    ) -> None:
         self._settings = settings
         self._scribe = scribe
         self._stop = threading.Event()
@@ -68,12 +80,13 @@ class Daemon:
         urdf = robot_description(settings)
         allow_descriptors()
         network = settings.network
-        self._session = open_session(
-            connect=network.connect,
-            listen=network.listen,
-            certificate=network.certificate,
-            more=BOUNDS | (access_control(settings.cell) if network.certificate else {}),
-        )
+        with ahead_of_others():
+            self._session = open_session(
+                connect=network.connect,
+                listen=network.listen,
+                certificate=network.certificate,
+                more=BOUNDS | (access_control(settings.cell, network.revoked) if network.certificate else {}),
+            )
         try:
             self._token = occupy(self._session, settings.cell)
         except OccupiedError:
@@ -88,7 +101,8 @@ class Daemon:
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
-        self._frame["tick"], self._frame["reason"] = -1, Reason.ARM_NOT_READY
+        self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
+        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
         self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
@@ -99,6 +113,7 @@ class Daemon:
         self._newest = -1  # tick
         self._laps: list[tuple[str, int]] = []
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
+        lock.tell(self.endpoints)
         self._subscribers = [
             (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
             for channel in channels.CHANNELS
@@ -152,16 +167,16 @@ class Daemon:
         log.info(text)
         self._scribe.note("requests", text, time.time_ns())
 
-    def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> None:
+    def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
         """Runs the loop until `stop`, `announce`d once requests are answered; then everything is
-        flushed and closed.
+        flushed and closed. What the recordings lack, in words; empty: nothing.
         """
         reporter: threading.Thread | None = None
         try:
             self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
             reporter = watch.start("status thread", self._report, self._fail)
-            announce(self)
             self._granted = ask_for_real_time()
+            announce(self)
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             watch.watched("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
@@ -173,6 +188,7 @@ class Daemon:
             self._session.close()  # type: ignore[no-untyped-call]
             if missing := self._scribe.close(timeout_s=20):
                 log.warning("%s", missing)
+        return missing
 
     def _fail(self, what: str) -> None:
         """Says what of the service failed; the next tick is at fault for it."""
@@ -347,22 +363,20 @@ def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
 
 def serve(
     settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]
-) -> None:
-    """The daemon from start to end:
+) -> str:
+    """The daemon from start to end; what the recordings lack, in words.
 
-    SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError, OccupiedError and UnreachableError
-    before it starts, LoopError where it ends by itself.
+    From the moment that it is ready SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError,
+    OccupiedError and UnreachableError before it starts, LoopError where it ends by itself.
     """
+    lock = Lock(state_folder(settings), settings.cell)
     workshop = Workshop()
-    before = {number: signal.getsignal(number) for number in STOPPING}
     try:
-        daemon = Daemon(
-            settings, load_skill(workshop, skill_path, settings), workshop=workshop, skills=skills, scribe=scribe
-        )
-        for number in before:
+        skill = load_skill(workshop, skill_path, settings)
+        daemon = Daemon(settings, skill, workshop=workshop, skills=skills, scribe=scribe, lock=lock)
+        for number in STOPPING:
             signal.signal(number, daemon.stop)
-        daemon.serve(announce)
+        return daemon.serve(announce)
     finally:
         workshop.close()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        lock.close()

@@ -5,7 +5,13 @@ cell.
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import json
+import logging
+import os
 import resource
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -29,8 +35,64 @@ BOUNDS: dict[str, Any] = {
 }
 
 
+log = logging.getLogger("thirdhand")
+
+
 class OccupiedError(ExplainedError, RuntimeError):
     """A cell that another daemon serves already."""
+
+
+class Lock:
+    """The right to serve a cell with a folder of its own state.
+
+    One daemon at a time has it, also of two that do not see each other by Zenoh. The system takes
+    it back however the process ends.
+
+    Raises OccupiedError where another has it, with what that one told of itself.
+    """
+
+    def __init__(self, folder: Path, cell: str) -> None:
+        path = folder / "daemon.lock"
+        self._descriptor: int | None = None
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            which = _told(path)
+            self.close()
+            raise OccupiedError(
+                f"cell {cell} is served already on this machine ({which}; {path} is locked): stop that daemon, or give "
+                "this one another --cell, or [files] state"
+            ) from None
+        except OSError as error:
+            log.warning("%s: %s; a second daemon of this cell is only noticed by Zenoh", path, error.strerror)
+            self.close()
+        else:
+            self.tell(())
+
+    def tell(self, endpoints: Iterable[str]) -> None:
+        """Where this process listens, for those who are refused."""
+        if self._descriptor is not None:
+            said = json.dumps({"pid": os.getpid(), "endpoints": list(endpoints)}).encode()
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, 0)
+                os.pwrite(self._descriptor, said, 0)
+
+    def close(self) -> None:
+        """Gives it back."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def _told(path: Path) -> str:
+    """What the holder of a lock says of itself."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        said = json.loads(path.read_bytes())
+        where = f"listening on {', '.join(said['endpoints'])}" if said["endpoints"] else "not listening, or not yet"
+        return f"process {said['pid']}, {where}"
+    return "a process that did not say which"
 
 
 def allow_descriptors() -> None:

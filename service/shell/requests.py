@@ -70,7 +70,7 @@ class Pending:
         """
         if not self._taken.wait(ADOPTION_TIMEOUT_S):
             if self._claim.acquire(blocking=False):
-                raise RequestError("the control loop did not take the request: it is ending or stalled")
+                raise RequestError("the loop did not take the request: it is starting, ending or stalled")
             self._taken.wait()
         return self._tick
 
@@ -223,11 +223,13 @@ class Requests:
         return Reply(tick, self._in_force)
 
     def _load(self, name: str) -> Reply:
-        path = self._skills / (name if name.endswith(".npz") else f"{name}.npz")
         folder = self._skills.resolve()
-        if not path.is_file() or path.resolve().parent != folder:
-            there = ", ".join(sorted(p.stem for p in folder.glob("*.npz") if p.resolve().parent == folder)) or "none"
-            raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {there}")
+        files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
+        there = {path.stem: path for path in files}  # and not what lies elsewhere, and is linked to
+        path = there.get(name.removesuffix(".npz"))
+        if path is None:
+            names = ", ".join(there) or "none"
+            raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {names}")
         skill = self._workshop.load(path)
         if (
             skill.learned_from == self._skill.learned_from and self._skill.via_points

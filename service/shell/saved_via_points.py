@@ -19,6 +19,11 @@ from service.core.skill import Skill
 from service.learning.skill_file import SkillError
 
 
+def state_folder(settings: Settings) -> Path:
+    """Where a cell keeps what survives a restart."""
+    return Path(settings.files.state).expanduser() / settings.cell
+
+
 def _checksum(saved: dict[str, Any]) -> str:
     """Of all that is saved, however it is laid out."""
     return hashlib.blake2b(json.dumps(saved, sort_keys=True).encode(), digest_size=16).hexdigest()
@@ -28,7 +33,7 @@ class SavedViaPoints:
     """The via-points in force on disk, so that they survive a restart; written atomically."""
 
     def __init__(self, settings: Settings) -> None:
-        self.path = Path(settings.files.state).expanduser() / settings.cell / "places.json"
+        self.path = state_folder(settings) / "places.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """Via-points and tolerance taught to this skill, or None.
@@ -69,7 +74,7 @@ class SavedViaPoints:
         saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
         content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile("w", dir=self.path.parent, suffix=".new", delete=False) as file:
                 file.write(content)
                 file.flush()

@@ -14,12 +14,15 @@ from pathlib import Path
 
 from service.contract.explain import ExplainedError
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
+from sim.faulty_cell import FaultError
+from sim.parts import PartError
 
 ABOUT = {
     "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
     "statistics": "100 random scenes, side by side with GMR, a Gaussian process, ProMP and the paper's own numbers",
     "motion": "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
     "separation": "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
+    "faults": "what happens when service, tracker, network, router, scribe or disk fail: time to rest, way, loss",
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
     "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
@@ -88,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
             results.say(ABOUT[name])
             numbers = importlib.import_module(f"sim.experiments.{name}").run(results, options)
             print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
-    except (ExplainedError, ExperimentError, OSError) as error:
+    except (ExplainedError, ExperimentError, FaultError, PartError, OSError) as error:
         print(f"python -m sim.experiments: {error}", file=sys.stderr)
         return 1
     return 0

@@ -5,12 +5,20 @@ glass and holds it over the board.
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 from cell import thirdhand
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from tests_paths import ROOT
+
+from service.cli.demo import text
 
 SCENES = {
     "the nominal places": "",
@@ -29,6 +37,7 @@ def test_the_task_succeeds_and_its_recording_replays_identically(scene: str, tmp
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)
     assert report["success"]
+    assert report["missing"] == ""
     for name in ("handover", "grasp", "carry"):
         assert report["events"][name]["reached"]
         assert report["events"][name]["error_mm"] <= 30
@@ -54,3 +63,25 @@ def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) 
     done = thirdhand("demo", "--out", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
     assert done.returncode == 1
     assert "handover" in done.stderr
+
+
+def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) -> None:
+    """Its scribe is killed while the scene is played; another takes its place."""
+    command = [sys.executable, "-m", "service", "demo", "--json", "--out", str(tmp_path)]
+    with (tmp_path / "said").open("w") as errors:
+        demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT)
+    end = time.monotonic() + 60
+    while "taught while it runs" not in (tmp_path / "said").read_text():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    (scribe,) = (
+        process
+        for process in psutil.Process(demo.pid).children(recursive=True)
+        if "service.recorder.process" in process.cmdline()
+    )
+    scribe.kill()
+    out, _ = demo.communicate(timeout=100)
+    assert demo.returncode == 1
+    report = json.loads(out)
+    assert re.fullmatch(r"[1-9]\d* of \d+ ticks are not recorded", report["missing"])
+    assert f"The recording is not complete: {report['missing']}." in text(report)

@@ -10,13 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
-from test_recording import write
+from test_recording import CELL, SKILL, at_ns, ticks, write
+from test_sinks import drawn
 
+from service.cli.view import convert
+from service.contract.cdr import encode_pose
+from service.contract.channels import POSE
+from service.contract.messages import PoseStamped
 from service.core.frame import encode
 from service.learning.demonstration import Demonstration
 from service.recorder.demonstrations import iter_hands, read_demonstration, write_demonstration
-from service.recorder.mcap_file import RecordingError
-from service.recorder.recording import Recording
+from service.recorder.mcap_file import McapFile, RecordingError
+from service.recorder.recording import Recorder, Recording
 from service.recorder.steps import Step
 
 COUNT = 600
@@ -128,7 +133,58 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
     )
     start, end = chunks(path.read_bytes())[0]
     path.write_bytes(flipped(path.read_bytes(), (start + end) // 2))
-    with pytest.raises(RecordingError, match=r"damage at byte .*nothing is learned from it"):
+    with pytest.raises(RecordingError, match=r"damage at byte .* poses on tool/pose can be read; nothing is learned"):
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
         list(iter_hands(path))
+
+
+def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp_path: Path) -> None:
+    path, said, total = tmp_path / "a.mcap", list[str](), 300
+    file = McapFile(path, joints=0)
+    for i in range(total):
+        for key in ("x/hands/left", "x/hands/right", "x/tool/pose"):
+            pose = PoseStamped(i * 10_000_000, "base", (0.1 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            file.put(key, POSE.type, encode_pose(pose), i * 10_000_000, i)
+        if i % 50 == 49:
+            file.flush()
+    file.close()
+    assert len(read_demonstration(path, say=said.append).stamps_ns) == total
+    assert said == []
+    path.write_bytes(path.read_bytes()[: chunks(path.read_bytes())[3][0] + 100])
+    assert len(read_demonstration(path, say=said.append).stamps_ns) == 150
+    (line,) = said
+    assert "cut at byte" in line
+    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose are there")
+
+
+@pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])
+def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path: Path, whole: bytes, kind: str) -> None:
+    path, said = tmp_path / "a.mcap", list[str]()
+    start, end = chunks(whole)[5]
+    if kind == "lost":
+        with Recorder(path, settings=CELL, skill=SKILL) as recorder:
+            for tick, frame, timing in ticks(40):
+                if not 10 <= tick.index < 15:
+                    lost = 5 * (tick.index == 15)
+                    recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, lost=lost)
+    else:
+        path.write_bytes(flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2])
+    shown = convert(path, tmp_path / "a.rrd", say=said.append)
+    recording = Recording.open(path)
+    steps = [step for step in recording.steps() if step.frame is not None]
+    assert shown == len(steps) > 0
+    assert said[-1] == f"{shown} ticks are there and shown"
+    gaps = [step for step in steps if step.lost or step.damage]
+    assert len(said) == len(gaps) + 1 + (kind == "cut")
+    expected = {
+        "damaged": f"before tick {gaps[0].tick if gaps else ''}: damage at byte {start}",
+        "cut": f"cut at byte {start}: the end is missing",
+        "lost": "gap after tick 9, before tick 15: 5 ticks not recorded",
+    }[kind]
+    assert expected in said[0]
+    if kind != "lost":  # the same words; nothing here replays, for its frames are made up
+        faults = [str(fault) for fault in recording.faults]
+        assert all(any(fault in line for line in said) for fault in faults)
+    logged = [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"] if row.get("TextLog:text")]
+    assert set(said[:-1]) <= set(logged)

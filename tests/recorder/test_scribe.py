@@ -195,6 +195,18 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
     assert [step.tick for step in rest] == list(range(start.tick + 1, told))
 
 
+def test_a_process_that_is_slow_to_listen_is_given_more_time_and_listens_at_last(tmp_path: Path) -> None:
+    with scribe(folder=tmp_path, restart_s=0.0, ready_s=0.02) as one:
+
+        def listens() -> bool:
+            one.supervise()
+            time.sleep(0.01)
+            return bool(one.status()["alive"])
+
+        until(listens, timeout_s=60.0)
+        assert one.status()["restarts"] > 1
+
+
 DAEMON = """
 import os, signal, sys, time
 sys.path[:0] = sys.argv[3:]

@@ -5,6 +5,7 @@ answered, everything recorded.
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -203,7 +204,8 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        done = thirdhand("serve", "--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}", "--arm", "assumed")
+        at = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = thirdhand("serve", "--listen", at, "--arm", "assumed", env=os.environ | {"HOME": str(tmp_path)})
     assert done.returncode == 1
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
 
@@ -215,6 +217,10 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
         (("serve", "--config", "missing.toml"), 1, "missing.toml"),
         (("serve", "--skill", "missing.npz"), 1, "missing.npz"),
         (("serve", "--arm", "left"), 2, "invalid choice"),
+        (("serve", "--connect", "tcp/10.0.0.1:7447"), 2, "allow_insecure = true needed"),
+        (("serve", "--rate", "5OO"), 2, "50 to 1000 Hz"),
+        (("status", "--rate", "500"), 2, "unrecognized arguments: --rate 500"),
+        (("stauts",), 2, "invalid choice: 'stauts'"),
         (("status", "--connect", "tcp/127.0.0.1:9"), 1, "is a daemon running"),
         (("learn", "missing.mcap", "--output", "x.npz"), 1, "missing.mcap"),
         (("view", "missing.rrd"), 1, "missing.rrd"),
@@ -223,8 +229,10 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
         ((), 2, "COMMAND"),
     ],
 )
-def test_bad_usage_and_failures_are_told_on_standard_error(arguments: tuple[str, ...], code: int, words: str) -> None:
-    done = thirdhand(*arguments)
+def test_bad_usage_and_failures_are_told_on_standard_error(
+    tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
     assert done.returncode == code, done.stderr
     assert words in done.stderr
     assert "Traceback" not in done.stderr

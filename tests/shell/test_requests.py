@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
+import stat
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -264,7 +266,7 @@ def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Worksh
 def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.shell.requests.ADOPTION_TIMEOUT_S", 0.05)
     cell.running = False
-    with pytest.raises(RefusedError, match="the control loop did not take the request: it is ending or stalled"):
+    with pytest.raises(RefusedError, match="the loop did not take the request: it is starting, ending or stalled"):
         cell.client.ask("hold")
 
 
@@ -278,6 +280,39 @@ def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch:
     cell.client.ask("hold")  # taken after whatever else waits
     assert cell.kinds() == ["hold"]
     assert cell.names() == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../secret", "..", "/etc/passwd", "sub/inside", "a\0b", "link", "loop", "pipe", ".hidden", "x" * 200),
+        *("{folder}/../secret", "{folder}/soldering", "soldering.npz/../../secret", "~/secret", "secret\n", ""),
+    ],
+)
+def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_path: Path, name: str) -> None:
+    """What lies elsewhere is not loaded, however it is named; nor is told where it is."""
+    outside = tmp_path / "elsewhere"
+    outside.mkdir()
+    for path in (outside / "secret.npz", cell.folder.parent / "secret.npz", cell.folder / ".hidden.npz"):
+        path.write_bytes(skill.file)
+    (cell.folder / "sub").mkdir()
+    (cell.folder / "sub" / "inside.npz").write_bytes(skill.file)
+    (cell.folder / "link.npz").symlink_to(outside / "secret.npz")
+    (cell.folder / "loop.npz").symlink_to(cell.folder / "loop.npz")
+    os.mkfifo(cell.folder / "pipe.npz")
+    with pytest.raises(RefusedError) as refused:
+        cell.client.ask("skill", {"name": name.format(folder=cell.folder)})
+    assert str(refused.value).startswith("$.name")
+    assert str(outside) not in str(refused.value)
+    assert cell.kinds() == []
+    assert cell.failures == []
+
+
+def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
+    cell.client.add(PLACES)
+    saved = cell.folder / "state" / cell.settings.cell
+    assert stat.S_IMODE((saved / "places.json").stat().st_mode) == 0o600
+    assert stat.S_IMODE(saved.stat().st_mode) == 0o700
 
 
 def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:

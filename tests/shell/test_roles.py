@@ -4,8 +4,11 @@ that try everything.
 
 from __future__ import annotations
 
+import contextlib
+import datetime
 import itertools
 import os
+import shutil
 import stat
 import time
 from collections.abc import Callable, Iterator
@@ -14,13 +17,15 @@ from pathlib import Path
 import pytest
 import zenoh
 from cell import LEFT, Tracker, thirdhand
+from cryptography import x509
 
+from service.cli.main import main
 from service.client import Client, UnreachableError, endpoints, open_session
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
+from service.contract.roles import ROLES, access_control, names
 from service.launch import launched
 from service.shell.door import BOUNDS
-from service.shell.roles import ROLES, access_control
 
 CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state")
@@ -42,9 +47,9 @@ def secrets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Guarded:
     """A session in the daemon's place: takes in, publishes and answers as a daemon does."""
 
-    def __init__(self, secrets: Path) -> None:
+    def __init__(self, secrets: Path, revoked: tuple[str, ...] = ()) -> None:
         self.session = open_session(
-            listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=BOUNDS | access_control(CELL)
+            listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=BOUNDS | access_control(CELL, revoked)
         )
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
@@ -126,6 +131,115 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
     assert forged == []
     assert answered == (len(REQUESTS) if role.asks else 0)
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
+
+
+def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Path) -> None:
+    """Sessions of two trackers and two operators; of each the second was revoked."""
+    for role in ("tracker", "operator"):
+        made = thirdhand("certificates", str(secrets), "--role", role)
+        assert made.returncode == 0, made.stderr
+        assert f"{secrets / role}-2: {role}-2, of role {role}; valid until 20" in made.stdout
+    full = {key: channels.key(CELL, key) for key in (*INPUTS, *OUTPUTS, *REQUESTS)}
+    daemon = Guarded(secrets, revoked=("tracker-2", "operator-2"))
+    with contextlib.ExitStack() as closing:
+        closing.callback(daemon.close)
+        sessions = {
+            name: closing.enter_context(open_session(connect=[daemon.endpoint], certificate=secrets / name))
+            for name in ("tracker", "tracker-2", "operator", "operator-2")
+        }
+        got: dict[str, set[str]] = {name: set() for name in sessions}
+        said: dict[str, set[bytes]] = {}
+        for name, session in sessions.items():
+
+            def hear(sample: zenoh.Sample, name: str = name) -> None:
+                got[name].update([str(sample.key_expr)] if bytes(sample.payload) == b"out" else [])
+
+            for key in (*full.values(), "**"):
+                closing.callback(session.declare_subscriber(key, hear).undeclare)
+        taken = daemon.session.declare_subscriber(
+            f"{CELL}/**", lambda s: said.setdefault(str(s.key_expr), set()).add(bytes(s.payload))
+        )
+        closing.callback(taken.undeclare)
+        assert within(lambda: Client(sessions["operator"], CELL, timeout_s=1.0).ask("status") == {})
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            for name, session in sessions.items():
+                for key in (*INPUTS, *OUTPUTS):
+                    session.put(full[key], name.encode())
+            daemon.publish()
+            time.sleep(0.05)
+        daemon.asked.clear()
+        asked = [sessions["operator-2"].get(full[key], payload=b"{}", timeout=PATIENCE_S) for key in REQUESTS]
+        assert not any(reply.ok for replies in asked for reply in replies)
+        assert daemon.asked == set()
+        assert Client(sessions["operator"], CELL).ask("hold") == {}
+    hands = {full["hands/left"], full["hands/right"]}
+    assert {key for key, names in said.items() if b"tracker" in names} == hands
+    assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
+    assert got["tracker-2"] == got["operator-2"] == set()
+    assert got["operator"] == {full[key] for key in OUTPUTS}
+
+
+def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
+    """A subject without a name would be everybody."""
+    told = access_control(CELL, names("tracker"))["access_control"]
+    assert all(subject["cert_common_names"] for subject in told["subjects"])
+    assert "tracker" not in [subject["id"] for subject in told["subjects"]]
+    assert {name for policy in told["policies"] for name in policy["subjects"]} == {s["id"] for s in told["subjects"]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--role", "tracker", "--name", "left-camera"), 2, "tracker with a number needed, tracker-2 to tracker-99"),
+        (("--name", "tracker-2"), 2, "the --role that it is to have needed too"),
+        (("--role", "tracker", "--name", "tracker"), 1, "a name that was not given before needed"),
+        (("--role", "nobody"), 2, "invalid choice"),
+        (("--role", "daemon", "--days", "0"), 2, "accepted"),
+    ],
+)
+def test_one_more_certificate_that_cannot_be_is_refused_in_words(
+    secrets: Path, arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    done = thirdhand("certificates", str(secrets), *arguments)
+    assert done.returncode == code
+    assert words in done.stderr
+    nowhere = thirdhand("certificates", str(secrets / "none"), "--role", "tracker")
+    assert nowhere.returncode == 1
+    assert "no authority in" in nowhere.stderr
+
+
+def test_the_daemons_certificate_can_be_made_anew(secrets: Path) -> None:
+    made = thirdhand("certificates", str(secrets), "--role", "daemon", "--name", "daemon-7", "--host", "bench.local")
+    assert made.returncode == 0, made.stderr
+    certificate = x509.load_pem_x509_certificate((secrets / "daemon-7" / "certificate.pem").read_bytes())
+    hosts = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "bench.local" in hosts.get_values_for_type(x509.DNSName)
+    with (
+        open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon-7") as renewed,
+        open_session(connect=endpoints(renewed), certificate=secrets / "operator"),
+    ):
+        pass
+
+
+def test_a_certificate_out_of_its_time_is_told_in_words(
+    guarded: Guarded, secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Made by the command, with its clock 30 days off."""
+    shutil.copytree(secrets, tmp_path / "own")
+    today = datetime.datetime.now(datetime.UTC)
+    for days, name, words in (
+        (-30, "tracker-5", r"certificate\.pem expired on 20.* UTC: a new certificate needed"),
+        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, and the clock here says"),
+    ):
+        made = today + datetime.timedelta(days=days)
+        monkeypatch.setattr("service.cli.certificates.now", lambda made=made: made)
+        assert main(["certificates", str(tmp_path / "own"), "--role", "tracker", "--name", name, "--days", "3"]) == 0
+        with pytest.raises(UnreachableError, match=words):
+            open_session(connect=[guarded.endpoint], certificate=tmp_path / "own" / name, timeout_s=1.0)
+    (tmp_path / "own" / "tracker" / "certificate.pem").write_text("nothing")
+    with pytest.raises(UnreachableError, match="does not hold a certificate"):
+        open_session(connect=[guarded.endpoint], certificate=tmp_path / "own" / "tracker", timeout_s=1.0)
 
 
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:

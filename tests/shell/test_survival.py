@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -98,7 +99,8 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
             daemon.client.ask("reset")
             daemon.client.ask("resume")
         daemon.until(lambda status: status["mode"] == "follow")
-        assert daemon.end() == 0
+        assert daemon.end() == 1  # the recording is not complete, and says so
+        assert daemon.log.read_text().endswith("ticks are not recorded\n")
     (recording,) = records.glob("*.mcap")
     result = replay(recording)
     assert result.identical == result.ticks > 0, result.text()
@@ -151,7 +153,7 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     with serving(tmp_path, "--arm", "assumed") as daemon:
         at = ("serve", "--arm", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
-        refused = thirdhand(*at, env=os.environ | {"XDG_STATE_HOME": str(tmp_path)})
+        refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
         assert refused.returncode == 1
         assert "cell thirdhand is served already" in refused.stderr
         assert f"listening on {daemon.endpoint}" in refused.stderr
@@ -161,6 +163,50 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         with serving(other, "--arm", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
             assert daemon.client.status()["cell"] == "thirdhand"
         assert daemon.end() == 0
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
+def test_a_second_daemon_does_not_start_where_zenoh_does_not_show_the_first(tmp_path: Path, ending: int) -> None:
+    """Each listens on a port of its own, and neither connects to the other."""
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        again = ("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
+        refused = thirdhand(*again)
+        assert refused.returncode == 1
+        assert "cell thirdhand is served already on this machine" in refused.stderr
+        assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in refused.stderr
+        assert "Traceback" not in refused.stderr
+        lock = tmp_path / "state" / "thirdhand" / "daemon.lock"
+        assert stat.S_IMODE(lock.stat().st_mode) == 0o600
+        assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
+        daemon.process.send_signal(ending)
+        daemon.process.wait(30)
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        assert daemon.end() == 0
+
+
+def test_a_cell_without_a_folder_for_its_lock_is_served_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("a file where a folder is needed")
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        daemon.until(lambda status: status["tick"] > 0)
+        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
+
+
+def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
+    before = (
+        "import time\nfrom service.shell.daemon import Daemon\nhonest = Daemon._run\n"
+        "def late(self):\n    time.sleep(10)\n    honest(self)\nDaemon._run = late"
+    )
+    with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
+        told = daemon.client.status()
+        said = thirdhand("status", "--connect", daemon.endpoint)
+        assert (told["tick"], told["mode"], told["reason"]) == (-1, "hold", "arm_not_ready")
+        assert (told["hand_age_ms"], told["hand_distance_m"]) == ({}, 3.0)
+        rows = {line[:10].strip(): line[11:] for line in said.stdout.splitlines()}
+        assert rows["mode"] == "hold (arm_not_ready)  it starts: nothing has been decided yet"
+        assert (rows["hands"], rows["nearest"]) == ("none seen", "no hand seen")
+        assert (rows["loop"], rows["scheduling"]) == ("no tick yet", "not known yet")
+        daemon.until(lambda status: status["tick"] >= 0)
+        assert "no tick yet" not in thirdhand("status", "--connect", daemon.endpoint).stdout
 
 
 def test_no_child_outlives_a_daemon_that_is_killed(tmp_path: Path) -> None:

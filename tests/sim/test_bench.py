@@ -137,6 +137,26 @@ def test_the_arm_brakes_twenty_milliseconds_after_the_last_command(bench: Bench)
     assert seen.joints[0] - joints[0] < 0.8 * 0.025
 
 
+def test_what_a_mended_network_sends_late_does_not_move_the_arm(bench: Bench) -> None:
+    joints = np.array(bench.observe().joints)
+    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
+    for _ in range(100):
+        joints = joints + 0.002 * speed
+        bench.step(tuple(joints), tuple(speed))
+    for _ in range(60):  # cut for 120 ms
+        stood = np.array(bench.step().joints)
+    late = [(joints + 0.002 * k * speed, speed) for k in range(1, 60)]
+    late.append((late[-1][0], 0 * speed))  # the service had stopped by then
+    for position, velocity in late[::3] + late[-1:]:
+        seen = bench.step(tuple(position), tuple(velocity))
+        assert np.abs(np.array(seen.joints) - stood).max() < 2e-3
+    assert bench.refused == 21
+    for k in range(100):  # who takes over begins where the arm stands
+        seen = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
+    assert seen.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
+    assert bench.refused == 21
+
+
 def test_hands_rest_at_their_start_until_the_script_begins_and_come_back_the_way_they_went() -> None:
     with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench:
         start = bench.observe().hands.left.position

@@ -171,6 +171,7 @@ class TestExperiments:
 
 def test_every_experiment_has_a_test() -> None:
     assert set(ABOUT) == {
+        "faults",  # in test_faults.py
         "motion",
         "letters",
         "promp",

@@ -1,10 +1,10 @@
-"""Who may do what on a network: each certificate's common name is a role, and a daemon with a
+"""Who may do what on a network: each certificate's common name tells a role, and a daemon with a
 certificate of its own lets each role do what stands here and nothing else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
 from service.contract import channels
@@ -12,6 +12,7 @@ from service.contract import channels
 DAEMON = "daemon"
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
+MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
 
 class Role(NamedTuple):
@@ -32,8 +33,15 @@ ROLES = {
 }
 
 
-def access_control(cell: str) -> dict[str, Any]:
-    """Zenoh's settings by which a daemon of this cell keeps the roles apart."""
+def names(role: str) -> tuple[str, ...]:
+    """The names that certificates of a role may have: `tracker`, `tracker-2` to `tracker-99`."""
+    return (role, *(f"{role}-{number}" for number in range(2, MOST_OF_A_ROLE + 1)))
+
+
+def access_control(cell: str, revoked: Collection[str] = ()) -> dict[str, Any]:
+    """Zenoh's settings by which a daemon of this cell keeps the roles apart, and lets certificates
+    of the `revoked` names do nothing.
+    """
 
     def keys(suffixes: tuple[str, ...]) -> list[str]:
         return [channels.key(cell, suffix) for suffix in suffixes]
@@ -73,13 +81,17 @@ def access_control(cell: str) -> dict[str, Any]:
             ],
         )
 
-    granted = list(policies())
+    granted = [
+        (role, valid, rules_of)
+        for role, rules_of in policies()
+        if (valid := [name for name in names(role) if name not in revoked])  # no name at all would mean everybody
+    ]
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
             "rules": rules,
-            "subjects": [{"id": name, "cert_common_names": [name]} for name, _ in granted],
-            "policies": [{"subjects": [name], "rules": names} for name, names in granted],
+            "subjects": [{"id": role, "cert_common_names": valid} for role, valid, _ in granted],
+            "policies": [{"subjects": [role], "rules": rules_of} for role, _, rules_of in granted],
         }
     }

@@ -1,0 +1,236 @@
+"""A whole cell to be broken: service, scribe, workshop, tracker and network as processes, the
+bench's arm in real time, and what they did when something of it failed.
+
+with FaultyCell(folder) as cell:
+    event = cell.suffer("tracker killed", Fault(lambda cell: cell.tracker.send(SIGKILL), ...))
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple, Self
+
+import zenoh
+
+from service.client import Client, UnreachableError, open_session
+from service.contract import cdr, channels
+from service.launch import Launched, launched
+from service.shell.clock import Deadlines
+from sim.bench import Bench
+from sim.network import Bridge, Live
+from sim.parts import CLIENT, Link, Part, as_usual_afterwards, before_others
+from sim.scene import Scene
+from sim.script import HandScript
+
+FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
+WATCHED_S = 1.0  # after a fault, before it is mended
+STEADY_S = 1.5  # it has followed before a fault strikes
+RESUMES_WITHIN_S = 60.0
+SWING_S = 5.0  # longer than the hands take to and fro
+CELL = "thirdhand"
+
+
+Network = Literal["relays", "router", "link"]
+Command = tuple[float, int, bytes]  # when it left the service (time.monotonic() [s]), its tick, its bytes
+
+
+class FaultError(RuntimeError):
+    """A cell that did not do what a row of the table needs; the message says what."""
+
+
+class Event(NamedTuple):
+    """When a fault struck, when it was mended, when the tool moved again and when the watch ended
+    (time.monotonic() [s]); the tick at which it struck; ticks counted as lost meanwhile.
+    """
+
+    fault: str
+    struck_s: float
+    mended_s: float
+    moving_s: float
+    ended_s: float
+    tick: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class Fault:
+    """How something is broken and mended, in a cell over which network; after it the arm `stops`,
+    or else goes on.
+    """
+
+    provoke: Callable[[FaultyCell], None]
+    mend: Callable[[FaultyCell], None] = lambda cell: None
+    stops: bool = True
+    network: Network = "relays"
+    lasts_s: float = WATCHED_S
+
+
+@dataclass
+class _Arm:
+    """The bench's arm on the network: follows commands and tells its joints, on a thread."""
+
+    endpoint: str
+    routed: bool
+    steps: list[tuple[float, ...]] = field(default_factory=list)  # time [s], tool [m], speed [m/s]
+
+    def __post_init__(self) -> None:
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="arm", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        before_others()
+        with (
+            Bench(HandScript(Scene(), seed=1)) as bench,
+            open_session(connect=[self.endpoint], more=CLIENT if self.routed else None) as session,
+            contextlib.closing(Bridge(session, Live(cell=CELL), bench.joint_names)) as bridge,
+        ):
+            deadlines = Deadlines(round(1 / bench.period_s))
+            while not self._end.is_set():
+                deadlines.wait()
+                seen = bench.step(*bridge.commands.take())
+                bridge.publish_joints(seen)
+                self.steps.append((time.monotonic(), *seen.tool.position, math.hypot(*seen.tool_velocity)))
+
+    @property
+    def speed(self) -> float:
+        """Of the tool now [m/s]."""
+        return self.steps[-1][4] if self.steps else 0.0
+
+    def close(self) -> None:
+        """Ends it."""
+        self._end.set()
+        self._thread.join()
+
+
+class FaultyCell:
+    """A running cell whose tool swings to and fro, with its files in `folder`.
+
+    Tracker and arm reach the service each over a relay of its own, both over one router, or over a
+    cable that leads to a network namespace. Raises FaultError, LaunchError and PartError.
+    """
+
+    def __init__(self, folder: Path, *, network: Network = "relays") -> None:
+        self.folder, self.records, self.network = folder, folder / "records", network
+        self.commands: list[Command] = []  # of the service's first life
+        self.unasked = 0  # faults that nobody struck: a machine that is busy
+        self._parts = contextlib.ExitStack()
+        self._life = contextlib.ExitStack()
+        self._lives = 0
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as parts:
+            if self.network == "router":
+                self.router = self._part(parts, "router", "0")
+            elif self.network == "link":
+                self.link = parts.enter_context(contextlib.closing(Link()))
+            parts.callback(self._life.close)
+            self.begin_service()
+            here = self.service.endpoint
+            if self.network == "relays":
+                self.to_tracker, self.to_arm = (self._part(parts, "relay", here, "0") for _ in range(2))
+                to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
+            else:
+                to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
+            routed = self.network == "router"
+            # the operator is at the service itself, so that what left it is known whatever is cut
+            with as_usual_afterwards():
+                self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
+            self.client = Client(self.session, CELL)
+            self.tracker = self._part(parts, "tracker", to_tracker, *["--routed"] * routed)
+            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, routed)))
+            self._listen()
+            self.until_fast()
+            self._parts = parts.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._parts.close()
+
+    @staticmethod
+    def _part(parts: contextlib.ExitStack, *arguments: str) -> Part:
+        return parts.enter_context(contextlib.closing(Part(*arguments)))
+
+    def begin_service(self) -> None:
+        """Begins the service, where it was if it has been."""
+        listen = f"tcp/{Link.ADDRESS if self.network == 'link' else '127.0.0.1'}:0"
+        if self._lives:
+            listen = self.service.endpoint
+        self._lives += 1
+        network = f"[network]\nlisten = [{listen!r}]\n"
+        if self.network == "router":
+            network += f"connect = [{self.router.endpoint!r}]\n"
+        if self.network == "link":
+            network += "allow_insecure = true\n"
+        program = self.link.program if self.network == "link" else ("-m", "service")
+        record = self.records if self._lives == 1 else self.folder / f"records-{self._lives}"
+        self._life.close()
+        self.service: Launched = self._life.enter_context(
+            launched(self.folder, record=record, network=network, program=program)
+        )
+
+    def _listen(self) -> None:
+        """Keeps every command that leaves the service."""
+
+        def keep(sample: zenoh.Sample) -> None:
+            if self._lives == 1 and sample.attachment is not None:
+                tick = cdr.decode_attachment(sample.attachment.to_bytes()).tick
+                self.commands.append((time.monotonic(), tick, sample.payload.to_bytes()))
+
+        self.session.declare_subscriber(channels.key(CELL, "joints/command"), keep)
+
+    def child(self, what: str) -> int:
+        """The process id of the service's `scribe` or `workshop`."""
+        module = {"scribe": b"service.recorder.process", "workshop": b"service.shell.workshop"}[what]
+        for path in Path(f"/proc/{self.service.process.pid}/task").glob("*/children"):
+            for pid in path.read_text().split():
+                if module in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    return int(pid)
+        raise FaultError(f"no {what} was found among the children of the service")
+
+    def until(self, what: Callable[[], bool], said: str, within_s: float = RESUMES_WITHIN_S) -> float:
+        """When something came to hold [s]. Raises FaultError where it does not."""
+        end = time.monotonic() + within_s
+        while not what():
+            if time.monotonic() > end:
+                raise FaultError(f"{said} within {within_s:g} s; the status: {self.client.status()}")
+            time.sleep(0.005)
+        return time.monotonic()
+
+    def until_fast(self, speed: float = FAST) -> float:
+        """When the tool came to be as fast [s]; a fault that nobody struck is counted and reset."""
+        end = time.monotonic() + RESUMES_WITHIN_S
+        while time.monotonic() < end:
+            with contextlib.suppress(FaultError, UnreachableError):
+                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
+            with contextlib.suppress(UnreachableError):
+                if self.client.status()["mode"] == "fault":
+                    self.unasked += 1
+                    self.client.ask("reset")
+        raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
+
+    def suffer(self, name: str, fault: Fault) -> Event:
+        """What came of a fault that strikes while the tool is fast, and of mending it."""
+        time.sleep(STEADY_S)
+        self.until_fast()
+        lost = self.client.status()["scribe"]["lost"]
+        self.until_fast()
+        struck = time.monotonic()
+        tick = self.commands[-1][1]
+        fault.provoke(self)
+        time.sleep(max(0.0, struck + fault.lasts_s - time.monotonic()))
+        mended = time.monotonic()
+        fault.mend(self)
+        moving = self.until_fast(MOVES)
+        lost = self.client.status()["scribe"]["lost"] - lost
+        return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
+
+    def close(self) -> int:
+        """The exit code of the service, asked to end."""
+        return self.service.stop()

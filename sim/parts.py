@@ -1,0 +1,258 @@
+"""Parts of a cell as processes of their own, to be killed, frozen and begun again: a tracker, a
+network between two ends, a Zenoh router.
+
+python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the
+                                          same sample for good, at each SIGUSR2 with a clock that
+                                          is set back by an hour, or ahead to where it was
+python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a
+                                          network that is silent
+python -m sim.parts router PORT           a Zenoh session that routes between its clients
+
+Each says where it listens, if it does, or else that it began; port 0 takes a free one.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import argparse
+import asyncio
+import contextlib
+import itertools
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+from service import child
+from service.client import endpoints, open_session
+from service.contract import cdr, channels, messages
+from service.shell.clock import Deadlines
+from sim.scene import Scene
+from sim.script import HandScript
+
+HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
+MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
+START_TIMEOUT_S = 60.0
+PRIORITY = 20  # below the service's loop, above what it does beside
+CLIENT = {"mode": "client"}  # as a router wants it
+
+
+def before_others() -> None:
+    """Lets this thread, and those that it starts, run before other processes, if that is granted:
+    then a machine that is busy is not taken for a fault.
+    """
+    with contextlib.suppress(PermissionError, AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+
+
+@contextlib.contextmanager
+def as_usual_afterwards() -> Iterator[None]:
+    """Within it, threads that are started run before other processes; this one until its end."""
+    before_others()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(PermissionError, AttributeError, OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+class PartError(RuntimeError):
+    """A part that did not begin; the message says which."""
+
+
+def script_time(time_s: float) -> float:
+    """The script's time [s] of hands that swing to and fro where they lead the tool fastest."""
+    return MIDDLE_S + SWING_S * math.sin(FASTEST / SWING_S * time_s)
+
+
+def track(endpoint: str, *, routed: bool) -> None:
+    """Publishes both hands for good; on SIGUSR1 what it sent last, again and again, on SIGUSR2 by a
+    clock that was set.
+    """
+    repeats, offs_ns = threading.Event(), itertools.cycle([HOUR_NS, 0])
+    off_ns = 0
+
+    def set_the_clock(*_: object) -> None:
+        nonlocal off_ns
+        off_ns = next(offs_ns)
+
+    signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
+    signal.signal(signal.SIGUSR2, set_the_clock)
+    script, sides = HandScript(Scene(), seed=1), ("left", "right")
+    with open_session(connect=[endpoint], more=CLIENT if routed else None) as session:
+        publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
+        clock, payloads = Deadlines(HANDS_HZ), [b"", b""]
+        print("begun", flush=True)
+        while True:
+            clock.wait()
+            if not repeats.is_set() or not payloads[0]:
+                stamp_ns = time.time_ns() - off_ns
+                poses = [pose.tolist() for pose in script.sample(script_time(time.monotonic()))]
+                payloads = [
+                    cdr.encode_pose(messages.PoseStamped(stamp_ns, messages.BASE, (x, y, z), tuple(turn)))
+                    for x, y, z, *turn in poses
+                ]
+            for publisher, payload in zip(publishers, payloads, strict=True):
+                publisher.put(payload)
+
+
+async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+    try:
+        while data := await source.read(65536):
+            sink.write(data)
+            await sink.drain()
+    except OSError:  # an end that is gone ends both
+        pass
+    finally:
+        sink.close()
+
+
+async def relay(target: str, port: int) -> None:
+    """Carries bytes between whoever connects and the target, for good."""
+    host, _, target_port = target.removeprefix("tcp/").rpartition(":")
+
+    async def carry(near: asyncio.StreamReader, to_near: asyncio.StreamWriter) -> None:
+        try:
+            far, to_far = await asyncio.open_connection(host, int(target_port))
+        except OSError:  # nobody there: so the asker learns
+            to_near.close()
+            return
+        await asyncio.gather(_pump(near, to_far), _pump(far, to_near))
+
+    server = await asyncio.start_server(carry, "127.0.0.1", port)
+    print(f"listening on tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}", flush=True)
+    await server.serve_forever()
+
+
+def route(port: int) -> None:
+    """Routes between the clients that connect, for good."""
+    with open_session(listen=[f"tcp/127.0.0.1:{port}"], more={"mode": "router"}) as session:
+        print(f"listening on {endpoints(session)[0]}", flush=True)
+        signal.pause()
+
+
+class Part:
+    """One of them, running; `endpoint` where it listens. Raises PartError where it does not begin.
+
+    `again` begins it anew at the same endpoint, after its end.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        self._arguments = arguments
+        self._start()
+
+    def _start(self) -> None:
+        command = [sys.executable, "-m", "sim.parts", *self._arguments]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        clock = threading.Timer(START_TIMEOUT_S, self.process.kill)
+        clock.start()
+        assert self.process.stdout is not None
+        said = self.process.stdout.readline().split()
+        clock.cancel()
+        if not said:
+            raise PartError(f"python -m sim.parts {' '.join(self._arguments)} did not begin")
+        self.endpoint = said[-1]
+
+    def send(self, number: int) -> None:
+        """Sends a signal."""
+        self.process.send_signal(number)
+
+    def again(self) -> None:
+        """Ends it and begins it anew, where it was."""
+        self.close()
+        if self._arguments[0] != "tracker":
+            self._arguments = (*self._arguments[:-1], self.endpoint.rsplit(":", 1)[1])
+        self._start()
+
+    def close(self) -> None:
+        """Ends it."""
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+class Link:
+    """A cable between this machine and a network namespace of its own in which a service may run:
+    it can be taken down. Only root may have one; raises PartError where it is not allowed.
+    """
+
+    ADDRESS, OTHER = "198.18.77.1", "198.18.77.2"  # of the range that is set aside for measurements
+
+    def __init__(self) -> None:
+        self.name = f"thirdhand{os.getpid()}"
+        self._cable = f"th{os.getpid()}"
+        _ip("netns", "add", self.name)
+        try:
+            _ip("link", "add", self._cable, "type", "veth", "peer", "name", "th0", "netns", self.name)
+            _ip("-n", self.name, "addr", "add", f"{self.ADDRESS}/30", "dev", "th0")
+            _ip("-n", self.name, "link", "set", "th0", "up")
+            _ip("-n", self.name, "link", "set", "lo", "up")
+            _ip("addr", "add", f"{self.OTHER}/30", "dev", self._cable)
+            self.set("up")
+        except PartError:
+            self.close()
+            raise
+
+    def set(self, state: str) -> None:
+        """Takes it `up` or `down`."""
+        _ip("link", "set", self._cable, state)
+
+    @property
+    def program(self) -> tuple[str, ...]:
+        """A Python program that runs the service at the far end."""
+        return (
+            "-c",
+            "import ctypes, os, sys\n"
+            f"if ctypes.CDLL(None).setns(os.open('/run/netns/{self.name}', os.O_RDONLY), 0): sys.exit('no namespace')\n"
+            "from service.__main__ import main\nsys.exit(main())",
+        )
+
+    def close(self) -> None:
+        """Removes it."""
+        _ip("netns", "del", self.name)
+
+
+def _ip(*arguments: str) -> None:
+    try:
+        done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=10, check=False)
+    except OSError as error:
+        raise PartError(f"ip cannot be run: {error}") from None
+    if done.returncode != 0:
+        raise PartError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code: 0, 2 on bad usage."""
+    p = argparse.ArgumentParser(
+        prog="python -m sim.parts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    kinds = p.add_subparsers(dest="kind", required=True)
+    tracker = kinds.add_parser("tracker", help="both hands, to and fro")
+    tracker.add_argument("endpoint", metavar="ENDPOINT", help="where the service or a router listens")
+    tracker.add_argument("--routed", action="store_true", help="as a router's client")
+    relaying = kinds.add_parser("relay", help="a network between two ends")
+    relaying.add_argument("target", metavar="TARGET", help="where it leads to, like tcp/127.0.0.1:7447")
+    routing = kinds.add_parser("router", help="a Zenoh router")
+    for one in (relaying, routing):
+        one.add_argument("port", metavar="PORT", type=int, help="where it listens; 0: a free one")
+    args = p.parse_args(arguments)
+    child.end_with_parent()
+    before_others()
+    if args.kind == "tracker":
+        track(args.endpoint, routed=args.routed)
+    elif args.kind == "relay":
+        asyncio.run(relay(args.target, args.port))
+    else:
+        route(args.port)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

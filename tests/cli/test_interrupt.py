@@ -1,0 +1,122 @@
+"""Ctrl-C at many moments of real processes: one line, exit 130, no traceback, nothing left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from tests_paths import RECORDINGS, ROOT
+
+SAID = "thirdhand: interrupted"
+DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts
+GOLDEN, DEMONSTRATION = str(RECORDINGS / "golden.mcap"), str(RECORDINGS / "demonstration-1.mcap")
+PUT_AWAY_SLOWLY = """
+import time
+from service import interrupt
+interrupt.watch()
+with interrupt.put_away_first():
+    try:
+        print("begun", flush=True)
+        time.sleep(60)
+    finally:
+        print("putting away", flush=True)
+        time.sleep(60)
+"""
+
+
+def wait_for(what: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def nobody() -> Iterator[str]:
+    """An endpoint that takes connections in and never says a word: who connects there waits."""
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
+    """A command that runs and looks after interrupts: by a thread of its own, its second."""
+    with said.open("wb") as errors:
+        command = [sys.executable, "-m", "service", *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, cwd=ROOT)
+    wait_for(lambda: process.poll() is not None or len(os.listdir(f"/proc/{process.pid}/task")) > 1)
+    return process
+
+
+@pytest.mark.parametrize("delay_s", DELAYS_S)
+@pytest.mark.parametrize("name", ["serve", "demo", "replay", "learn", "status", "play"])
+def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
+    (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
+    arguments = {
+        "serve": ["--config", str(tmp_path / "cell.toml"), "--connect", nobody],
+        "demo": ["--out", str(tmp_path / "demo")],
+        "replay": [GOLDEN],
+        "learn": [DEMONSTRATION, "--output", str(tmp_path / "skill.npz")],
+        "status": ["--connect", nobody],
+        "play": [GOLDEN, "--connect", nobody],
+    }[name]
+    said = tmp_path / "said"
+    process = begun([name, *arguments], said)
+    time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
+    text = said.read_text()
+    assert text.splitlines()[-1] == SAID
+    assert text.count(SAID) == 1
+    assert "Traceback" not in text
+
+
+def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
+    said = tmp_path / "said"
+    process = begun(["demo", "--out", str(tmp_path / "demo")], said)
+    wait_for(lambda: "service at" in said.read_text(), 100)
+
+    def services() -> list[bytes]:
+        lines = subprocess.run(["ps", "-ewwo", "args"], capture_output=True, check=True).stdout.splitlines()
+        return [line for line in lines if str(tmp_path).encode() in line and b"defunct" not in line]
+
+    assert len(services()) == 2  # the demo and its daemon
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130
+    assert services() == []
+    assert said.read_text().splitlines()[-1] == SAID
+    assert "Traceback" not in said.read_text()
+
+
+def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PUT_AWAY_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "putting away\n"
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=10)
+    assert (process.returncode, said) == (130, f"{SAID}\n")
+
+
+def test_an_interrupt_that_is_ignored_stays_so() -> None:
+    """As a shell starts what runs in its background."""
+    code = (
+        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom service import interrupt\n"
+        "interrupt.watch()\nsignal.raise_signal(signal.SIGINT)\nprint('goes on')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30, check=True
+    )
+    assert done.stdout == "goes on\n"

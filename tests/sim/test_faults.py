@@ -1,0 +1,116 @@
+"""A cell whose parts are killed, frozen and cut off while its tool is fast: it stops as promised,
+and goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
+
+from sim.experiments.__main__ import main
+from sim.experiments.faults import SHORT
+from sim.parts import Part
+
+pytestmark = pytest.mark.timeout(300)
+BRAKE_MM = 40.0  # of a tool at up to 0.8 m/s that brakes 20 ms after the last command
+
+
+@pytest.fixture(scope="module")
+def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The experiment's numbers of a few faults."""
+    folder = tmp_path_factory.mktemp("faults")
+    assert main(["faults", "--output", str(folder), "--share", "0.1", "--quiet"]) == 0
+    assert (folder / "faults.png").read_bytes()[:4] == b"\x89PNG"
+    found: dict[str, Any] = json.loads((folder / "faults.json").read_text())
+    assert set(found["faults"]) >= set(SHORT) - {"cable pulled"}
+    return found
+
+
+@pytest.mark.parametrize("name", ["tracker killed", "tracker frozen", "network to the tracker silent"])
+def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
+    suffered: dict[str, Any], name: str
+) -> None:
+    one = suffered["faults"][name]
+    assert one["reason"] == "stale_hand"
+    assert 80 <= one["hold_ms"] <= 120
+    assert one["rest_ms"] < 700
+    assert one["speed_at_the_end_m_per_s"] < 1e-3
+    assert one["travelled_mm"] == pytest.approx(one["commanded_mm"], abs=10)  # the arm did as it was told
+    assert one["lost_ticks"] == 0
+
+
+@pytest.mark.parametrize("name", ["network to the arm silent", "network to the arm torn", "cable pulled"])
+def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it(
+    suffered: dict[str, Any], name: str
+) -> None:
+    if name not in suffered["faults"]:
+        pytest.skip("a network namespace is not allowed here")
+    one = suffered["faults"][name]
+    assert one["reason"] in ("arm_error", "arm_silent", *["stale_hand"] * (name == "cable pulled"))
+    assert one["hold_ms"] <= 120
+    assert one["travelled_mm"] < BRAKE_MM
+    assert one["speed_at_the_end_m_per_s"] < 1e-3
+    assert one["fastest_m_per_s"] < 1.0  # also when all comes that was held back
+    assert one["lost_ticks"] == 0
+
+
+def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whole(suffered: dict[str, Any]) -> None:
+    one = suffered["faults"]["service killed"]
+    assert one["travelled_mm"] < BRAKE_MM
+    assert one["speed_at_the_end_m_per_s"] < 1e-3
+    assert one["lost_ticks"] == 0
+    assert one["moves_again_ms"] > 0  # begun anew, it goes on by itself
+
+
+def test_a_router_that_is_killed_stops_the_arm_and_all_meet_again(suffered: dict[str, Any]) -> None:
+    one = suffered["faults"]["router killed"]
+    assert one["reason"] in ("stale_hand", "arm_error", "arm_silent")
+    assert one["hold_ms"] <= 120
+    assert one["travelled_mm"] < BRAKE_MM
+    assert one["moves_again_ms"] > 0
+
+
+def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(suffered: dict[str, Any]) -> None:
+    one = suffered["faults"]["scribe killed"]
+    assert one["lost_ticks"] > 0
+    assert one["command_mean_gap_ms"] < 2.5
+    assert suffered["unaccounted_ticks"] == 0  # what is neither recorded nor said to be lost
+
+
+def test_a_frozen_relay_is_silent_and_a_killed_one_tears(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as far_end:
+        target = f"tcp/127.0.0.1:{far_end.getsockname()[1]}"
+        with closing(Part("relay", target, "0")) as relay:
+            port = int(relay.endpoint.rsplit(":", 1)[1])
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as near:
+                far, _ = far_end.accept()
+                with far:
+                    far.settimeout(10)
+                    near.sendall(b"before")
+                    assert far.recv(6) == b"before"
+                    relay.send(signal.SIGSTOP)
+                    os.waitid(os.P_PID, relay.process.pid, os.WSTOPPED)
+                    near.sendall(b"held back")
+                    far.settimeout(0.2)
+                    with pytest.raises(TimeoutError):
+                        far.recv(1)
+                    relay.send(signal.SIGCONT)
+                    far.settimeout(10)
+                    assert far.recv(20) == b"held back"
+                    relay.again()
+                    assert relay.endpoint.endswith(f":{port}")
+                    assert far.recv(1) == b""
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as near:
+                far, _ = far_end.accept()
+                with far:
+                    near.sendall(b"anew")
+                    assert far.recv(4) == b"anew"
