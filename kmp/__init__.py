@@ -12,16 +12,19 @@ fitted weights.
 """
 
 from kmp.checks import RankReached, ViaPointMissed
+from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement, improve
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
-from kmp.kernel import GaussianKernel, VelocityKernel
+from kmp.kernel import GaussianKernel
 from kmp.orientation import OrientationKMP
-from kmp.primitive import KMP, Uncertainty
+from kmp.predictor import Uncertainty
+from kmp.primitive import KMP
 from kmp.query import MotionPrediction
 from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
+from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 __all__ = [
     "KMP",
@@ -32,9 +35,11 @@ __all__ = [
     "Gaussians",
     "Improvement",
     "Learned",
+    "LinearConstraints",
     "LocalKMP",
     "MotionPrediction",
     "OrientationKMP",
+    "PeriodicKernel",
     "RankReached",
     "Score",
     "Stored",

@@ -21,11 +21,14 @@ from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.query import MotionPrediction, Query
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CompiledQuery(Immutable):
     """A query's arrays for compiled loops. R centres, O outputs."""
 
     query: Query
+    along: Array
+    """(R, I) the directions of the derivatives, in the kernel's coordinates, zero for a value; or
+    (0, I), where all are values."""
     columns: Array | None
     """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c Sigma
     = L L^T (R O, R O); None: the covariance is the solution's own."""
@@ -36,7 +39,8 @@ class CompiledQuery(Immutable):
         if not AVAILABLE or not isinstance(query.kernel, GaussianKernel):
             return None
         solution = query.solution
-        return cls(query, _packed(solution) if isinstance(solution, Dense) else None)
+        along = solution.functionals.along * query.stretch if query.derivatives else np.empty((0, len(query.stretch)))
+        return cls(query, frozen(along), _packed(solution) if isinstance(solution, Dense) else None)
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -55,6 +59,7 @@ class CompiledQuery(Immutable):
             q.stretch,
             q.scale,
             q.centres,
+            self.along,
             q.weights,
             q.prior_mean,
             values,
@@ -66,10 +71,11 @@ class CompiledQuery(Immutable):
         )
         if not finite:
             return None
-        found = self._covariance(values) if covariance else None
+        found = self.covariance(values) if covariance else None
         return MotionPrediction(mean, moved, pushed, found, jacobian, curvature)
 
-    def _covariance(self, values: Array) -> Array:
+    def covariance(self, values: Array) -> Array:
+        """As `Query.covariance`, but for rounding."""
         q = self.query
         if self.columns is None:
             return q.covariance(values)
@@ -95,6 +101,7 @@ def _motion(
     stretch: Array,
     scale: float,
     centres: Array,
+    along: Array,
     weights: Array,
     prior: Array,
     values: Array,
@@ -105,9 +112,9 @@ def _motion(
     pushed: Array,
 ) -> bool:
     """Equation (8), and its first and second derivatives along the motion, from one pass over the
-    centres; whether all is finite.
+    centres, of which some may stand for derivatives; whether all is finite.
     """
-    inputs, outputs = len(query), len(prior)
+    inputs, outputs, derivatives = len(query), len(prior), len(along) > 0
     offset, direction = np.empty(inputs), np.empty(inputs)
     square = 0.0
     for i in range(inputs):
@@ -117,15 +124,28 @@ def _motion(
     jacobian[:] = 0.0
     curvature[:] = 0.0
     for r in range(len(centres)):
-        distance = along = 0.0
+        distance = to_it = 0.0
         for i in range(inputs):
             offset[i] = query[i] * stretch[i] - centres[r, i]
             distance += offset[i] * offset[i]
-            along += offset[i] * direction[i]
+            to_it += offset[i] * direction[i]
         value = math.exp(-scale * distance)
-        values[r] = value
-        slope = 2.0 * scale * along
+        slope = 2.0 * scale * to_it
         bend = value * (slope * slope - 2.0 * scale * square)
+        if derivatives:
+            away = turn = length = 0.0
+            for i in range(inputs):
+                away += offset[i] * along[r, i]
+                turn += direction[i] * along[r, i]
+                length += abs(along[r, i])
+            if length > 0.0:
+                pull = 2.0 * scale * value
+                for o in range(outputs):
+                    for i in range(inputs):
+                        jacobian[o, i] += pull * weights[r, o] * along[r, i]
+                bend = 2.0 * scale * (away * bend - 2.0 * turn * slope * value)
+                value *= 2.0 * scale * away
+        values[r] = value
         for o in range(outputs):
             weight = weights[r, o]
             mean[o] += value * weight

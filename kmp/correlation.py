@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, numbers, positive
+from kmp.checks import Array, check_kind, numbers, positive
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 from kmp.primitive import KMP
@@ -33,7 +33,7 @@ _SHARPNESS = 10.0  # h of the exponential weights, usual in path integral method
 _SMALLEST = 0.05  # of |Lambda|: below it a deviation shrinks no further
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Correlation(Immutable):
     """Lambda(s) = phi(s)^T theta, with B normalised Gaussian basis functions. Read-only.
 
@@ -77,6 +77,7 @@ class Correlation(Immutable):
 
         Raises ValueError if it has another number of inputs or outputs.
         """
+        check_kind("primitive", primitive, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
         base = primitive.base
         if (given := self.theta.shape[1]) != base.outputs:
             raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
@@ -87,7 +88,7 @@ class Correlation(Immutable):
         return primitive.refitted(Gaussians(base.reference.mean, covariance))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Improvement(Immutable):
     """What `improve` found."""
 

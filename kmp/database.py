@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from kmp.checks import Array, ViaPointMissed
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 
@@ -23,40 +24,72 @@ class Changes(NamedTuple):
     """How an adapted database differs from its base: R points less, V via-points more."""
 
     replaced: NDArray[np.intp]  # (R,) indices of the base's points, ascending
-    inputs: Array  # (V, I)
+    functionals: Functionals  # V
     points: Gaussians  # V
 
+    @property
+    def inputs(self) -> Array:
+        """(V, I) where the via-points are."""
+        return self.functionals.inputs
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Database(Immutable):
-    """N reference points: where they are, and the normal distribution of the output there."""
+    """N reference points: where they are, and the normal distribution of the output there.
 
-    inputs: Array  # (N, I)
+    Where a point is a derivative along a direction, of that derivative.
+    """
+
+    functionals: Functionals  # N
     reference: Gaussians  # N
 
     def __len__(self) -> int:
-        return len(self.inputs)
+        return len(self.functionals)
+
+    @property
+    def inputs(self) -> Array:
+        """(N, I) where the points are."""
+        return self.functionals.inputs
+
+    def deviations(self, prior_mean: Array) -> Array:
+        """mu less the prior mean (O,), whose derivatives are 0: (N, O)."""
+        if self.functionals.directions is None:
+            return self.reference.mean - prior_mean
+        return self.reference.mean - self.functionals.values[:, None] * prior_mean
 
     def unchanged(self) -> Changes:
         """No changes at all."""
         nothing = frozen(np.empty(0, dtype=np.intp))
-        return Changes(nothing, self.inputs[:0], self.reference.take(slice(0, 0)))
+        return Changes(nothing, Functionals(self.inputs[:0]), self.reference.take(slice(0, 0)))
 
     def changed(self, changes: Changes) -> Database:
         """The database after the changes: the points not replaced, then the via-points."""
         kept = np.delete(np.arange(len(self)), changes.replaced)
-        inputs = frozen(np.concatenate([self.inputs[kept], changes.inputs]))
-        return Database(inputs, Gaussians.concatenated([self.reference.take(kept), changes.points]))
+        functionals = Functionals.concatenated([self.functionals.take(kept), changes.functionals])
+        return Database(functionals, Gaussians.concatenated([self.reference.take(kept), changes.points]))
 
-    def nearest(self, via: Array, tolerance: float) -> NDArray[np.intp]:
-        """The indices, ascending, of the points nearest to those of via (V, I), if near enough."""
-        near = np.zeros(len(self), dtype=bool)
+    def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
+        """The indices, ascending, of the values nearest to those of via, if near enough.
+
+        A derivative neither replaces a point nor is replaced.
+        """
+        values, near = via.inputs[via.values], np.zeros(len(self), dtype=bool)
         step = max(1, _DISTANCES // len(self))
-        for i in range(0, len(via), step):
-            distance = cdist(via[i : i + step], self.inputs)  # (V, N)
+        for i in range(0, len(values), step):
+            distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
+            if self.functionals.directions is not None:
+                distance[:, ~self.functionals.values] = np.inf
             least = distance.min(axis=1, keepdims=True)
             near |= ((distance == least) & (least < tolerance)).any(axis=0)
         return np.flatnonzero(near)
+
+
+def _distances(a: Array, b: Array, period: float | None) -> Array:
+    """From a (A, I) to b (B, I): (A, B); round the circle where there is a period."""
+    if period is None:
+        return cdist(a, b)
+    r = np.abs(a - b.T) % period
+    return np.asarray(np.minimum(r, period - r))
 
 
 def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:

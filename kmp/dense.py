@@ -12,15 +12,18 @@ from scipy.linalg import blas, lapack
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.kernel import between, variances
 from kmp.linear_algebra import kron_identity
 
+_RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
 _COLUMNS = 64  # of a factor, copied at once
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dense(Immutable):
     """The solution for N points, N O x N O numbers; the factors are made when first asked for.
 
@@ -40,25 +43,31 @@ class Dense(Immutable):
     error_bound: ClassVar[float] = 0.0
 
     @property
+    def functionals(self) -> Functionals:
+        """The N reference points."""
+        return self.database.functionals
+
+    @property
     def centres(self) -> Array:
-        """(N, I) the reference points."""
+        """(N, I) where they are."""
         return self.database.inputs
 
     @cached_property
     def weights(self) -> Array:
         """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        mean = self.database.reference.mean
-        solution, _ = lapack.dpotrs(self._factor, (mean - self.hyperparameters.prior_mean).ravel(), lower=1)
-        return frozen(np.ascontiguousarray(solution).reshape(mean.shape))
+        right = self.database.deviations(self.hyperparameters.prior_mean)
+        solution, _ = lapack.dpotrs(self._factor, right.ravel(), lower=1)
+        return frozen(np.ascontiguousarray(solution).reshape(right.shape))
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
         self._covariance_factor  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self._inverse_factor.times_one(row.T)
-        return np.asarray(self._prior_covariance - blas.dgemm(1.0, root, root, trans_b=1))
+        own = self._prior_covariance if prior is None else kron_identity(prior, self.hyperparameters.channel_outputs)
+        return np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1))
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self._inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
@@ -92,9 +101,25 @@ class Dense(Immutable):
     @cached_property
     def _covariance_factor(self) -> Array:
         parameters = self.hyperparameters
+        self._check_resolved()
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self._factor
         return self._factorised(parameters.lambda_covariance, self.base._covariance_factor if self.base else None)
+
+    def _check_resolved(self) -> None:
+        """Raises ValueError where rounding, some 1e-15 of k(s, s), would hide the covariance."""
+        points, reference = self.database.functionals.take(slice(self.same, None)), self.database.reference
+        parameters = self.hyperparameters
+        scale = np.sqrt(variances(parameters.kernel, points)).repeat(parameters.channel_outputs, axis=1)
+        covariance = reference.covariance[self.same :] / (scale[:, :, None] * scale[:, None, :])
+        least = parameters.lambda_covariance * np.linalg.eigvalsh(covariance)[:, 0]
+        for n in np.flatnonzero(least < _RESOLVED)[:1]:
+            enough = parameters.lambda_covariance * _RESOLVED / max(least[n], 1e-300)
+            raise ValueError(
+                f"The covariance at point {self.same + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} "
+                f"of k(s, s) there, at least {_RESOLVED:g} needed. Give the point a greater variance, or the "
+                f"primitive a lambda_covariance of at least {enough:.3g}."
+            )
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
         """The lower Cholesky factor (N O, N O) of K (x) I + lambda Sigma."""
@@ -116,14 +141,14 @@ class Dense(Immutable):
         """The rows of K (x) I + lambda Sigma that the base does not share: ((N - same) O, N O)."""
         kernel, o = self.hyperparameters.kernel, self.hyperparameters.outputs
         c, d, same = kernel.channels, self.hyperparameters.channel_outputs, self.same
-        inputs, count, changed = self.database.inputs, len(self.database), len(self.database) - same
+        points, count, changed = self.database.functionals, len(self.database), len(self.database) - same
         rows = np.zeros((changed, c, d, count, c, d))
-        k = kernel(inputs[same:], inputs).reshape(changed, c, count, c)
+        k = between(kernel, points.take(slice(same, None)), points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
-        points = np.arange(changed)
+        diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        blocks[points, :, points + same, :] += penalty * self.database.reference.covariance[same:]
+        blocks[diagonal, :, diagonal + same, :] += penalty * self.database.reference.covariance[same:]
         return rows.reshape(changed * o, count * o)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, numbers
+from kmp.checks import Array, check_kind, numbers
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
 
@@ -17,7 +17,7 @@ _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance 
 _MACHINE = float(np.finfo(np.float64).eps)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gaussians(Immutable):
     """N normal distributions over O outputs: mean (N, O) [unit], covariance (N, O, O) [unit^2].
 
@@ -44,6 +44,17 @@ class Gaussians(Immutable):
         """O, the number of dimensions."""
         return int(self.mean.shape[1])
 
+    def __getitem__(self, index: int | slice | NDArray[Any] | Sequence[int]) -> Gaussians:
+        """Some of them, as NumPy would choose: one too is a `Gaussians`, of N = 1.
+
+        Raises IndexError beyond the last.
+        """
+        chosen = np.arange(len(self))[index]
+        return self.take(np.atleast_1d(chosen))
+
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self)} over {self.outputs} outputs)"
+
     def take(self, index: NDArray[Any] | slice) -> Gaussians:
         """The chosen distributions, in the index's order. Raises IndexError beyond the last."""
         return unchecked(self.mean[index].copy(), self.covariance[index].copy())
@@ -65,6 +76,7 @@ class Gaussians(Immutable):
         """
         factors = (self, *others)
         for other in others:
+            check_gaussians("product", other)
             if other.mean.shape != self.mean.shape:
                 raise ValueError(f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed.")
         precisions = [np.linalg.inv(one.covariance) for one in factors]
@@ -91,8 +103,14 @@ def fused_mean(covariance: Array, precisions: Sequence[NDArray[Any]], factors: S
     return np.asarray((covariance @ np.sum(pulls, axis=0))[:, :, 0])
 
 
+def check_gaussians(name: str, value: object) -> None:
+    """Raises ValueError unless the value is `Gaussians`."""
+    check_kind(name, value, Gaussians, "Gaussians(mean (N, O), covariance (N, O, O))")
+
+
 def check_pairs(inputs: Array, points: Gaussians, outputs: int) -> None:
     """Raises ValueError unless there is one normal over that many outputs for each input (N, I)."""
+    check_gaussians("points", points)
     if points.mean.shape != (len(inputs), outputs):
         n, given = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
         raise ValueError(f"{given} given for {n} inputs; {n} over {outputs} needed.")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, numbers, positive
+from kmp.checks import Array, numbers, positive, whole
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
@@ -20,7 +20,7 @@ _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture(Immutable):
     """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l), K components over I + O dimensions. Read-only.
 
@@ -31,6 +31,9 @@ class GaussianMixture(Immutable):
     weights: Array
     means: Array
     covariances: Array
+
+    def __repr__(self) -> str:
+        return f"GaussianMixture({len(self.weights)} components over {self.means.shape[1]} dimensions)"
 
     def __post_init__(self) -> None:
         weights = numbers("weights", self.weights, "K")
@@ -55,8 +58,7 @@ class GaussianMixture(Immutable):
         """
         data = numbers("samples", samples, "M", "I+O")
         positive("regularization", regularization)
-        if components < 1:
-            raise ValueError(f"components is {components}, and must be at least 1.")
+        whole("components", components)
         if len(data) < components:
             given = f"{len(data)} samples given for {components} components"
             raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
@@ -109,8 +111,7 @@ class GaussianMixture(Immutable):
 
         Raises ValueError if the count is below 1, or no output is left.
         """
-        if count < 1:
-            raise ValueError(f"count is {count}, and must be at least 1.")
+        whole("count", count)
         i = self._checked_dimensions(dimensions)
         random = np.random.default_rng(seed)
         component = random.choice(len(self.weights), size=count, p=self.weights / self.weights.sum())

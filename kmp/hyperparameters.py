@@ -12,7 +12,7 @@ from kmp.immutable import Immutable
 from kmp.kernel import Kernel
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Hyperparameters(Immutable):
     """The parameters of the costs: equation (4) for the mean, IJRR 2019 for the covariance."""
 
@@ -33,6 +33,8 @@ class Hyperparameters(Immutable):
         outputs: int,
     ) -> Hyperparameters:
         """The parameters, or their defaults. Raises ValueError if they do not go with I and O."""
+        if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
+            raise ValueError(f"kernel: {kernel!r} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
         kernel.check(inputs, outputs)
         penalty = positive("lambda_mean", lambda_mean)
         other = penalty if lambda_covariance is None else positive("lambda_covariance", lambda_covariance)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+_SHOWN = 3  # of a tuple
 _Some = TypeVar("_Some", bound=NDArray[Any])
 
 
@@ -23,6 +24,15 @@ class Immutable:
     _not_pickled: ClassVar[frozenset[str]] = frozenset()
     """Cached properties that a pickle leaves out: large, and made again when asked for."""
 
+    def __repr__(self) -> str:
+        """The fields in one line, arrays by their shapes."""
+        fields = (f"{name}={_short(value)}" for name, value in self.__dict__.items() if name in self._fields())
+        return f"{type(self).__name__}({', '.join(fields)})"
+
+    @classmethod
+    def _fields(cls) -> tuple[str, ...]:
+        return tuple(getattr(cls, "__dataclass_fields__", ()))
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in self._not_pickled}
 
@@ -35,6 +45,14 @@ class Immutable:
         other = copy.copy(self)
         other.__dict__.update(known)
         return other
+
+
+def _short(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"array{value.shape}"
+    if isinstance(value, tuple) and len(value) > _SHOWN:
+        return f"({len(value)} of {type(value[0]).__name__})"
+    return repr(value)
 
 
 def _freeze(value: object) -> None:

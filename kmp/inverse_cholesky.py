@@ -14,7 +14,7 @@ from kmp.immutable import Immutable, frozen
 _BANDS = 4  # with 4, five eighths of the square are kept
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InverseCholeskyFactor(Immutable):
     """L^-1 of a lower triangular L (n D, n D), for products L^-1 (x (x) I) with I of size D.
 

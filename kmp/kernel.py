@@ -2,7 +2,8 @@
 
 A kernel has C channels: 1 where the outputs are values, 2 where they are a value and its rate. Rows
 and columns of its matrices are (point, channel), the channel running faster, so that the O = C D
-outputs share each entry D times.
+outputs share each entry D times. A point may also stand for the derivative along a direction: its
+row is the kernel derived.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from functools import cached_property
 from typing import ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from kmp.checks import Array, numbers, positive
+from kmp.functionals import Derivatives, Functionals
 from kmp.immutable import Immutable, frozen
 
 
@@ -23,7 +26,8 @@ class Kernel(Protocol):
 
     `values`, `row`, `jacobian` and `curvature` serve one query s, where microseconds count. They
     are functions of arrays alone, in the coordinates x = stretch * s, in which one scale serves all
-    inputs: of the offsets x - x_r (R, I) from the centres, and of the values (R,) there.
+    inputs: of the offsets x - x_r (R, I) from the centres, of the values (R,) there, and of which
+    centres stand for derivatives.
     """
 
     @property
@@ -35,6 +39,10 @@ class Kernel(Protocol):
         """C."""
 
     @property
+    def period(self) -> float | None:
+        """After which inputs are the same again [unit of the inputs]; None where none are."""
+
+    @property
     def prior_variance(self) -> Array:
         """k(s, s) (C, C), the same at every input."""
 
@@ -44,27 +52,54 @@ class Kernel(Protocol):
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         """The scale, and the stretch (I,) of each input."""
 
-    def __call__(self, a: Array, b: Array) -> Array:
-        """k(a, b) for every pair: (A, I), (B, I) -> (A C, B C)."""
+    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
+        """k(a, b) for every pair: (A, I), (B, I) -> (A C, B C).
+
+        Derived by a along directions (A, I), by b along (B, I), where a direction is not zero.
+        """
+
+    def variances(self, along: Array) -> Array:
+        """The diagonals (N, C) of k of functionals with itself, for directions (N, I)."""
 
     @staticmethod
     def values(offsets: Array, scale: float) -> Array:
-        """exp(-scale |x - x_r|^2): (R,)."""
+        """k of values (R,), of the distance alone."""
 
     @staticmethod
-    def row(offsets: Array, values: Array, scale: float) -> Array:
+    def row(offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None) -> Array:
         """k(s, s_r): (R,) where C is 1, else (C, R C)."""
 
     @staticmethod
-    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
+    def jacobian(
+        offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+    ) -> Array:
         """d/dx of sum_r k(s, s_r) w_r, with the weights' rows (D, R C): (O, I)."""
 
     @staticmethod
-    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
+    def curvature(
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weights: Array,
+        direction: Array,
+        derivatives: Derivatives | None = None,
+    ) -> Array:
         """d^2/dt^2 of that sum at x + t v for t = 0, with v (I,) and the weights (R C, D): (O,)."""
 
 
-@dataclass(frozen=True, eq=False)
+def between(kernel: Kernel, a: Functionals, b: Functionals) -> Array:
+    """k of every pair of functionals: (A C, B C)."""
+    return kernel(a.inputs, b.inputs, a.directions, b.directions)
+
+
+def variances(kernel: Kernel, functionals: Functionals) -> Array:
+    """k of each functional with itself: the diagonals (N, C)."""
+    if functionals.directions is None:
+        return np.broadcast_to(np.diagonal(kernel.prior_variance), (len(functionals), kernel.channels))
+    return kernel.variances(functionals.directions)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianKernel(Immutable):
     """k(s, s') = exp(-ell |s - s'|^2), `ell` in 1 / (unit of the inputs)^2. The paper, section III.
 
@@ -73,11 +108,12 @@ class GaussianKernel(Immutable):
     """
 
     channels: ClassVar[int] = 1
+    period: ClassVar[None] = None
     ell: float | Array
 
     def __post_init__(self) -> None:
         if np.ndim(self.ell) == 0:
-            object.__setattr__(self, "ell", positive("ell", float(self.ell)))
+            object.__setattr__(self, "ell", positive("ell", self.ell))
             return
         ell = numbers("ell", self.ell, "I")
         for i, value in enumerate(ell):
@@ -86,6 +122,9 @@ class GaussianKernel(Immutable):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, GaussianKernel) and np.array_equal(self.ell, other.ell)
+
+    def __repr__(self) -> str:
+        return f"GaussianKernel(ell={np.asarray(self.ell).tolist()})"
 
     def __hash__(self) -> int:
         return hash(np.asarray(self.ell).tobytes())
@@ -104,9 +143,28 @@ class GaussianKernel(Immutable):
             return 1.0, frozen(np.sqrt(self.ell))
         return float(self.ell), frozen(np.ones(inputs))
 
-    def __call__(self, a: Array, b: Array) -> Array:
+    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
         scale, stretch = self.coordinates(a.shape[1])
-        return np.exp(-scale * cdist(a * stretch, b * stretch, "sqeuclidean"))
+        x, y = a * stretch, b * stretch
+        k = np.exp(-scale * cdist(x, y, "sqeuclidean"))
+        if along_a is None and along_b is None:
+            return k
+        i, u = directed(along_a, stretch)
+        j, v = directed(along_b, stretch)
+        origin = y[:1].sum(axis=0)  # what is subtracted from each other should be small
+        x, y = x - origin, y - origin
+        left = 2 * scale * (u @ y.T - np.vecdot(x[i], u)[:, None])  # (I', B)
+        right = 2 * scale * (x @ v.T - np.vecdot(y[j], v))  # (A, J')
+        both = k[np.ix_(i, j)] * (left[:, j] * right[i] + 2 * scale * (u @ v.T))
+        k[i] *= left
+        k[:, j] *= right
+        k[np.ix_(i, j)] = both
+        return k
+
+    def variances(self, along: Array) -> Array:
+        scale, stretch = self.coordinates(along.shape[1])
+        squares = 2 * scale * ((along * stretch) ** 2).sum(axis=1, keepdims=True)
+        return np.where(squares > 0, squares, 1.0)
 
     @staticmethod
     def values(offsets: Array, scale: float) -> Array:
@@ -115,82 +173,45 @@ class GaussianKernel(Immutable):
         return np.asarray(np.exp(value, value))
 
     @staticmethod
-    def row(offsets: Array, values: Array, scale: float) -> Array:
-        return values
+    def row(offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None) -> Array:
+        if derivatives is None:
+            return values
+        row, (rows, along) = values.copy(), derivatives
+        row[rows] *= 2 * scale * np.vecdot(offsets[rows], along)
+        return row
 
     @staticmethod
-    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
-        return np.asarray((weight_rows * (values * (-2 * scale))) @ offsets)
+    def jacobian(
+        offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+    ) -> Array:
+        if derivatives is None:
+            return np.asarray((weight_rows * (values * (-2 * scale))) @ offsets)
+        row, (rows, along) = GaussianKernel.row(offsets, values, scale, derivatives), derivatives
+        through = (weight_rows[:, rows] * (values[rows] * (2 * scale))) @ along
+        return np.asarray((weight_rows * (row * (-2 * scale))) @ offsets + through)
 
     @staticmethod
-    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
+    def curvature(
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weights: Array,
+        direction: Array,
+        derivatives: Derivatives | None = None,
+    ) -> Array:
         slope = (2 * scale) * (offsets @ direction)
-        return np.asarray((values * (slope * slope - 2 * scale * float(direction @ direction))) @ weights)
+        bend = slope * slope - 2 * scale * float(direction @ direction)
+        if derivatives is None:
+            return np.asarray((values * bend) @ weights)
+        bend *= GaussianKernel.row(offsets, values, scale, derivatives)
+        rows, along = derivatives
+        bend[rows] -= values[rows] * (4 * scale) * (along @ direction) * slope[rows]
+        return np.asarray(bend @ weights)
 
 
-@dataclass(frozen=True)
-class VelocityKernel(Immutable):
-    """The kernel of skills over time whose 2 D outputs are a value and its rate: [xi, dxi/dt].
-
-    k(t, t') and its derivatives, exact, so that a via-point can fix the velocity too (IJRR 2019, on
-    time-driven trajectories). With r = t - t' the block of two points is
-    [[k, 2 ell r k], [-2 ell r k, (2 ell - 4 ell^2 r^2) k]]; `ell` in 1 / (unit of time)^2. It
-    takes one input. The methods are those of `Kernel`. Raises ValueError unless ell is finite and
-    above 0.
-    """
-
-    channels: ClassVar[int] = 2
-    ell: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "ell", positive("ell", self.ell))
-
-    @cached_property
-    def prior_variance(self) -> Array:
-        return frozen(np.diag([1.0, 2 * self.ell]))
-
-    def check(self, inputs: int, outputs: int) -> None:
-        """Raises ValueError unless there is one input, and there are as many rates as values."""
-        if inputs != 1 or outputs % 2:
-            raise ValueError(
-                f"{inputs} inputs and {outputs} outputs given; value and rate over time need "
-                "1 input and an even number of outputs: the values, then their rates."
-            )
-
-    def coordinates(self, inputs: int) -> tuple[float, Array]:
-        return self.ell, frozen(np.ones(inputs))
-
-    def __call__(self, a: Array, b: Array) -> Array:
-        r = a - b.T
-        blocks = _rate_blocks(r, np.exp(-self.ell * r * r), self.ell, order=0)
-        return blocks.transpose(0, 2, 1, 3).reshape(2 * len(a), 2 * len(b))
-
-    @staticmethod
-    def values(offsets: Array, scale: float) -> Array:
-        r = offsets[:, 0]
-        return np.asarray(np.exp(-scale * r * r))
-
-    @staticmethod
-    def row(offsets: Array, values: Array, scale: float, order: int = 0) -> Array:
-        """The row, or its derivative of that order by t."""
-        blocks = _rate_blocks(offsets[:, 0], values, scale, order)
-        return np.ascontiguousarray(blocks.transpose(1, 0, 2)).reshape(2, -1)
-
-    @staticmethod
-    def jacobian(offsets: Array, values: Array, scale: float, weight_rows: Array) -> Array:
-        return np.asarray((VelocityKernel.row(offsets, values, scale, 1) @ weight_rows.T).reshape(-1, 1))
-
-    @staticmethod
-    def curvature(offsets: Array, values: Array, scale: float, weights: Array, direction: Array) -> Array:
-        row = VelocityKernel.row(offsets, values, scale, 2)
-        return np.asarray((row @ weights).ravel() * float(direction @ direction))
-
-
-def _rate_blocks(r: Array, values: Array, ell: float, order: int) -> Array:
-    """The derivative of that order by t of the kernel's blocks at r = t - t' (...): (..., 2, 2)."""
-    # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
-    k = [values, -2 * ell * r * values]
-    for n in range(1, order + 2):
-        k.append(-2 * ell * (r * k[n] + n * k[n - 1]))
-    a, b, c = k[order : order + 3]
-    return np.stack([a, -b, b, -c], axis=-1).reshape(*r.shape, 2, 2)
+def directed(along: Array | None, stretch: Array) -> tuple[NDArray[np.intp], Array]:
+    """Which of the directions are not zero, and these in the kernel's coordinates (I', I)."""
+    if along is None:
+        return np.empty(0, dtype=np.intp), np.empty((0, len(stretch)))
+    rows = np.flatnonzero(along.any(axis=1))
+    return rows, along[rows] * stretch

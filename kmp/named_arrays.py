@@ -9,20 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.checks import numbers
+from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database
 from kmp.dense import Dense
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
-from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
+from kmp.kernel import GaussianKernel, Kernel
 from kmp.low_rank import LowRank
 from kmp.solution import Solution
+from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _NAMES = (
     *("base_inputs", "base_mean", "base_covariance", "base_weights"),
     *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
     *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
 )
+_OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
 
 
@@ -44,8 +48,18 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
         "lambda_covariance": np.array(parameters.lambda_covariance),
         "prior_mean": parameters.prior_mean,
     }
+    if parameters.kernel.period is not None:
+        arrays["period"] = np.array(parameters.kernel.period)
     if parameters.kernel.channels > 1:
         arrays["channels"] = np.array(parameters.kernel.channels)
+    for name, functionals in (("base", base.database.functionals), ("via", changes.functionals)):
+        if functionals.directions is not None:
+            arrays[f"{name}_directions"] = functionals.directions
+    if isinstance(solution, Constrained):
+        constraints = solution.constraints
+        arrays |= {name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS}
+        if constraints.directions is not None:
+            arrays["constraint_directions"] = constraints.directions
     return arrays | base.to_arrays()
 
 
@@ -56,9 +70,20 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, 
         raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
     base = _base(arrays)
     changes = _changes(arrays, base.database)
-    if len(changes.inputs) == 0:
-        return base, changes, base
-    return base, changes, _weighted(base.adapted(changes), "weights", arrays)
+    solution = base.adapted(changes) if len(changes.inputs) else base
+    if any(name in arrays for name in _OF_CONSTRAINTS):
+        solution = _constrained(solution, arrays)
+    return base, changes, solution if solution is base else _weighted(solution, "weights", arrays)
+
+
+def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
+    if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
+        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}.")
+    if not isinstance(solution, Dense):
+        raise ValueError("constraints: given for a low rank solution, a dense one needed.")
+    inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
+    given = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
+    return Constrained(solution, given)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
@@ -73,7 +98,7 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
         inputs=inputs.shape[1],
         outputs=reference.outputs,
     )
-    database = Database(inputs, reference)
+    database = Database(Functionals.checked(inputs, arrays.get("base_directions")), reference)
     low_rank = "pivots" in arrays
     solution = LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
     return _weighted(solution, "base_weights", arrays)
@@ -87,7 +112,7 @@ def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
     n = len(database)
     if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
         raise ValueError(f"replaced: {replaced} given, ascending indices of the {n} base points needed.")
-    return Changes(frozen(replaced), via, points)
+    return Changes(frozen(replaced), Functionals.checked(via, arrays.get("via_directions")), points)
 
 
 def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
@@ -96,6 +121,8 @@ def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]])
 
 
 def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
+    if "period" in arrays:
+        return PeriodicKernel(float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"])))
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
     if int(arrays["channels"]) != 2:

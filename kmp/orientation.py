@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers
+from kmp.checks import Array, check_kind, numbers, real
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
@@ -86,7 +86,7 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
     return np.asarray(2 * (np.eye(3) + first * cross + second * (cross @ cross)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class OrientationKMP(Immutable):
     """A skill whose output is an orientation: a primitive of zeta, over time with its rate.
 
@@ -101,6 +101,7 @@ class OrientationKMP(Immutable):
     """(4,) q_a, x y z w."""
 
     def __post_init__(self) -> None:
+        check_kind("primitive", self.primitive, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
         wanted = 3 * self.primitive.kernel.channels
         if (outputs := self.primitive.outputs) != wanted:
             raise ValueError(f"primitive: {outputs} outputs given, {wanted} needed for an orientation.")
@@ -127,7 +128,7 @@ class OrientationKMP(Immutable):
         Over time the velocity of the input is 1. Raises ValueError if a shape is another or a
         number is not finite.
         """
-        s = np.asarray(query, dtype=np.float64)
+        s = real("query", query)
         moving = self.primitive.predict_motion(s, velocity, np.zeros_like(s), covariance=False)
         return np.asarray(rotation_per_zeta(moving.mean[:3]) @ moving.velocity[:3])
 
@@ -194,6 +195,6 @@ def _unit(name: str, quaternions: ArrayLike) -> Array:
 
 
 def _each(name: str, covariance: ArrayLike, count: int) -> Array:
-    given = np.asarray(covariance, dtype=np.float64)
+    given = real(name, covariance)
     each = np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given
     return numbers(name, each, count, 3, 3)

@@ -5,48 +5,31 @@ The paper, sections II-B and II-C.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
-from kmp.checks import Array, RankReached, check_finite, check_shape, numbers, positive
-from kmp.compiled_query import CompiledQuery
+from kmp.checks import Array, check_kind, numbers, positive, real, whole
+from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
-from kmp.gaussians import Gaussians, check_pairs, unchecked
+from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
+from kmp.immutable import frozen
 from kmp.kernel import Kernel
-from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
-from kmp.low_rank import RANK, TOLERANCE, Features, LowRank
-from kmp.query import MotionPrediction, Query
-from kmp.solution import Solution, mean_at
-
-_BATCH = 256  # queries at once, which bounds the memory of `predict`
-_SMALL = 1500  # N O up to which the dense solution is the faster one
-_LARGE = 6000  # N O beyond which the dense solution takes seconds and 300 MB
-_ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever was asked for
-_RESIDUAL = 1e-10  # the same, for the uncertainty that is distance from the data
+from kmp.low_rank import RANK, TOLERANCE
+from kmp.predictor import Predictor
+from kmp.solution import Solution, mean_of
+from kmp.solving import solved
 
 
-@dataclass(frozen=True, eq=False)
-class Uncertainty(Immutable):
-    """The covariance of `predict` as the sum of two, each (M, O, O) [unit of the outputs^2]."""
-
-    variability: Array
-    """How much the demonstrations differ from each other there."""
-    distance: Array
-    """How far the query is from the data: what would remain if each reference point were exact."""
-
-
-@dataclass(frozen=True, eq=False)
-class KMP(Immutable):
+@dataclass(frozen=True, eq=False, repr=False)
+class KMP(Predictor):
     """A skill: a reference database, the via-points in it, and its solution.
 
     Made by `fit`, `adapt` and `from_arrays`. N points in all, I inputs, O outputs. Immutable, so
@@ -58,6 +41,11 @@ class KMP(Immutable):
     _changes: Changes
     _base: KMP | None = None
 
+    def __repr__(self) -> str:
+        count, inputs = self.inputs.shape
+        of = f"{count} points" + (f", {len(self.via_inputs)} of them taught" if len(self.via_inputs) else "")
+        return f"KMP({of}: {inputs} inputs, {self.outputs} outputs, {self.kernel}, {self.representation})"
+
     @classmethod
     def fit(
         cls,
@@ -68,6 +56,7 @@ class KMP(Immutable):
         lambda_mean: float,
         lambda_covariance: float | None = None,
         prior_mean: ArrayLike | None = None,
+        directions: ArrayLike | None = None,
         representation: Literal["auto", "dense", "low_rank"] = "auto",
         rank: int = RANK,
         rank_tolerance: float = TOLERANCE,
@@ -77,6 +66,9 @@ class KMP(Immutable):
         `prior_mean` (O,) [unit of the outputs] is what the mean returns to far from the inputs, the
         origin by default. `lambda_covariance` None is `lambda_mean`; another value costs a second
         factor.
+
+        Where a row of `directions` (N, I) [unit of the inputs] is not zero, that normal is of the
+        output's derivative along it [unit of the outputs], dxi/ds times the direction.
 
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
         (4) on at most `rank` features of the kernel, which leave a share of at most
@@ -90,6 +82,7 @@ class KMP(Immutable):
         s = numbers("inputs", inputs, "N", "I")
         if len(s) == 0:
             raise ValueError("inputs: no reference point given, at least 1 needed.")
+        check_gaussians("reference", reference)
         check_pairs(s, reference, reference.outputs)
         parameters = Hyperparameters.checked(
             kernel,
@@ -101,105 +94,31 @@ class KMP(Immutable):
         )
         if representation not in {"auto", "dense", "low_rank"}:
             raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
-        if rank < 1:
-            raise ValueError(f"rank is {rank}, and must be at least 1.")
+        whole("rank", rank)
         positive("rank_tolerance", rank_tolerance)
-        database = Database(s, reference)
-        return cls(_solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
+        database = Database(Functionals.checked(s, directions), reference)
+        return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
 
-    def mean(self, queries: ArrayLike) -> Array:
-        """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
-
-        One query alone may differ by rounding from the same in a set. Raises ValueError if the
-        shape is another or a number is not finite.
-        """
-        s = self._checked_many(queries)
-        if len(s) == 1:
-            return self._query.mean(self._query.row(s[0]))[None]
-        return mean_at(self._solution, s)
-
-    def predict(self, queries: ArrayLike) -> Gaussians:
-        """xi(s) with its covariance at queries (M, I): M normals.
-
-        The mean is that of `mean`, bit for bit. Covariance: N / lambda_c (k(s, s) I - k (K +
-        lambda_c Sigma)^-1 k^T), IJRR 2019. The first prediction inverts the triangular factor: make
-        one before there is a deadline. Raises ValueError if the shape is another, a number is not
-        finite, or what was stored cannot be solved here.
-        """
-        s = self._checked_many(queries)
-        if len(s) == 1:
-            row = self._query.row(s[0])
-            return unchecked(self._query.mean(row)[None], self._query.covariance(row.kernel)[None])
-        solution = self._solution
-        batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
-        posterior = [solution.posterior_covariance(self.kernel(one, solution.centres)) for one in batches]
-        stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
-        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self._query.covariance_scale)
-
-    def predict_motion(
+    def adapt(
         self,
-        query: ArrayLike,
-        velocity: ArrayLike,
-        acceleration: ArrayLike,
+        inputs: ArrayLike,
+        desired: Gaussians,
         *,
-        covariance: bool = True,
-    ) -> MotionPrediction:
-        """xi at one query (I,), and how it moves with the input: all from one kernel row.
-
-        The input's velocity (I,) [unit of the inputs / s] and its acceleration (I,) [unit of the
-        inputs / s^2] give those of the output. The numbers are those of `predict`, `jacobian` and
-        `curvature`: but for rounding where Numba is installed, whose compiled loops then serve, bit
-        for bit where it is not. The covariance takes longer than all else, and can be left out.
-
-        Raises ValueError if a shape is another or a number is not finite.
-        """
-        s, v, a = (np.asarray(x, dtype=np.float64) for x in (query, velocity, acceleration))
-        compiled = self._compiled_query
-        if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
-            found = compiled.motion(s, v, a, covariance=covariance)
-            if found is not None:
-                return found
-        checked = self._checked("query", s), self._checked("velocity", v), self._checked("acceleration", a)
-        return self._query.motion(*checked, covariance=covariance)
-
-    def jacobian(self, query: ArrayLike) -> Array:
-        """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
-
-        Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
-        """
-        return self._query.jacobian(self._query.row(self._checked("query", query)))
-
-    def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
-        """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
-
-        Equation (8), derived twice. Where v is the velocity of the input [unit of the inputs / s],
-        this is the part of the output's acceleration [unit of the outputs / s^2] that the velocity
-        makes. Raises ValueError if a shape is another or a number is not finite.
-        """
-        s, v = self._checked("query", query), self._checked("direction", direction)
-        return self._query.curvature(self._query.row(s), v)
-
-    def uncertainty(self, queries: ArrayLike) -> Uncertainty:
-        """The covariance at queries (M, I), split: how demonstrations vary, how far they are.
-
-        The second is what IJRR 2019's covariance would be with Sigma = 0. Raises ValueError if the
-        shape is another or a number is not finite.
-        """
-        s = self._checked_many(queries)
-        total = self.predict(s).covariance
-        c = self.kernel.channels
-        z = self._spanned(s).T.reshape(len(s), c, -1)
-        residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
-        distance = nearest_positive_semidefinite(residual) * self._query.covariance_scale
-        return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
-
-    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> KMP:
+        tolerance: float,
+        directions: ArrayLike | None = None,
+    ) -> KMP:
         """A new primitive that also goes through desired points: inputs (V, I), V normals.
 
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
         point of the *base's* reference takes the place of its nearest one (of all, where several
         are equally near); any other is inserted. The order of the desired points does not matter.
-        Earlier via-points stay: to be rid of them, adapt `base` anew.
+        Earlier via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the
+        base's, so that teaching here changes nothing elsewhere.
+
+        Where a row of `directions` (V, I) [unit of the inputs] is not zero, that normal is of the
+        output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
+        of the output, where the direction is that of the input. It is inserted, and replaces
+        nothing.
 
         A desired point that is then missed by more than 3 of its deviations, and by more than 0.001
         (1 mm, where the unit is the metre), is named in a `ViaPointMissed` warning.
@@ -208,33 +127,75 @@ class KMP(Immutable):
         or the equations cannot be solved to working precision.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
+        check_gaussians("desired", desired)
         check_pairs(via, desired, self.outputs)
-        if not tolerance >= 0:
+        if not real("tolerance", tolerance) >= 0:
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
-        if len(via) == 0:
-            return self
-        before = self._changes
-        changes = Changes(
-            frozen(np.union1d(before.replaced, self.base._solution.database.nearest(via, tolerance))),
-            frozen(np.concatenate([before.inputs, via])),
-            Gaussians.concatenated([before.points, desired]),
-        )
-        adapted = KMP(self.base._solution.adapted(changes).solved(), changes, self.base)
-        warn_of_missed(desired, adapted.mean(via), self.kernel.channels)
+        points = Functionals.checked(via, directions)
+        adapted = self._through(points, desired, tolerance)
+        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
         return adapted
+
+    def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
+        """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
+
+        `deviation` [unit of the outputs / unit of the inputs] is how sure each entry is. So one
+        via-point says what lies about it: the output follows an input there (ones), or does not
+        heed it (zeros). What is not known of a Jacobian is left out by `adapt` along `directions`.
+
+        Raises ValueError as `adapt` does.
+        """
+        via = numbers("inputs", inputs, "V", self._dimensions)
+        given = numbers("jacobians", jacobians, len(via), self.outputs, self._dimensions)
+        axes = np.tile(np.eye(self._dimensions), (len(via), 1))
+        means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
+        variance = positive("deviation", deviation) ** 2
+        desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
+        points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
+        adapted = self._through(points, desired, 0.0)
+        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
+        return adapted
+
+    def constrained(self, constraints: LinearConstraints) -> KMP:
+        """A new primitive whose mean obeys these constraints too, to 1e-9. LC-KMP.
+
+        They hold at the inputs that they are given at; between them the mean may cross a little, so
+        give them closer than the kernel is long. Later via-points obey them, and `base` is without.
+        The covariance is as without. For the dense representation.
+
+        Raises ValueError if shapes do not agree, or the constraints cannot be met together.
+        """
+        check_kind("constraints", constraints, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
+        for name, given, needed in (
+            ("inputs", constraints.inputs.shape[1], self._dimensions),
+            ("outputs", constraints.normals.shape[1], self.outputs),
+        ):
+            if given != needed:
+                raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
+        solution: Solution = self._solution
+        if isinstance(solution, Constrained):
+            constraints = solution.constraints.joined(constraints)
+            solution = solution.solution
+        if not isinstance(solution, Dense):
+            raise ValueError('constraints: representation "low_rank" given, "dense" needed; fit the primitive so.')
+        return KMP(Constrained(solution, constraints).solved(), self._changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        inputs = self.base.inputs
-        check_pairs(inputs, reference, self.outputs)
-        database, parameters = Database(inputs, reference), self._solution.hyperparameters
-        fitted = KMP(_solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
+        points = self.base._solution.database.functionals
+        check_pairs(points.inputs, reference, self.outputs)
+        database, parameters = Database(points, reference), self._solution.hyperparameters
+        fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         if self is self.base:
             return fitted
-        return KMP(fitted._solution.adapted(self._changes).solved(), self._changes, fitted)
+        changed: Solution = fitted._solution.adapted(self._changes) if len(self.via_inputs) else fitted._solution
+        before: Solution = self._solution
+        if isinstance(before, Constrained) and isinstance(changed, Dense):
+            changed = Constrained(changed, before.constraints)
+        return KMP(changed.solved(), self._changes, fitted)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
@@ -252,25 +213,21 @@ class KMP(Immutable):
         unadapted = cls(base, base.database.unchanged())
         return unadapted if solution is base else cls(solution, changes, unadapted)
 
-    @property
-    def kernel(self) -> Kernel:
-        """The kernel k."""
-        return self._solution.hyperparameters.kernel
+    def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
+        if len(points) == 0:
+            return self
+        before = self._changes
+        nearest = self.base._solution.database.nearest(points, tolerance, self.kernel.period)
+        changes = Changes(
+            frozen(np.union1d(before.replaced, nearest)),
+            Functionals.concatenated([before.functionals, points]),
+            Gaussians.concatenated([before.points, desired]),
+        )
+        return KMP(self._solution.adapted(changes).solved(), changes, self.base)
 
     @property
-    def lambda_mean(self) -> float:
-        """lambda of equation (9) [1 / (unit of the outputs)^2]."""
-        return self._solution.hyperparameters.lambda_mean
-
-    @property
-    def lambda_covariance(self) -> float:
-        """lambda of the covariance [1 / (unit of the outputs)^2]."""
-        return self._solution.hyperparameters.lambda_covariance
-
-    @property
-    def prior_mean(self) -> Array:
-        """(O,) [unit of the outputs] what the mean returns to far from the inputs."""
-        return self._solution.hyperparameters.prior_mean
+    def _count(self) -> int:
+        return len(self.base.inputs)
 
     @property
     def base(self) -> KMP:
@@ -293,88 +250,11 @@ class KMP(Immutable):
         return self._changes.inputs
 
     @property
+    def via_directions(self) -> Array:
+        """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
+        return self._changes.functionals.along
+
+    @property
     def via_points(self) -> Gaussians:
         """The V via-points."""
         return self._changes.points
-
-    @property
-    def outputs(self) -> int:
-        """O, the number of outputs."""
-        return self._solution.hyperparameters.outputs
-
-    @property
-    def representation(self) -> Literal["dense", "low_rank"]:
-        """How the primitive is solved."""
-        return self._solution.representation
-
-    @property
-    def weights(self) -> Array:
-        """Those of equation (8): alpha (N, O) of equation (9), or those of the low rank centres."""
-        return self._solution.weights
-
-    @property
-    def error_bound(self) -> float:
-        """How far the mean can be from equation (9)'s at the points [unit of the outputs].
-
-        An upper bound: 0 for the dense solution; for the low rank one rigorous but for rounding,
-        and pessimistic by one to three orders.
-        """
-        return self._solution.error_bound
-
-    @cached_property
-    def _query(self) -> Query:
-        count = len(self.base.inputs) - len(self._changes.replaced) + len(self.via_inputs)
-        return Query.of(self._solution, count)
-
-    @cached_property
-    def _compiled_query(self) -> CompiledQuery | None:
-        return CompiledQuery.of(self._query)
-
-    @cached_property
-    def _spanned(self) -> Features:
-        centres = self._solution.centres
-        return Features.of(self.kernel, centres, rank=len(centres), tolerance=_RESIDUAL)[0]
-
-    @cached_property
-    def _dimensions(self) -> int:
-        return int(self._changes.inputs.shape[1])
-
-    def _checked(self, name: str, value: ArrayLike) -> Array:
-        s = np.asarray(value, dtype=np.float64)
-        check_shape(name, s, self._dimensions)
-        check_finite(name, s)
-        return s
-
-    def _checked_many(self, queries: ArrayLike) -> Array:
-        s = np.asarray(queries, dtype=np.float64)
-        if s.ndim != 2 or s.shape[1] != self._dimensions:
-            check_shape("queries", s, "M", self._dimensions)
-        check_finite("queries", s)
-        return s
-
-
-def _solved(
-    parameters: Hyperparameters,
-    database: Database,
-    representation: str,
-    rank: int,
-    tolerance: float,
-) -> Solution:
-    size = database.reference.mean.size
-    if representation == "dense" or (representation == "auto" and size <= _SMALL):
-        return Dense(parameters, database).solved()
-    features, residual = Features.of(parameters.kernel, database.inputs, rank=rank, tolerance=tolerance)
-    reached = len(features.pivots) >= rank
-    enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
-    if representation == "auto" and not enough and size <= _LARGE:
-        return Dense(parameters, database).solved()
-    solution = LowRank.fit(parameters, database, features).solved()
-    if not enough:
-        warnings.warn(
-            f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} was asked for: the mean at them may be off by up to {solution.error_bound:.2g} "
-            "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
-            RankReached,
-            stacklevel=3,
-        )
-    return solution

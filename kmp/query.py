@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kmp.checks import Array
+from kmp.functionals import Derivatives
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel
 from kmp.linear_algebra import nearest_positive_semidefinite
@@ -40,10 +41,10 @@ class KernelRow(NamedTuple):
 
     offsets: Array  # (R, I) x - x_r, in the kernel's coordinates
     values: Array  # (R,) exp(-scale |x - x_r|^2)
-    kernel: Array  # (R,) or (C, R C) k(s, s_r)
+    kernel: Array  # (R,) or (C, R C) k(s, s_r), derived where s_r stands for a derivative
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Query(Immutable):
     """A solution made ready for one query at a time: R centres, C channels, D outputs a channel."""
 
@@ -52,6 +53,7 @@ class Query(Immutable):
     scale: float
     stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
     centres: Array  # (R, I), there
+    derivatives: Derivatives | None  # which of the R are derivatives
     weights: Array  # (R C, D)
     weight_rows: Array  # (D, R C), the same
     prior_mean: Array  # (O,)
@@ -59,7 +61,10 @@ class Query(Immutable):
 
     @classmethod
     def of(cls, solution: Solution, count: int) -> Query:
-        """The solution of N = `count` points, ready. Raises ValueError if it cannot be solved."""
+        """The solution, for a base of N = `count` points, ready.
+
+        Raises ValueError if it cannot be solved.
+        """
         parameters, centres = solution.hyperparameters, solution.centres
         scale, stretch = parameters.kernel.coordinates(centres.shape[1])
         weights = solution.weights.reshape(-1, parameters.channel_outputs)
@@ -69,6 +74,7 @@ class Query(Immutable):
             scale,
             stretch,
             frozen(centres * stretch),
+            solution.functionals.derivatives(stretch),
             weights,
             frozen(np.ascontiguousarray(weights.T)),
             parameters.prior_mean,
@@ -79,7 +85,7 @@ class Query(Immutable):
         """The kernel row of a query (I,)."""
         offsets = query * self.stretch - self.centres
         values = self.kernel.values(offsets, self.scale)
-        return KernelRow(offsets, values, self.kernel.row(offsets, values, self.scale))
+        return KernelRow(offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives))
 
     def mean(self, row: KernelRow) -> Array:
         """xi(s) (O,). Equation (8)."""
@@ -92,11 +98,13 @@ class Query(Immutable):
 
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""
-        return self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows) * self.stretch
+        found = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
+        return found * self.stretch
 
     def curvature(self, row: KernelRow, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""
-        return self.kernel.curvature(row.offsets, row.values, self.scale, self.weights, velocity * self.stretch)
+        direction = velocity * self.stretch
+        return self.kernel.curvature(row.offsets, row.values, self.scale, self.weights, direction, self.derivatives)
 
     def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
         """All of these for a query (I,), and its velocity and acceleration."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers
-from kmp.gaussians import Gaussians, check_pairs, fused_mean
+from kmp.checks import Array, numbers, pair, real
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs, fused_mean
 from kmp.gmm import GaussianMixture
 from kmp.immutable import Immutable
 from kmp.kernel import Kernel
@@ -32,6 +32,8 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
     """
     if len(references) == 0:
         raise ValueError("references: none given, at least 1 needed.")
+    for i, reference in enumerate(references):
+        check_gaussians(f"references[{i}]", reference)
     n, outputs = references[0].mean.shape
     for i, other in enumerate(references):
         if other.mean.shape != (n, outputs):
@@ -45,7 +47,7 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
 
 def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
     """The priorities (L, N) or (L, 1), checked."""
-    given = np.asarray(priorities, dtype=np.float64)
+    given = real("priorities", priorities)
     g = numbers("priorities", given[:, None] if given.ndim == 1 else given, count, "N")
     if g.shape[1] not in {1, n}:
         raise ValueError(f"priorities: shape {given.shape} given, ({count},) or {(count, n)} needed.")
@@ -55,7 +57,7 @@ def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
     return g
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CoordinateFrame(Immutable):
     """Task parameters (A, b): xi = A xi' + b for coordinates xi' in the frame. Read-only.
 
@@ -118,7 +120,7 @@ class CoordinateFrame(Immutable):
         return normals.affine(self.matrix, self.offset)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LocalKMP(Immutable):
     """A skill in F coordinate frames at once: a primitive in each, and where the frames are now.
 
@@ -156,11 +158,12 @@ class LocalKMP(Immutable):
             count = len(demonstrations)
             raise ValueError(f"frames: {counts} given for {count} demonstrations, as many for each needed.")
         where = numbers("inputs", inputs, "N", "I")
+        data = [pair(f"demonstrations[{h}]", one) for h, one in enumerate(demonstrations)]
         primitives = []
         for f in range(counts[0]):
             samples = [
                 np.hstack([numbers("inputs", s, "T", where.shape[1]), frame[f].local(xi)])
-                for (s, xi), frame in zip(demonstrations, frames, strict=True)
+                for (s, xi), frame in zip(data, frames, strict=True)
             ]
             mixture = GaussianMixture.fit(
                 np.concatenate(samples),

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, positive
+from kmp.checks import Array, numbers, pair, positive
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.immutable import Immutable, frozen
-from kmp.kernel import GaussianKernel, Kernel, VelocityKernel
+from kmp.kernel import GaussianKernel, Kernel
 from kmp.primitive import KMP
+from kmp.time_kernels import VelocityKernel
 
 _ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # over twice the variance of the inputs
 _LAMBDAS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # over the mean variance of the reference
@@ -26,7 +27,7 @@ _SWEEPS = 2
 _HELD_OUT = 200  # points of a demonstration that are predicted
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Score(Immutable):
     """How well some hyper-parameters predict a demonstration that was left out."""
 
@@ -40,7 +41,7 @@ class Score(Immutable):
     """[nat] the mean of a point's, None where only the mean was tried."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Learned(Immutable):
     """A primitive, the mixture of its reference, and the scores of all that was tried."""
 
@@ -256,7 +257,8 @@ def _checked(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tupl
     if len(demonstrations) == 0:
         raise ValueError("demonstrations: none given, at least 1 needed.")
     data: list[tuple[Array, Array]] = []
-    for h, (inputs, outputs) in enumerate(demonstrations):
+    for h, demonstration in enumerate(demonstrations):
+        inputs, outputs = pair(f"demonstrations[{h}]", demonstration)
         i, o = (data[0][0].shape[1], data[0][1].shape[1]) if data else ("I", "O")
         s = numbers(f"demonstrations[{h}] inputs", inputs, "T", i)
         data.append((s, numbers(f"demonstrations[{h}] outputs", outputs, len(s), o)))

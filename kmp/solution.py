@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
+from kmp.kernel import between
 
 
 class Solution(Protocol):
@@ -31,8 +33,12 @@ class Solution(Protocol):
         """How the costs are solved."""
 
     @property
+    def functionals(self) -> Functionals:
+        """The R values, and derivatives, that the kernels stand for."""
+
+    @property
     def centres(self) -> Array:
-        """s_r (R, I)."""
+        """s_r (R, I) where they are."""
 
     @property
     def weights(self) -> Array:
@@ -45,8 +51,11 @@ class Solution(Protocol):
     def solved(self) -> Self:
         """This solution, its weights and factors made. Raises ValueError if that fails."""
 
-    def posterior_covariance_one(self, row: Array) -> Array:
-        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C)."""
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C).
+
+        Of M queries together (M O, M O), with k (M C, R C) and `prior` k(s, s) (M C, M C).
+        """
 
     def posterior_covariance(self, rows: Array) -> Array:
         """Those (M, O, O) of the kernel rows (M C, R C) of M queries."""
@@ -63,7 +72,14 @@ class Solution(Protocol):
 
 def mean_at(solution: Solution, queries: Array) -> Array:
     """Equation (8) at queries (M, I): (M, O)."""
+    return mean_of(solution, Functionals(queries))
+
+
+def mean_of(solution: Solution, queries: Functionals) -> Array:
+    """Equation (8) for M queries, derived where a query is a derivative: (M, O)."""
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
-    expansion = parameters.kernel(queries, solution.centres) @ weights
-    return expansion.reshape(len(queries), parameters.outputs) + parameters.prior_mean
+    expansion = (between(parameters.kernel, queries, solution.functionals) @ weights).reshape(-1, parameters.outputs)
+    if queries.directions is None:
+        return np.asarray(expansion + parameters.prior_mean)
+    return np.asarray(expansion + queries.values[:, None] * parameters.prior_mean)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kmp.checks import check_kind
 from kmp.primitive import KMP
+from kmp.value_arrays import KIND, from_arrays, to_arrays
 
 _FORMAT = 1
 
@@ -18,9 +20,16 @@ _FORMAT = 1
 class Stored(NamedTuple):
     """What a file held."""
 
-    primitive: KMP
+    value: Any
+    """A `KMP`, or another value of this package."""
     input_unit: str
     output_unit: str
+
+    @property
+    def primitive(self) -> KMP:
+        """The `KMP`. Raises ValueError if the value is none."""
+        check_kind("the stored value", self.value, KMP, "take `value` for what is none")
+        return cast(KMP, self.value)
 
 
 def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -34,23 +43,24 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
     return sums.hexdigest()
 
 
-def save(path: str | Path, primitive: KMP, *, input_unit: str, output_unit: str) -> None:
-    """Writes the primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
+def save(path: str | Path, value: object, *, input_unit: str, output_unit: str) -> None:
+    """Writes a primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
 
-    The file has this very name. Raises OSError if the file cannot be written.
+    Or any other value of this package. The file has this very name. Raises OSError if the file
+    cannot be written, and ValueError if the value is none of this package.
     """
     units = {
         "kmp_format": np.array(_FORMAT),
         "input_unit": np.array(input_unit),
         "output_unit": np.array(output_unit),
     }
-    arrays: dict[str, Any] = units | primitive.to_arrays()
+    arrays: dict[str, Any] = units | (value.to_arrays() if isinstance(value, KMP) else to_arrays(value))
     with Path(path).open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
 
 def load(path: str | Path) -> Stored:
-    """The primitive and the units that `save` wrote; it predicts the same, bit for bit.
+    """What `save` wrote, and the units; a primitive predicts the same, bit for bit.
 
     Raises OSError if the file cannot be read, and ValueError if it is not one that `save` wrote, or
     was changed since. Files of earlier versions have no checksum, and are taken without.
@@ -67,6 +77,7 @@ def load(path: str | Path) -> Stored:
     if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
         raise ValueError(f"{path}: the numbers are not those that were saved: their checksum is another.")
     try:
-        return Stored(KMP.from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))
+        value = from_arrays(arrays) if KIND in arrays else KMP.from_arrays(arrays)
+        return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -149,6 +149,13 @@ def test_mean_and_covariance_of_one_query_200(benchmark, small):
     compare(benchmark, lambda: small.predict(query), lambda: inverse @ k, 4, "dgemv(1800 x 200)", calls=50)
 
 
+def test_mean_and_covariance_of_one_query_200_beside_numpys_mean(benchmark, small):
+    pytest.importorskip("numba")
+    query = small.inputs[:1].copy()
+    benchmark(small.predict, query)
+    compare(benchmark, lambda: small.predict(query), primitive_query(small), 8, "NumPy's five calls", calls=100)
+
+
 def test_jacobian_200(benchmark, small):
     query = small.inputs[0].copy()
     benchmark(small.jacobian, query)

@@ -12,9 +12,11 @@ from scipy.linalg import lapack
 
 from kmp.checks import Array
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
+from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bound
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ class _System(NamedTuple):
         return np.asarray(lapack.dgetrs(self.lu, self.pivots.copy(), right)[0])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Conditioned(Immutable):
     """The low rank solution after V points were added and R taken out: U = V + R changes.
 
@@ -61,9 +63,14 @@ class Conditioned(Immutable):
         return self.base.database.changed(self.changes)
 
     @cached_property
+    def functionals(self) -> Functionals:
+        """The r pivots, then the V via-points."""
+        return Functionals.concatenated([self.base.functionals, self.changes.functionals])
+
+    @property
     def centres(self) -> Array:
-        """(r + V, I) the pivots, then the via-points."""
-        return frozen(np.concatenate([self.base.centres, self.changes.inputs]))
+        """(r + V, I) where they are."""
+        return self.functionals.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -72,7 +79,7 @@ class Conditioned(Immutable):
         shared = penalty == self.hyperparameters.lambda_covariance
         system = self._covariance_system if shared else self._system(penalty, base.mean_factor)
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
-        pull = system.solve((self._points.mean - self.hyperparameters.prior_mean - mean).ravel())
+        pull = system.solve((self._points.deviations(self.hyperparameters.prior_mean) - mean).ravel())
         back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
         columns = self._added_columns
         w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]
@@ -88,9 +95,9 @@ class Conditioned(Immutable):
         self._covariance_system  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.base.whitened_one(row)
-        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None])[0])
+        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0])
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.base.whitened(rows)
@@ -114,25 +121,29 @@ class Conditioned(Immutable):
         return self._added * self.base.features.kernel.channels
 
     @cached_property
-    def _points(self) -> Gaussians:
-        """The U normals, the added first."""
-        return Gaussians.concatenated([self.changes.points, self.base.database.reference.take(self.changes.replaced)])
+    def _points(self) -> Database:
+        """The U points, the added first."""
+        database, replaced = self.base.database, self.changes.replaced
+        functionals = Functionals.concatenated([self.changes.functionals, database.functionals.take(replaced)])
+        normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
+        return Database(functionals, normals)
 
     @cached_property
     def _z(self) -> Array:
         """The features (r, U C) of the U points."""
-        inputs = np.concatenate([self.changes.inputs, self.base.database.inputs[self.changes.replaced]])
-        return frozen(self.base.features(inputs))
+        return frozen(self.base.features(self._points.functionals))
 
     @cached_property
     def _covariance_system(self) -> _System:
         return self._system(self.hyperparameters.lambda_covariance, self.base.covariance_factor)
 
-    def _posterior_covariance(self, rows: Array, z: Array, roots: Array) -> Array:
+    def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
         m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
         columns, system = self._added_columns, self._covariance_system
-        residual = rows[:, :, z.shape[1] * c :] - z.transpose(0, 2, 1) @ self._z[:, :columns]  # (M, C, V C)
+        residual = (
+            rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]
+        )  # (M, C, V C)
         cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
         split = cross.reshape(m, c, d, -1, d)
         for i in range(d):
@@ -140,23 +151,23 @@ class Conditioned(Immutable):
         cross = split.reshape(m * c * d, -1)
         gain = system.solve(cross.T).T.reshape(m, c * d, -1)
         within = penalty * (roots.transpose(0, 2, 1) @ roots)
-        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z) + within
+        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
         return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
     def _system(self, penalty: float, base_factor: Array) -> _System:
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
-        added, first = self.changes.inputs, self._added_columns
+        added, first = self.changes.functionals, self._added_columns
         lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
-        between = self.base.features.kernel(added, added) - self._z[:, :first].T @ self._z[:, :first]
+        left = between(self.hyperparameters.kernel, added, added) - self._z[:, :first].T @ self._z[:, :first]
         for i in range(d):
             lifted[:, i, :, i] = self._z
-            residual[:first, i, :first, i] = between
+            residual[:first, i, :first, i] = left
         cross, _ = lapack.dtrtrs(base_factor, lifted.reshape(r * d, -1), lower=1)
         matrix = penalty * (cross.T @ cross) + residual.reshape(columns * d, columns * d)
         blocks = matrix.reshape(count, -1, count, columns * d // count)
         points = np.arange(count)
         sign = np.where(points < self._added, penalty, -penalty)
-        blocks[points, :, points, :] += sign[:, None, None] * self._points.covariance
+        blocks[points, :, points, :] += sign[:, None, None] * self._points.reference.covariance
         lu, pivots, info = lapack.dgetrf(matrix)
         if info or not np.isfinite(lu).all():
             raise ValueError(

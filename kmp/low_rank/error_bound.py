@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kmp.kernel import between, variances
 from kmp.low_rank.features import BLOCK, Features
-from kmp.solution import Solution, mean_at
+from kmp.solution import Solution, mean_of
 
 
 def error_bound(solution: Solution, features: Features, *, added: int = 0) -> float:
@@ -21,24 +22,23 @@ def error_bound(solution: Solution, features: Features, *, added: int = 0) -> fl
     is.
     """
     kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
-    inputs, reference = solution.database.inputs, solution.database.reference
-    c, count = kernel.channels, len(inputs)
-    blocks = [inputs[i : i + BLOCK] for i in range(0, count, BLOCK)]
-    miss = reference.mean - np.concatenate([mean_at(solution, block) for block in blocks])
+    points, reference = solution.database.functionals, solution.database.reference
+    c, count = kernel.channels, len(points)
+    blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
+    miss = reference.mean - np.concatenate([mean_of(solution, block) for block in blocks])
     pull = np.linalg.solve(reference.covariance, miss[:, :, None])[:, :, 0]
-    variances = np.linalg.eigvalsh(reference.covariance)
+    spread = np.linalg.eigvalsh(reference.covariance)
 
     residual = np.concatenate([features.residual(block) for block in blocks])
-    root = np.sqrt(residual * np.diagonal(kernel.prior_variance))[:, :, None]  # (N, C, 1)
+    root = np.sqrt(residual * variances(kernel, points))[:, :, None]  # (N, C, 1)
     pulled = root * np.abs(pull.reshape(count, c, -1)) / lambda_mean
     data, via = pulled[: count - added].sum(axis=(0, 1)), pulled[count - added :].sum(axis=(0, 1))
     moved = root * (data + via)  # (N, C, D)
     moved[count - added :] -= root[count - added :] * via  # between via-points nothing is neglected
-    total = np.sqrt(((moved**2).sum(axis=(1, 2)) / variances[:, 0]).sum())
-    by_means = total + moved[: count - added].max(initial=0) / np.sqrt(variances[:, -1].max())
+    total = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum())
+    by_means = total + moved[: count - added].max(initial=0) / np.sqrt(spread[:, -1].max())
 
-    centres = solution.centres
-    weights = solution.weights.reshape(len(centres) * c, -1)
-    penalty = (weights * (kernel(centres, centres) @ weights)).sum()
+    weights = solution.weights.reshape(len(solution.functionals) * c, -1)
+    penalty = (weights * (between(kernel, solution.functionals, solution.functionals) @ weights)).sum()
     by_cost = np.sqrt((miss * pull).sum() + lambda_mean * max(float(penalty), 0.0))
-    return float(np.sqrt(variances[:, -1].max()) * min(by_means, by_cost))
+    return float(np.sqrt(spread[:, -1].max()) * min(by_means, by_cost))

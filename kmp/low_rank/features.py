@@ -1,7 +1,7 @@
 """Features of the kernel: k(s, s') = z(s) z(s')^T + a residual, by pivoted Cholesky.
 
-The Gaussian kernel of smooth data has a small numerical rank: r features, each made at one of the
-inputs (its pivot), leave at each input a share of k(s, s) below a tolerance.
+The Gaussian kernel of smooth data has a small numerical rank: r features, each made of one of the
+points (its pivot), leave at each point a share of k(s, s) below a tolerance.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from kmp.checks import Array
+from kmp.functionals import Functionals
 from kmp.immutable import Immutable, frozen
-from kmp.kernel import Kernel
+from kmp.kernel import Kernel, between, variances
 
 BLOCK = 8192  # inputs at once, which bounds the memory
 _CANDIDATES = 4096  # inputs among which pivots are sought at once
@@ -23,36 +24,36 @@ _MARGIN = 0.25  # of the tolerance, for the inputs that are no candidates
 _FLOOR = 1e-14  # of k(s, s): a smaller residual is rounding
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Features(Immutable):
     """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of their kernel matrix."""
 
     kernel: Kernel
-    pivots: Array  # (r, I)
+    pivots: Functionals  # r
     root: Array  # L (r, r)
 
     @classmethod
-    def at(cls, kernel: Kernel, pivots: Array) -> Features:
-        """The features of these pivots (r, I), without the last if rounding hides what they add."""
-        k = kernel(pivots, pivots)[:: kernel.channels, :: kernel.channels]
+    def at(cls, kernel: Kernel, pivots: Functionals) -> Features:
+        """The features of these r pivots, without the last if rounding hides what they add."""
+        k = between(kernel, pivots, pivots)[:: kernel.channels, :: kernel.channels]
         root, info = lapack.dpotrf(k, lower=1, clean=1)
         if info:
-            return cls.at(kernel, pivots[: info - 1].copy())
-        return cls(kernel, frozen(pivots), frozen(np.asfortranarray(root)))
+            return cls.at(kernel, pivots.take(slice(info - 1)))
+        return cls(kernel, pivots, frozen(np.asfortranarray(root)))
 
     @classmethod
-    def of(cls, kernel: Kernel, inputs: Array, *, rank: int, tolerance: float) -> tuple[Features, float]:
-        """The features of inputs (N, I), at most `rank`, and their largest residual at an input.
+    def of(cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float) -> tuple[Features, float]:
+        """The features of N points, at most `rank`, and their largest residual at one of them.
 
         That is a share of k(s, s), and no more than `tolerance` unless the rank does not reach so
         far.
         """
-        count = len(inputs)
+        count = len(points)
         index = np.linspace(0, count - 1, min(count, _CANDIDATES)).astype(np.intp)
         for _ in range(_ROUNDS):
-            chosen = _pivots(kernel, inputs[index], rank, _MARGIN * tolerance)
-            found = cls.at(kernel, inputs[index[chosen]])
-            blocks = [inputs[i : i + BLOCK] for i in range(0, count, BLOCK)]
+            chosen = _pivots(kernel, points.take(index), rank, _MARGIN * tolerance)
+            found = cls.at(kernel, points.take(index[chosen]))
+            blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
             residual = np.concatenate([found.residual(block)[:, 0] for block in blocks])
             worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // 2]
             worst = np.setdiff1d(worst[residual[worst] > tolerance], index)
@@ -61,9 +62,9 @@ class Features(Immutable):
             index = np.union1d(index, worst)
         return found, float(residual.max())
 
-    def __call__(self, inputs: Array) -> Array:
-        """z at inputs (n, I), for each channel: (r, n C)."""
-        return self.of_kernel(self.kernel(inputs, self.pivots)[:, :: self.kernel.channels].T)
+    def __call__(self, points: Functionals) -> Array:
+        """z of n points, for each channel: (r, n C)."""
+        return self.of_kernel(between(self.kernel, points, self.pivots)[:, :: self.kernel.channels].T)
 
     def of_kernel(self, columns: Array) -> Array:
         """L^-1 times columns (r, n) of the pivots' kernels: the features there."""
@@ -76,25 +77,25 @@ class Features(Immutable):
         weights[:, 0] = values
         return weights.reshape(len(w), -1)
 
-    def residual(self, inputs: Array) -> Array:
-        """k(s, s) - |z(s)|^2 at inputs (n, I), for each channel, as a share of k(s, s): (n, C)."""
-        z = self(inputs)
-        variance = np.diagonal(self.kernel.prior_variance)
-        shares = 1 - (z * z).sum(axis=0).reshape(len(inputs), -1) / variance
+    def residual(self, points: Functionals) -> Array:
+        """k(s, s) - |z(s)|^2 of n points, for each channel, as a share of k(s, s): (n, C)."""
+        z = self(points)
+        shares = 1 - (z * z).sum(axis=0).reshape(len(points), -1) / variances(self.kernel, points)
         return np.asarray(np.maximum(shares, _FLOOR))
 
 
-def _pivots(kernel: Kernel, inputs: Array, rank: int, tolerance: float) -> NDArray[np.intp]:
-    """Which inputs make the best pivots, greedily: where the residual is largest."""
-    c = kernel.channels
-    residual = np.ones(len(inputs))
-    columns = np.empty((min(rank, len(inputs)), len(inputs)))
+def _pivots(kernel: Kernel, points: Functionals, rank: int, tolerance: float) -> NDArray[np.intp]:
+    """Which points make the best pivots, greedily: where the share of the residual is largest."""
+    c, deviation = kernel.channels, np.sqrt(variances(kernel, points)[:, 0])
+    residual = np.ones(len(points))
+    columns = np.empty((min(rank, len(points)), len(points)))
     chosen: list[int] = []
     for j in range(len(columns)):
         n = int(residual.argmax())
         if residual[n] <= tolerance:
             break
-        column = kernel(inputs[n : n + 1], inputs)[0, ::c] - columns[:j, n] @ columns[:j]
+        column = between(kernel, points.take(slice(n, n + 1)), points)[0, ::c]
+        column = column / (deviation[n] * deviation) - columns[:j, n] @ columns[:j]
         columns[j] = column / np.sqrt(residual[n])
         residual -= columns[j] ** 2
         residual[n] = 0

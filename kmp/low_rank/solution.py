@@ -13,6 +13,7 @@ from scipy.linalg import blas, lapack
 
 from kmp.checks import Array, numbers
 from kmp.database import Changes, Database
+from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
@@ -27,7 +28,7 @@ _KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are mad
 _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LowRank(Immutable):
     """The solution on r features, with the members of `Solution`; factors are made when used."""
 
@@ -54,15 +55,15 @@ class LowRank(Immutable):
     ) -> LowRank:
         """The solution. Raises ValueError if the normal equations cannot be solved."""
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
-        inputs = database.inputs
+        points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
-        target = database.reference.mean - hyperparameters.prior_mean
-        blocks = [slice(i, i + BLOCK) for i in range(0, len(inputs), BLOCK)]
+        target = database.deviations(hyperparameters.prior_mean)
+        blocks = [slice(i, i + BLOCK) for i in range(0, len(points), BLOCK)]
 
         def lifted(start: int) -> Array:
-            return features(inputs[start : start + BLOCK]).T.reshape(-1, c, r)
+            return features(points.take(slice(start, start + BLOCK))).T.reshape(-1, c, r)
 
-        z = cache(lifted) if len(inputs) * c * r <= _KEPT else lifted
+        z = cache(lifted) if len(points) * c * r <= _KEPT else lifted
         total = np.zeros((r, d, r, d))
         for block in blocks:
             _add_information(total, z(block.start), precision[block])
@@ -90,15 +91,21 @@ class LowRank(Immutable):
         r, d = len(pivots), hyperparameters.channel_outputs
         information = numbers("information", arrays["information"], r * d, r * d)
         w = numbers("features", arrays["features"], r, d)
-        features = Features.at(hyperparameters.kernel, pivots)
+        directions = arrays.get("pivot_directions")
+        features = Features.at(hyperparameters.kernel, Functionals.checked(pivots, directions))
         if (usable := len(features.pivots)) < r:
             raise ValueError(f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the primitive anew.")
         return cls(hyperparameters, database, features, information, w)
 
     @property
-    def centres(self) -> Array:
-        """(r, I) the pivots."""
+    def functionals(self) -> Functionals:
+        """The r pivots."""
         return self.features.pivots
+
+    @property
+    def centres(self) -> Array:
+        """(r, I) where they are."""
+        return self.features.pivots.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -114,10 +121,10 @@ class LowRank(Immutable):
         self.covariance_factor  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array) -> Array:
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.whitened_one(row)
         within = blas.dgemm(1.0, root, root, trans_b=1)
-        return self.residual_covariance(z.T @ z) + self.hyperparameters.lambda_covariance * within
+        return self.residual_covariance(z.T @ z, prior) + self.hyperparameters.lambda_covariance * within
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.whitened(rows)
@@ -132,7 +139,7 @@ class LowRank(Immutable):
         # So many changes cost more, and lose more digits, than a new solution.
         database = base.database.changed(changes)
         rank = max(RANK, len(base.centres) + len(changes.inputs))
-        features, _ = Features.of(base.features.kernel, database.inputs, rank=rank, tolerance=TOLERANCE)
+        features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
         return LowRank.fit(self.hyperparameters, database, features, base)
 
     def with_weights(self, weights: Array) -> Self:
@@ -141,13 +148,16 @@ class LowRank(Immutable):
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """The pivots, the information and W of the base."""
         base = self.base or self
-        return {"pivots": base.centres, "information": base.information, "features": base.w}
+        arrays = {"pivots": base.centres, "information": base.information, "features": base.w}
+        if base.functionals.directions is not None:
+            arrays["pivot_directions"] = base.functionals.directions
+        return arrays
 
     def whitened_one(self, row: Array) -> tuple[Array, Array]:
         """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(row[..., : len(self.centres) * c : c].T)
-        return z.reshape(-1, c), self._inverse_factor.times_one(z)
+        return z.reshape(len(self.centres), -1), self._inverse_factor.times_one(z)
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
@@ -155,9 +165,10 @@ class LowRank(Immutable):
         z = self.features.of_kernel(rows[:, : len(self.centres) * c : c].T)
         return z.reshape(len(z), -1, c).transpose(1, 0, 2), self._inverse_factor.times_many(z, c)
 
-    def residual_covariance(self, explained: Array) -> Array:
+    def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
         """k(s, s) less what the features explain (..., C, C), for each output: (..., O, O)."""
-        return kron_identity(self.features.kernel.prior_variance - explained, self.w.shape[1])
+        own = self.features.kernel.prior_variance if prior is None else prior
+        return kron_identity(own - explained, self.w.shape[1])
 
     @cached_property
     def mean_factor(self) -> Array:

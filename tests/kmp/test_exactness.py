@@ -113,3 +113,16 @@ def check(primitive, queries):
     near = slice(0, -3)  # and where the covariance is small, in its own right
     error = np.linalg.norm((together.covariance - covariance)[near].astype(float))
     assert error <= 1e-9 * np.linalg.norm(covariance[near].astype(float))
+
+
+@pytest.mark.parametrize("variance", [1e-9, 1.01e-11])
+def test_a_covariance_that_is_not_refused_has_three_digits_where_all_is_known(variance):
+    inputs, reference = hands()
+    primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(5.0), lambda_mean=1.0)
+    via = Gaussians(reference.mean[[20, 40]] + 0.05, np.tile(variance * np.eye(3), (2, 1, 1)))
+    primitive = primitive.adapt(inputs[[20, 40]] + 0.01, via, tolerance=0.05)
+    wanted = exact(primitive, primitive.via_inputs)[1].astype(float)
+    together = primitive.predict(primitive.via_inputs).covariance
+    singly = np.concatenate([primitive.predict(s[None]).covariance for s in primitive.via_inputs])
+    for found in (together, singly):
+        assert np.linalg.norm(found - wanted) < 2e-3 * np.linalg.norm(wanted)

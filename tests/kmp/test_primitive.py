@@ -41,7 +41,7 @@ def via(seed, count, inputs=4, outputs=3, std=1e-4):
     return random.normal(size=(count, inputs)), points
 
 
-def naive(inputs, reference, query, *, lambda_mean, lambda_covariance, prior_mean):
+def naive(inputs, reference, query, *, lambda_mean, lambda_covariance, prior_mean, count):
     """Equations (8), (9) and the covariance of the IJRR paper, written down as they stand."""
     o = reference.mean.shape[1]
     unit = np.eye(o)
@@ -50,7 +50,7 @@ def naive(inputs, reference, query, *, lambda_mean, lambda_covariance, prior_mea
     sigma = block_diag(*reference.covariance)
     alpha = np.linalg.solve(big + lambda_mean * sigma, (reference.mean - prior_mean).ravel())
     explained = row @ np.linalg.solve(big + lambda_covariance * sigma, row.T)
-    return prior_mean + row @ alpha, len(inputs) / lambda_covariance * (unit - explained)
+    return prior_mean + row @ alpha, count / lambda_covariance * (unit - explained)
 
 
 def same_bits(a, b, queries):
@@ -85,6 +85,7 @@ def test_mean_and_covariance_are_those_of_the_naive_solution(seed, outputs, lamb
             lambda_mean=2.0,
             lambda_covariance=lambda_covariance or 2.0,
             prior_mean=prior,
+            count=len(primitive.base.inputs),
         )
         alone = primitive.predict(query[None])
         for found in (together.mean[n], alone.mean[0], primitive.mean(queries)[n]):
@@ -116,7 +117,7 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
     inputs = spread * random.normal(size=(20, 2))
     primitive = KMP.fit(
         inputs,
-        Gaussians(random.normal(size=(20, 2)), np.tile(1e-14 * np.eye(2), (20, 1, 1))),
+        Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1))),
         kernel=kernel,
         lambda_mean=1.0,
     )
@@ -124,6 +125,20 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
     for covariance in (p.covariance for p in predictions):
         assert np.array_equal(covariance, covariance.swapaxes(1, 2))
         assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+@pytest.mark.parametrize("lambda_covariance", [1e-2, 1.0])
+def test_a_covariance_that_rounding_would_hide_is_refused_and_the_remedy_works(lambda_covariance):
+    inputs, reference = database()
+    sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
+    one = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance)
+    assert one.predict(inputs).covariance.shape == (30, 3, 3)
+    points = via(0, 1, std=1e-8)
+    says = rf"point 30 .* lambda Sigma is {1e-16 * lambda_covariance:.3g} .* lambda_covariance of at least 1e\+05"
+    with pytest.raises(ValueError, match=says):
+        one.adapt(*points, tolerance=0)
+    remedied = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=1e5)
+    np.testing.assert_allclose(remedied.adapt(*points, tolerance=0).mean(points[0]), points[1].mean, atol=1e-6)
 
 
 def test_far_away_the_mean_is_the_prior_and_the_covariance_the_whole():
@@ -214,7 +229,23 @@ def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, toler
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
     found, wanted = adapted.predict(queries).covariance, fitted.predict(queries).covariance
-    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    of_base = len(adapted.base.inputs) / len(fitted.inputs)  # N stays the base's
+    np.testing.assert_allclose(found, wanted * of_base, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation):
+    inputs, reference = database()
+    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
+    points = Gaussians(np.zeros((80, 3)), np.tile(1e-4 * np.eye(3), (80, 1, 1)))
+    elsewhere = 40.0 + 3 * np.random.default_rng(0).normal(size=(80, 4))
+    adapted = primitive.adapt(elsewhere, points, tolerance=0.1)
+    assert len(adapted.inputs) == 110
+    queries = np.concatenate([inputs[:5], np.full((1, 4), -50.0)])
+    before = primitive.predict(queries).covariance
+    for again in (adapted, KMP.from_arrays(adapted.to_arrays()), adapted.refitted(reference)):
+        np.testing.assert_allclose(again.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(again.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
 
 
 def test_every_point_of_the_base_may_be_replaced():
@@ -340,7 +371,7 @@ def test_the_covariance_is_small_at_a_via_point_and_not_at_a_query_far_from_the_
     where, points = via(4, 1, std=1e-3)
     before, after = primitive.predict(where), primitive.adapt(where, points, tolerance=0).predict(where)
     assert np.trace(after.covariance[0]) < 0.1 * np.trace(before.covariance[0])
-    assert np.linalg.eigvalsh(after.covariance[0])[-1] < 31 * 1e-6 * 1.01  # N times the via-point's own, no more
+    assert np.linalg.eigvalsh(after.covariance[0])[-1] < 30 * 1e-6 * 1.01  # N times the via-point's own, no more
 
 
 @properties

@@ -58,7 +58,7 @@ def test_all_that_the_protocol_names_is_there(primitive):
 def test_counts_and_shapes_agree(primitive):
     solution = primitive._solution
     assert len(solution.database) == len(primitive.inputs) == len(primitive.reference)
-    assert primitive._query.covariance_scale == len(solution.database) / primitive.lambda_covariance
+    assert primitive._query.covariance_scale == len(primitive.base.inputs) / primitive.lambda_covariance
     assert solution.weights.shape == (len(solution.centres), 2)
     rows = primitive.kernel(S[:5], solution.centres)
     assert mean_at(solution, S[:5]).shape == (5, 2)

@@ -1,0 +1,182 @@
+"""Linear inequality constraints: what the mean must obey, whatever the demonstrations say.
+
+Huang and Caldwell, A Linearly Constrained Nonparametric Framework for Imitation Learning, ICRA 2020
+(arXiv 1909.07374, "LC-KMP").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from scipy.optimize import nnls
+
+from kmp.checks import Array, numbers
+from kmp.database import Changes, Database
+from kmp.dense import Dense
+from kmp.functionals import Functionals
+from kmp.hyperparameters import Hyperparameters
+from kmp.immutable import Immutable, frozen
+from kmp.kernel import between
+from kmp.solution import mean_of
+
+_VIOLATION = 1e-9  # of a constraint [unit of the outputs], at most, where its normal has norm 1
+_ENOUGH = 1e-13  # at which the search ends, where rounding allows
+_ROUNDS = 30  # of choosing which constraints act
+_RIDGE = 1e-12  # of the largest eigenvalue, for the start of the search only
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearConstraints(Immutable):
+    """J constraints g_j . xi(s_j) >= b_j: a plane that the output must stay on one side of.
+
+    inputs (J, I), normals g (J, O), bounds b (J,) [unit of the outputs, where g has norm 1]. Where
+    a row of `directions` (J, I) is not zero, of the derivative along it instead: a limit of speed.
+    Read-only. Raises ValueError if shapes do not agree, a number is not finite, or a normal is 0.
+    """
+
+    inputs: Array
+    normals: Array
+    bounds: Array
+    directions: Array | None = None
+
+    def __post_init__(self) -> None:
+        inputs = numbers("constraints.inputs", self.inputs, "J", "I")
+        normals = numbers("constraints.normals", self.normals, len(inputs), "O")
+        for j in np.flatnonzero(~normals.any(axis=1))[:1]:
+            raise ValueError(f"constraints.normals[{j}] is 0, and must have a direction.")
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "normals", normals)
+        object.__setattr__(self, "bounds", numbers("constraints.bounds", self.bounds, len(inputs)))
+        points = Functionals.checked(inputs, self.directions)
+        object.__setattr__(self, "directions", points.directions)
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    @property
+    def functionals(self) -> Functionals:
+        """Where they are, and of what."""
+        return Functionals(self.inputs, self.directions)
+
+    def joined(self, other: LinearConstraints) -> LinearConstraints:
+        """These and the others."""
+        points = Functionals.concatenated([self.functionals, other.functionals])
+        normals = np.concatenate([self.normals, other.normals])
+        return LinearConstraints(points.inputs, normals, np.concatenate([self.bounds, other.bounds]), points.directions)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Constrained(Immutable):
+    """The dense solution with J constraints on its mean; LC-KMP, section III.
+
+    The mean is the one of the least cost (4) among those that obey. It is f + sum_j a_j P(., s_j)
+    g_j with the posterior covariance P = k - k (K + lambda Sigma)^-1 k^T and the multipliers
+    a >= 0, which are 0 where a constraint does not act. The covariance is as without constraints.
+    The members are those of `Solution`.
+    """
+
+    solution: Dense
+    constraints: LinearConstraints
+
+    representation: ClassVar[Literal["dense"]] = "dense"
+    error_bound: ClassVar[float] = 0.0
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return self.solution.hyperparameters
+
+    @property
+    def database(self) -> Database:
+        return self.solution.database
+
+    @cached_property
+    def functionals(self) -> Functionals:
+        """The N reference points, then the J constraints."""
+        return Functionals.concatenated([self.solution.functionals, self.constraints.functionals])
+
+    @property
+    def centres(self) -> Array:
+        """(N + J, I) where they are."""
+        return self.functionals.inputs
+
+    @cached_property
+    def weights(self) -> Array:
+        """(N + J, O) the weights of the kernels there."""
+        constraints, outputs = self.constraints, self.hyperparameters.outputs
+        kernel, c = self.hyperparameters.kernel, self.hyperparameters.kernel.channels
+        normals = constraints.normals.reshape(len(constraints), c, -1)
+        points = constraints.functionals
+        across = between(kernel, self.solution.functionals, points).reshape(-1, c, len(points), c)
+        pulls = np.einsum("ncje,jed->ncdj", across, normals).reshape(-1, len(points))
+        back = lapack.dpotrs(self.solution._factor, pulls, lower=1)[0]  # (N O, J)
+        within = between(kernel, points, points).reshape(len(points), c, len(points), c)
+        stiffness = np.einsum("icd,icje,jed->ij", normals, within, normals) - pulls.T @ back
+
+        def weights(multipliers: Array) -> Array:
+            data = self.solution.weights - (back @ multipliers).reshape(-1, outputs)
+            return np.concatenate([data, multipliers[:, None] * constraints.normals])
+
+        def slack(multipliers: Array) -> Array:
+            mean = mean_of(self.with_weights(weights(multipliers)), points)
+            return np.asarray((mean * constraints.normals).sum(axis=1) - constraints.bounds)
+
+        found = _multipliers((stiffness + stiffness.T) / 2, slack)
+        size = np.linalg.norm(constraints.normals, axis=1)
+        missed = -slack(found) / size
+        for worst in np.flatnonzero(missed > _VIOLATION)[:1]:
+            raise ValueError(
+                f"The constraints cannot be met together: {worst} is missed by {missed[worst]:.3g}. They contradict "
+                "each other, or the reference is too sure there: give it more variance, or fewer constraints."
+            )
+        return frozen(weights(found))
+
+    def solved(self) -> Self:
+        self.solution.solved()
+        self.weights  # noqa: B018
+        return self
+
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        return self.solution.posterior_covariance_one(self._known(row), prior)
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        return self.solution.posterior_covariance(self._known(rows))
+
+    def adapted(self, changes: Changes) -> Constrained:
+        return Constrained(self.solution.adapted(changes), self.constraints)
+
+    def with_weights(self, weights: Array) -> Self:
+        return self._with_cached(weights=weights)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        return self.solution.to_arrays()
+
+    def _known(self, rows: Array) -> Array:
+        return np.asarray(rows[..., : len(self.database) * self.hyperparameters.kernel.channels])
+
+
+def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
+    """a >= 0 with a slack >= 0 where a is 0, and of 0 where it is not.
+
+    The slack moves by stiffness (J, J) times a. Which constraints act comes from a quadratic
+    programme; what is left is mended by the slack that the mean itself has.
+    """
+    size = np.sqrt(np.maximum(np.diagonal(stiffness), np.finfo(np.float64).tiny))
+    scaled = stiffness / np.outer(size, size)
+    values, vectors = np.linalg.eigh(scaled)
+    root = np.sqrt(np.maximum(values, _RIDGE * values[-1]))
+    found = nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[0] / size
+    for _ in range(_ROUNDS):
+        left = slack(found)
+        acts = (found > 0) | (left < 0)
+        if not acts.any() or np.abs(left[acts]).max() <= _ENOUGH:
+            break
+        step = np.linalg.lstsq(scaled[np.ix_(acts, acts)], -left[acts] / size[acts], rcond=1e-13)[0] / size[acts]
+        found = found.copy()
+        found[acts] = np.maximum(found[acts] + step, 0.0)
+    return found

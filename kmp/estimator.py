@@ -1,0 +1,106 @@
+"""The primitive as a scikit-learn estimator: for pipelines, searches and cross-validation.
+
+Imported on its own, `from kmp.estimator import KMPRegressor`: scikit-learn loads slowly.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from kmp.checks import Array, positive
+from kmp.gaussians import Gaussians
+from kmp.gmm import GaussianMixture
+from kmp.kernel import GaussianKernel
+from kmp.primitive import KMP
+
+
+class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """A `KMP` of samples X (N, I) and y (N,) or (N, O), by scikit-learn's rules.
+
+    `ell` [1 / (unit of X)^2] is one number, one for each input (I,), or "scale": 1 / (I x the
+    variance of X). `noise` is the deviation of a sample of y, as a share of y's own. `components`
+    None takes each sample as a reference point of that noise; a number takes the regression of a
+    mixture of so many at each sample (the paper, section II-A), from `random_state`. `lambda_mean`
+    and `lambda_covariance` are those of `KMP.fit` where the variance of y is 1. Far from the
+    samples the mean returns to that of y.
+
+    After `fit`: `primitive_`, with all that a `KMP` can do, and `n_features_in_`.
+    """
+
+    def __init__(
+        self,
+        *,
+        ell: float | ArrayLike | str = "scale",
+        lambda_mean: float = 1.0,
+        lambda_covariance: float | None = None,
+        noise: float = 0.1,
+        components: int | None = None,
+        random_state: int = 0,
+    ) -> None:
+        self.ell = ell
+        self.lambda_mean = lambda_mean
+        self.lambda_covariance = lambda_covariance
+        self.noise = noise
+        self.components = components
+        self.random_state = random_state
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:  # noqa: N803
+        """Fits the primitive to samples X (N, I) and y (N,) or (N, O).
+
+        Raises ValueError as `KMP.fit` does, and where scikit-learn's own checks do.
+        """
+        inputs, outputs = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        self._one_output = outputs.ndim == 1
+        outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
+        spread = outputs.var(axis=0)
+        spread = np.where(spread > 0, spread, 1.0)  # an output that never changes
+        if self.components is None:
+            variance = positive("noise", self.noise) ** 2 * np.diag(spread)
+            reference = Gaussians(outputs, np.tile(variance, (len(inputs), 1, 1)))
+        else:
+            samples = np.hstack([inputs, outputs])
+            mixture = GaussianMixture.fit(samples, components=self.components, seed=self.random_state)
+            reference = mixture.regress(inputs)
+        unit = float(spread.mean())
+        self.primitive_ = KMP.fit(
+            inputs,
+            reference,
+            kernel=GaussianKernel(self._ell(inputs)),
+            lambda_mean=positive("lambda_mean", self.lambda_mean) / unit,
+            lambda_covariance=self.lambda_covariance and self.lambda_covariance / unit,
+            prior_mean=outputs.mean(axis=0),
+        )
+        return self
+
+    def predict(self, X: ArrayLike, return_std: bool = False) -> Any:  # noqa: N803
+        """The mean at X (M, I): (M,) or (M, O), as y was; and with `return_std` the deviations too.
+
+        Raises NotFittedError before `fit`, and ValueError as `KMP.predict` does.
+        """
+        check_is_fitted(self)
+        inputs = validate_data(self, X, reset=False, dtype=np.float64)
+        if not return_std:
+            return self._shaped(self.primitive_.mean(inputs))
+        found = self.primitive_.predict(inputs)
+        deviations = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        return self._shaped(found.mean), self._shaped(deviations)
+
+    def _shaped(self, outputs: Array) -> Array:
+        return outputs[:, 0] if self._one_output else outputs
+
+    def _ell(self, inputs: Array) -> Any:
+        if not isinstance(self.ell, str):
+            return self.ell
+        if self.ell != "scale":
+            raise ValueError(f'ell: {self.ell!r} given, a number, one for each input, or "scale" needed.')
+        return 1.0 / (inputs.shape[1] * (float(inputs.var()) or 1.0))

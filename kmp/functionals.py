@@ -1,0 +1,77 @@
+"""What is known of the output, or asked: its value at an input, or its derivative there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kmp.checks import Array, numbers
+from kmp.immutable import Immutable, frozen
+
+
+class Derivatives(NamedTuple):
+    """Which of R functionals are derivatives, and along what."""
+
+    rows: NDArray[np.intp]  # (R',) their indices, ascending
+    along: Array  # (R', I) their directions, in the kernel's coordinates
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Functionals(Immutable):
+    """N linear functionals of the output: its value at an input, or its derivative there.
+
+    A Gaussian process that is known by its derivatives is one still: its kernel between two
+    functionals is the kernel of values, derived by either input along either direction.
+    """
+
+    inputs: Array  # (N, I)
+    directions: Array | None = None
+    """(N, I) the direction of each derivative, zero for a value; None where all are values."""
+
+    @classmethod
+    def checked(cls, inputs: Array, directions: ArrayLike | None) -> Functionals:
+        """The functionals at inputs (N, I). Raises ValueError if the directions are not (N, I)."""
+        if directions is None:
+            return cls(inputs)
+        along = numbers("directions", directions, *inputs.shape)
+        return cls(inputs, along if along.any() else None)
+
+    @staticmethod
+    def concatenated(parts: Sequence[Functionals]) -> Functionals:
+        """All functionals of the parts, in order."""
+        inputs = frozen(np.concatenate([part.inputs for part in parts]))
+        if all(part.directions is None for part in parts):
+            return Functionals(inputs)
+        return Functionals(inputs, frozen(np.concatenate([part.along for part in parts])))
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def take(self, index: NDArray[Any] | slice) -> Functionals:
+        """The chosen ones, in the index's order."""
+        directions = None if self.directions is None else frozen(self.directions[index].copy())
+        return Functionals(frozen(self.inputs[index].copy()), directions)
+
+    @property
+    def along(self) -> Array:
+        """(N, I) the directions, all zero where all are values."""
+        return np.zeros(self.inputs.shape) if self.directions is None else self.directions
+
+    @cached_property
+    def values(self) -> NDArray[np.bool_]:
+        """(N,) whether each is a value."""
+        if self.directions is None:
+            return np.ones(len(self), dtype=bool)
+        return np.asarray(~self.directions.any(axis=1))
+
+    def derivatives(self, stretch: Array) -> Derivatives | None:
+        """The derivatives among them, in coordinates x = stretch * s; None if there is none."""
+        if self.directions is None:
+            return None
+        rows = np.flatnonzero(~self.values)
+        return Derivatives(frozen(rows), frozen(self.directions[rows] * stretch)) if len(rows) else None

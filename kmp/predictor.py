@@ -1,0 +1,260 @@
+"""What a primitive says at queries: the mean, its derivatives, and how sure it is.
+
+The paper, section II-B.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kmp.checks import Array, check_finite, check_shape, real, whole
+from kmp.compiled_query import CompiledQuery
+from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, unchecked
+from kmp.immutable import Immutable, frozen
+from kmp.kernel import Kernel, between
+from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
+from kmp.low_rank import Features
+from kmp.query import MotionPrediction, Query
+from kmp.solution import Solution, mean_at
+
+_BATCH = 256  # queries at once, which bounds the memory of `predict`
+_RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertainty(Immutable):
+    """The covariance of `predict` as the sum of two, each (M, O, O) [unit of the outputs^2]."""
+
+    variability: Array
+    """How much the demonstrations differ from each other there."""
+    distance: Array
+    """How far the query is from the data: what would remain if each reference point were exact."""
+
+
+class Predictor(Immutable):
+    """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
+
+    _solution: Solution
+
+    @property
+    @abstractmethod
+    def _count(self) -> int:
+        """N of the covariance."""
+
+    def mean(self, queries: ArrayLike) -> Array:
+        """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
+
+        One query alone may differ by rounding from the same in a set. Raises ValueError if the
+        shape is another or a number is not finite.
+        """
+        s = self._checked_many(queries)
+        if len(s) == 1:
+            return self._query.mean(self._query.row(s[0]))[None]
+        return mean_at(self._solution, s)
+
+    def predict(self, queries: ArrayLike) -> Gaussians:
+        """xi(s) with its covariance at queries (M, I): M normals.
+
+        The mean is that of `mean`, bit for bit. Covariance: N / lambda_c (k(s, s) I - k (K +
+        lambda_c Sigma)^-1 k^T), IJRR 2019. The first prediction inverts the triangular factor: make
+        one before there is a deadline. Raises ValueError if the shape is another, a number is not
+        finite, or what was stored cannot be solved here.
+        """
+        s = self._checked_many(queries)
+        if len(s) == 1:
+            row = self._query.row(s[0])
+            by = self._compiled_query or self._query
+            return unchecked(self._query.mean(row)[None], by.covariance(row.kernel)[None])
+        batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
+        posterior = [self._solution.posterior_covariance(self._rows(one)) for one in batches]
+        stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
+        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self._query.covariance_scale)
+
+    def predict_joint(self, queries: ArrayLike) -> Gaussians:
+        """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
+
+        Its blocks on the diagonal are the covariances of `predict`; the others tell how queries go
+        together: a path is one draw. (M O)^2 numbers. Raises ValueError as `predict` does.
+        """
+        s = self._checked_many(queries)
+        if len(s) == 0:
+            raise ValueError("queries: none given, at least 1 needed.")
+        posterior = self._solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
+        covariance = nearest_positive_semidefinite(posterior[None]) * self._query.covariance_scale
+        return unchecked(self.mean(s).reshape(1, -1), covariance)
+
+    def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
+        """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
+
+        Raises ValueError as `predict` does, or if the count is below 1.
+        """
+        whole("count", count)
+        joint = self.predict_joint(queries)
+        values, vectors = np.linalg.eigh(joint.covariance[0])
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ root.T
+        return np.asarray((joint.mean + drawn).reshape(count, -1, self.outputs))
+
+    def predict_motion(
+        self,
+        query: ArrayLike,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        *,
+        covariance: bool = True,
+    ) -> MotionPrediction:
+        """xi at one query (I,), and how it moves with the input: all from one kernel row.
+
+        The input's velocity (I,) [unit of the inputs / s] and its acceleration (I,) [unit of the
+        inputs / s^2] give those of the output. The numbers are those of `predict`, `jacobian` and
+        `curvature`: but for rounding where Numba is installed, whose compiled loops then serve, bit
+        for bit where it is not. The covariance takes longer than all else, and can be left out.
+
+        Raises ValueError if a shape is another or a number is not finite.
+        """
+        s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
+        compiled = self._compiled_query
+        if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
+            found = compiled.motion(s, v, a, covariance=covariance)
+            if found is not None:
+                return found
+        checked = self._checked("velocity", v), self._checked("acceleration", a)
+        return self._query.motion(self._one_query(s), *checked, covariance=covariance)
+
+    def jacobian(self, query: ArrayLike) -> Array:
+        """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
+
+        Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
+        """
+        return self._query.jacobian(self._query.row(self._one_query(query)))
+
+    def jacobians(self, queries: ArrayLike) -> Array:
+        """dxi/ds at queries (M, I): (M, O, I). The numbers are `jacobian`'s, but for rounding.
+
+        Raises ValueError if the shape is another or a number is not finite.
+        """
+        s, i = self._checked_many(queries), self._dimensions
+        weights = self.weights.reshape(-1, self.outputs // self.kernel.channels)
+        found = np.empty((len(s), i, self.outputs))
+        for a in range(0, len(s), _BATCH):
+            each = np.repeat(s[a : a + _BATCH], i, axis=0)
+            rows = self._rows(each, np.tile(np.eye(i), (len(each) // i, 1)))
+            found[a : a + _BATCH] = (rows @ weights).reshape(-1, i, self.outputs)
+        return found.transpose(0, 2, 1)
+
+    def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
+        """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
+
+        Equation (8), derived twice. Where v is the velocity of the input [unit of the inputs / s],
+        this is the part of the output's acceleration [unit of the outputs / s^2] that the velocity
+        makes. Raises ValueError if a shape is another or a number is not finite.
+        """
+        s, v = self._one_query(query), self._checked("direction", direction)
+        return self._query.curvature(self._query.row(s), v)
+
+    def uncertainty(self, queries: ArrayLike) -> Uncertainty:
+        """The covariance at queries (M, I), split: how demonstrations vary, how far they are.
+
+        The second is what IJRR 2019's covariance would be with Sigma = 0. Raises ValueError if the
+        shape is another or a number is not finite.
+        """
+        s = self._checked_many(queries)
+        total = self.predict(s).covariance
+        c = self.kernel.channels
+        z = self._spanned(Functionals(s)).T.reshape(len(s), c, -1)
+        residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
+        distance = nearest_positive_semidefinite(residual) * self._query.covariance_scale
+        return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
+
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel k."""
+        return self._solution.hyperparameters.kernel
+
+    @property
+    def lambda_mean(self) -> float:
+        """lambda of equation (9) [1 / (unit of the outputs)^2]."""
+        return self._solution.hyperparameters.lambda_mean
+
+    @property
+    def lambda_covariance(self) -> float:
+        """lambda of the covariance [1 / (unit of the outputs)^2]."""
+        return self._solution.hyperparameters.lambda_covariance
+
+    @property
+    def prior_mean(self) -> Array:
+        """(O,) [unit of the outputs] what the mean returns to far from the inputs."""
+        return self._solution.hyperparameters.prior_mean
+
+    @property
+    def outputs(self) -> int:
+        """O, the number of outputs."""
+        return self._solution.hyperparameters.outputs
+
+    @property
+    def representation(self) -> Literal["dense", "low_rank"]:
+        """How the primitive is solved."""
+        return self._solution.representation
+
+    @property
+    def weights(self) -> Array:
+        """Those of equation (8): alpha (N, O) of equation (9), or those of the low rank centres."""
+        return self._solution.weights
+
+    @property
+    def error_bound(self) -> float:
+        """How far the mean can be from equation (9)'s at the points [unit of the outputs].
+
+        An upper bound: 0 for the dense solution; for the low rank one rigorous but for rounding,
+        and pessimistic by one to three orders.
+        """
+        return self._solution.error_bound
+
+    @cached_property
+    def _query(self) -> Query:
+        return Query.of(self._solution, self._count)
+
+    @cached_property
+    def _compiled_query(self) -> CompiledQuery | None:
+        return CompiledQuery.of(self._query)
+
+    @cached_property
+    def _spanned(self) -> Features:
+        known = self._solution.functionals
+        return Features.of(self.kernel, known, rank=len(known), tolerance=_RESIDUAL)[0]
+
+    @cached_property
+    def _dimensions(self) -> int:
+        return int(self._solution.database.inputs.shape[1])
+
+    def _rows(self, queries: Array, directions: Array | None = None) -> Array:
+        """k of M queries, or their derivatives, and what is known: (M C, R C)."""
+        return between(self.kernel, Functionals(queries, directions), self._solution.functionals)
+
+    def _wrapped(self, queries: Array) -> Array:
+        """The queries, within the period where there is one: no seam, not even rounding's."""
+        period = self.kernel.period
+        return queries if period is None else queries % period
+
+    def _one_query(self, query: ArrayLike) -> Array:
+        return self._wrapped(self._checked("query", query))
+
+    def _checked(self, name: str, value: ArrayLike) -> Array:
+        s = real(name, value)
+        check_shape(name, s, self._dimensions)
+        check_finite(name, s)
+        return s
+
+    def _checked_many(self, queries: ArrayLike) -> Array:
+        s = real("queries", queries)
+        if s.ndim != 2 or s.shape[1] != self._dimensions:
+            check_shape("queries", s, "M", self._dimensions)
+        check_finite("queries", s)
+        return self._wrapped(s)

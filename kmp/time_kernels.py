@@ -1,0 +1,187 @@
+"""The kernels of skills over time or a phase: with rates among the outputs, or periodic."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from kmp.checks import Array, positive
+from kmp.functionals import Derivatives
+from kmp.immutable import Immutable, frozen
+from kmp.kernel import directed
+
+
+@dataclass(frozen=True)
+class _OneInput(Immutable):
+    """A kernel of one input: all follows from its blocks' derivatives by r = x - x'."""
+
+    channels: ClassVar[int] = 1
+    ell: float
+
+    @staticmethod
+    @abstractmethod
+    def values(offsets: Array, scale: float) -> Array:
+        """k of values (R,) at offsets (R, 1)."""
+
+    @staticmethod
+    @abstractmethod
+    def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
+        """d^order/dr^order of the blocks (..., C, C) of two points, at r (...)."""
+
+    @abstractmethod
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        """The scale, and the stretch (1,)."""
+
+    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
+        scale, stretch = self.coordinates(1)
+        r = a * stretch - (b * stretch).T
+        values = self.values(r.reshape(-1, 1), scale).reshape(r.shape)
+        k = self.blocks(r, values, scale, 0)
+        if along_a is not None or along_b is not None:
+            i, u = directed(along_a, stretch)
+            j, v = directed(along_b, stretch)
+            both = np.ix_(i, j)
+            through = self.blocks(r[both], values[both], scale, 2) * (-u * v.T)[:, :, None, None]
+            k[i] = self.blocks(r[i], values[i], scale, 1) * u[:, :, None, None]
+            k[:, j] = self.blocks(r[:, j], values[:, j], scale, 1) * -v[:, :, None]
+            k[both] = through
+        return k.transpose(0, 2, 1, 3).reshape(self.channels * len(a), self.channels * len(b))
+
+    def variances(self, along: Array) -> Array:
+        scale, stretch = self.coordinates(1)
+        home = np.zeros(len(along))
+        at_home = self.values(home[:, None], scale)
+        values, bends = (np.diagonal(self.blocks(home, at_home, scale, n), axis1=1, axis2=2) for n in (0, 2))
+        return np.where(along != 0, -bends * (along * stretch) ** 2, values)
+
+    @classmethod
+    def row(
+        cls, offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None, order: int = 0
+    ) -> Array:
+        """The row, or its derivative of that order by x: (R,) where C is 1, else (C, R C)."""
+        r = offsets[:, 0]
+        blocks = cls.blocks(r, values, scale, order)
+        if derivatives is not None:
+            rows, along = derivatives
+            blocks[rows] = cls.blocks(r[rows], values[rows], scale, order + 1) * -along[:, :, None]
+        if cls.channels == 1:
+            return blocks.reshape(-1)
+        return np.ascontiguousarray(blocks.transpose(1, 0, 2)).reshape(cls.channels, -1)
+
+    @classmethod
+    def jacobian(
+        cls, offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+    ) -> Array:
+        return np.asarray((cls.row(offsets, values, scale, derivatives, 1) @ weight_rows.T).reshape(-1, 1))
+
+    @classmethod
+    def curvature(
+        cls,
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weights: Array,
+        direction: Array,
+        derivatives: Derivatives | None = None,
+    ) -> Array:
+        row = cls.row(offsets, values, scale, derivatives, 2)
+        return np.asarray((row @ weights).ravel() * float(direction @ direction))
+
+
+@dataclass(frozen=True)
+class VelocityKernel(_OneInput):
+    """The kernel of skills over time whose 2 D outputs are a value and its rate: [xi, dxi/dt].
+
+    k(t, t') and its derivatives, exact, so that a via-point can fix the velocity too (IJRR 2019, on
+    time-driven trajectories). With r = t - t' the block of two points is
+    [[k, 2 ell r k], [-2 ell r k, (2 ell - 4 ell^2 r^2) k]]; `ell` in 1 / (unit of time)^2. It
+    takes one input. The methods are those of `Kernel`. Raises ValueError unless ell is finite and
+    above 0.
+    """
+
+    channels: ClassVar[int] = 2
+    period: ClassVar[None] = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ell", positive("ell", self.ell))
+
+    @cached_property
+    def prior_variance(self) -> Array:
+        return frozen(np.diag([1.0, 2 * self.ell]))
+
+    def check(self, inputs: int, outputs: int) -> None:
+        """Raises ValueError unless there is one input, and there are as many rates as values."""
+        if inputs != 1 or outputs % 2:
+            raise ValueError(
+                f"{inputs} inputs and {outputs} outputs given; value and rate over time need "
+                "1 input and an even number of outputs: the values, then their rates."
+            )
+
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        return self.ell, frozen(np.ones(inputs))
+
+    @staticmethod
+    def values(offsets: Array, scale: float) -> Array:
+        r = offsets[:, 0]
+        return np.asarray(np.exp(-scale * r * r))
+
+    @staticmethod
+    def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
+        # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
+        k = [values, -2 * scale * r * values]
+        for n in range(1, order + 2):
+            k.append(-2 * scale * (r * k[n] + n * k[n - 1]))
+        a, b, c = k[order : order + 3]
+        return np.stack([a, -b, b, -c], axis=-1).reshape(*r.shape, 2, 2)
+
+
+@dataclass(frozen=True)
+class PeriodicKernel(_OneInput):
+    """k(t, t') = exp(-ell (T / pi)^2 sin^2(pi (t - t') / T)): the same again after each period T.
+
+    Near to t it is the Gaussian kernel of the same `ell` [1 / (unit of time)^2]; `period` T [unit
+    of time], 2 pi for a phase in radians. MacKay, Introduction to Gaussian Processes, 1998. A
+    rhythmic skill has no seam: all predictions at t and t + T are the same. It takes one input. The
+    methods are those of `Kernel`. Raises ValueError unless both are finite and above 0.
+    """
+
+    period: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ell", positive("ell", self.ell))
+        object.__setattr__(self, "period", positive("period", self.period))
+
+    @cached_property
+    def prior_variance(self) -> Array:
+        return frozen(np.ones((1, 1)))
+
+    def check(self, inputs: int, outputs: int) -> None:
+        """Raises ValueError unless there is one input."""
+        if inputs != 1:
+            raise ValueError(f"{inputs} inputs given; a periodic kernel needs 1, the time or a phase.")
+
+    def coordinates(self, inputs: int) -> tuple[float, Array]:
+        """In radians."""
+        return self.ell * (self.period / np.pi) ** 2, frozen(np.full(inputs, 2 * np.pi / self.period))
+
+    @staticmethod
+    def values(offsets: Array, scale: float) -> Array:
+        return np.asarray(np.exp(-scale * np.sin(offsets[:, 0] / 2) ** 2))
+
+    @staticmethod
+    def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
+        c = scale / 2
+        sine, cosine = np.sin(r), np.cos(r)
+        if order == 0:
+            factor = np.ones_like(r)
+        elif order == 1:
+            factor = -c * sine
+        elif order == 2:
+            factor = c * c * sine * sine - c * cosine
+        else:
+            factor = c * sine * (3 * c * cosine + 1 - c * c * sine * sine)
+        return np.asarray((factor * values)[..., None, None])

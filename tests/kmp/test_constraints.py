@@ -1,0 +1,143 @@
+"""Linear inequality constraints: obeyed to 1e-9, at the least cost, and kept thereafter."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import kmp
+from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
+
+T = np.linspace(0, 2, 50)[:, None]
+PATH = np.hstack([np.sin(3 * T), np.cos(2 * T)])
+REFERENCE = Gaussians(PATH, np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+WHERE = np.linspace(0, 2, 41)[:, None]
+LOW = LinearConstraints(WHERE, np.tile([0.0, 1.0], (41, 1)), np.full(41, -0.2))  # stay above -0.2
+SIDE = LinearConstraints(WHERE, np.tile([-2.0, 0.5], (41, 1)), np.full(41, -1.6))
+
+
+def base(representation="dense", **options):
+    options = {"kernel": GaussianKernel(5.0), "lambda_mean": 1.0} | options
+    return KMP.fit(T, REFERENCE, representation=representation, **options)
+
+
+def violation(skill, constraints=LOW):
+    slack = (skill.mean(constraints.inputs) * constraints.normals).sum(axis=1) - constraints.bounds
+    return max(-slack.min(), 0.0)
+
+
+def test_they_are_violated_without_and_obeyed_with_them():
+    assert violation(base()) > 0.3
+    skill = base().constrained(LOW)
+    assert violation(skill) < 1e-9
+    alone = np.array([skill.mean(s[None])[0] for s in WHERE])
+    assert alone[:, 1].min() > -0.2 - 1e-9
+    both = skill.constrained(SIDE)
+    assert violation(both) < 1e-9
+    assert violation(both, SIDE) < 1e-9
+
+
+def test_between_them_little_is_crossed_and_away_from_them_nothing_changes():
+    skill = base().constrained(LOW)
+    assert skill.mean(np.linspace(0, 2, 1001)[:, None])[:, 1].min() > -0.2 - 1e-3
+    free = T[:20]
+    np.testing.assert_allclose(skill.mean(free)[:, 0], base().mean(free)[:, 0], atol=1e-3)
+    np.testing.assert_allclose(skill.mean(free)[:10], base().mean(free)[:10], atol=2e-2)
+
+
+def test_the_mean_is_the_one_of_the_least_cost_among_those_that_obey():
+    few = LinearConstraints(WHERE[::5], np.tile([0.0, 1.0], (9, 1)), np.full(9, -0.2))
+    t, path = T[::4], PATH[::4]
+    reference = Gaussians(path, np.tile(0.05 * np.eye(2), (len(t), 1, 1)))
+    skill = KMP.fit(t, reference, kernel=GaussianKernel(5.0), lambda_mean=1.0).constrained(few)
+    points = np.concatenate([t, few.inputs + 1e-9])
+    k = skill.kernel(points, points) + 1e-10 * np.eye(len(points))
+
+    def cost(w):
+        f = k @ w
+        return ((f[: len(t)] - path[:, 1]) ** 2).sum() / 0.05 / 2 + w @ k @ w / 2
+
+    def slope(w):
+        return k[: len(t)].T @ (k[: len(t)] @ w - path[:, 1]) / 0.05 + k @ w
+
+    obeyed = {"type": "ineq", "fun": lambda w: (k @ w)[len(t) :] + 0.2, "jac": lambda w: k[len(t) :]}
+    start = np.zeros(len(points))
+    found = minimize(cost, start, jac=slope, constraints=[obeyed], method="SLSQP", options={"maxiter": 500})
+    np.testing.assert_allclose(skill.mean(points)[:, 1], k @ found.x, atol=2e-3)
+    found_by_us = np.linalg.solve(k, skill.mean(points)[:, 1])
+    assert cost(found_by_us) <= cost(found.x) * (1 + 1e-3)
+
+
+def test_constraints_that_are_obeyed_already_change_nothing():
+    loose = LinearConstraints(WHERE, LOW.normals, np.full(41, -3.0))
+    np.testing.assert_allclose(base().constrained(loose).mean(T), base().mean(T), atol=1e-12)
+
+
+def test_a_speed_can_be_limited_and_rates_among_the_outputs_too():
+    slow = LinearConstraints(WHERE, np.tile([-1.0, 0.0], (41, 1)), np.full(41, -1.5), np.ones((41, 1)))
+    skill = base().constrained(slow)
+    assert base().jacobians(WHERE)[:, 0, 0].max() > 2.9
+    assert skill.jacobians(WHERE)[:, 0, 0].max() < 1.5 + 1e-9
+    rates = Gaussians(np.hstack([PATH[:, :1], 3 * np.cos(3 * T)]), np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+    one = KMP.fit(T, rates, kernel=VelocityKernel(5.0), lambda_mean=1.0)
+    limits = LinearConstraints(WHERE, np.tile([0.0, -1.0], (41, 1)), np.full(41, -2.0))
+    assert violation(one, limits) > 0.9
+    assert violation(one.constrained(limits), limits) < 1e-9
+
+
+def test_via_points_and_constraints_hold_together_in_any_order():
+    via = Gaussians([[0.5, 0.1]], [1e-8 * np.eye(2)])
+    first = base().constrained(LOW).adapt([[1.3]], via, tolerance=0.03)
+    then = base().adapt([[1.3]], via, tolerance=0.03).constrained(LOW)
+    for skill in (first, then):
+        np.testing.assert_allclose(skill.mean([[1.3]]), via.mean, atol=1e-4)
+        assert violation(skill) < 1e-9
+    np.testing.assert_allclose(first.mean(T), then.mean(T), atol=1e-9)
+    assert violation(first.base) > 0.3
+    moved = then.refitted(Gaussians(PATH - 0.1, REFERENCE.covariance))
+    assert violation(moved) < 1e-9
+
+
+def test_everything_else_is_predicted_as_ever():
+    skill, h = base().constrained(LOW), 1e-5
+    s = np.array([1.2])
+    numeric = (skill.mean([s + h]) - skill.mean([s - h]))[0] / (2 * h)
+    np.testing.assert_allclose(skill.jacobian(s)[:, 0], numeric, atol=1e-6)
+    np.testing.assert_allclose(skill.predict_motion(s, [1.0], [0.0]).velocity, numeric, atol=1e-6)
+    np.testing.assert_allclose(skill.predict(T).covariance, base().predict(T).covariance, atol=1e-12)
+    np.testing.assert_allclose(skill.predict([s]).covariance, base().predict([s]).covariance, atol=1e-12)
+    assert skill.predict_joint(T[:5]).covariance.shape == (1, 10, 10)
+    assert (skill.uncertainty(T).distance >= -1e-9).all()
+
+
+@pytest.mark.parametrize("adapted", [False, True])
+def test_files_and_pickles_give_it_back_bit_for_bit(tmp_path, adapted):
+    skill = base().constrained(LOW)
+    if adapted:
+        skill = skill.adapt([[1.3]], Gaussians([[0.5, 0.1]], [1e-8 * np.eye(2)]), tolerance=0.03)
+    kmp.save(tmp_path / "skill", skill, input_unit="s", output_unit="m")
+    for again in (kmp.load(tmp_path / "skill").primitive, pickle.loads(pickle.dumps(skill))):
+        assert np.array_equal(again.mean(T), skill.mean(T))
+        assert np.array_equal(again.predict(T).covariance, skill.predict(T).covariance)
+        assert violation(again.adapt([[0.1]], Gaussians([[0.3, 0.9]], [1e-4 * np.eye(2)]), tolerance=0)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: base().constrained((WHERE, 1, 2)), "constraints: tuple given, LinearConstraints needed"),
+        (
+            lambda: base().constrained(LinearConstraints([[1.0], [1.0]], [[0, 1], [0, -1]], [0.5, 0.5])),
+            r"The constraints cannot be met together: \d is missed by",
+        ),
+        (lambda: base("low_rank").constrained(LOW), 'representation "low_rank" given, "dense" needed'),
+        (lambda: base().constrained(LinearConstraints([[1.0]], [[1.0]], [0.0])), "1 outputs given, 2 needed"),
+        (lambda: base().constrained(LinearConstraints([[1.0, 2.0]], [[1.0, 0]], [0.0])), "2 inputs given, 1 needed"),
+        (lambda: LinearConstraints([[1.0]], [[0.0, 0.0]], [0.0]), r"normals\[0\] is 0, and must have a direction"),
+        (lambda: LinearConstraints([[1.0]], [[0.0, 1.0]], [np.nan]), r"bounds\[0\] is nan"),
+    ],
+)
+def test_what_cannot_be_obeyed_is_refused_with_what_could(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()

@@ -1,0 +1,235 @@
+"""Derivatives as observations: a via-point that carries its Jacobian, and velocities."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import kmp
+from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed
+from kmp.functionals import Functionals
+from kmp.kernel import between, variances
+
+RANDOM = np.random.default_rng(0)
+S = RANDOM.normal(size=(60, 4))
+TRUTH = lambda s: np.stack([np.sin(s[:, 0]), s[:, 1] * s[:, 2], np.cos(s[:, 3])], axis=1)  # noqa: E731
+REFERENCE = Gaussians(TRUTH(S), np.tile(1e-3 * np.eye(3), (60, 1, 1)))
+PLACE = S[:1] + 0.1
+FOLLOW = np.eye(3, 4)[None]  # the output follows the first three inputs
+KERNELS = {
+    "one length": GaussianKernel(0.3),
+    "a length an input": GaussianKernel([0.3, 0.5, 0.2, 0.4]),
+    "periodic": PeriodicKernel(0.5, 2.5),
+    "velocity": VelocityKernel(0.7),
+}
+
+
+def base(representation="dense", kernel="a length an input", **options):
+    options = {"lambda_mean": 1.0, "prior_mean": [0.1, 0.2, 0.3]} | options
+    return KMP.fit(S, REFERENCE, kernel=KERNELS[kernel], representation=representation, **options)
+
+
+def taught(one, deviation=1e-4):
+    desired = Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)])
+    return one.adapt(PLACE, desired, tolerance=0.3).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_kernel_of_derivatives_is_the_derivative_of_the_kernel(name):
+    kernel, h = KERNELS[name], 1e-5
+    i = 4 if name in {"one length", "a length an input"} else 1
+    a, u, b, v = (0.5 * RANDOM.normal(size=(n, i)) for n in (5, 5, 4, 4))
+    u[1], v[2] = 0, 0
+    c = kernel.channels
+
+    def at(t, r):
+        return kernel(a + t * u, b + r * v).reshape(5, c, 4, c)
+
+    once_a, once_b = (at(h, 0) - at(-h, 0)) / (2 * h), (at(0, h) - at(0, -h)) / (2 * h)
+    twice = (at(h, h) - at(h, -h) - at(-h, h) + at(-h, -h)) / (4 * h * h)
+    is_a, is_b = u.any(axis=1)[:, None, None, None], v.any(axis=1)[None, None, :, None]
+    wanted = np.where(is_a & is_b, twice, np.where(is_a, once_a, np.where(is_b, once_b, at(0, 0))))
+    one, other = Functionals(a, u), Functionals(b, v)
+    found = between(kernel, one, other)
+    np.testing.assert_allclose(found.reshape(5, c, 4, c), wanted, atol=3e-5)
+    np.testing.assert_allclose(between(kernel, other, one), found.T, atol=1e-12)
+    np.testing.assert_allclose(variances(kernel, one).ravel(), np.diagonal(between(kernel, one, one)), rtol=1e-9)
+    whole = Functionals.concatenated([one, other])
+    assert np.linalg.eigvalsh(between(kernel, whole, whole))[0] > -1e-9
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("kernel", ["one length", "a length an input"])
+def test_a_taught_jacobian_is_the_jacobian_there_and_the_place_is_still_met(representation, kernel):
+    one = taught(base(representation, kernel))
+    np.testing.assert_allclose(one.jacobian(PLACE[0]), FOLLOW[0], atol=1e-5)
+    np.testing.assert_allclose(one.mean(PLACE), TRUTH(S[:1]), atol=1e-5)
+    step = 0.01 * RANDOM.normal(size=(5, 4))
+    follows = TRUTH(S[:1]) + step @ FOLLOW[0].T
+    np.testing.assert_allclose(one.mean(PLACE + step), follows, atol=1e-3)
+    bare = base(representation, kernel).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    assert np.abs(bare.mean(PLACE + step) - follows).max() > 4e-3
+
+
+def test_one_point_with_its_jacobian_says_what_thirteen_points_say():
+    step = np.concatenate([np.zeros((1, 4)), 0.03 * np.eye(4), -0.03 * np.eye(4)])
+    around = Gaussians(TRUTH(S[:1]) + step @ FOLLOW[0].T, np.tile(1e-8 * np.eye(3), (9, 1, 1)))
+    nine, one = base().adapt(PLACE + step, around, tolerance=0.3), taught(base())
+    queries = PLACE + 0.01 * RANDOM.normal(size=(20, 4))
+    np.testing.assert_allclose(one.mean(queries), nine.mean(queries), atol=1e-3)
+    np.testing.assert_allclose(one.jacobian(queries[0]), nine.jacobian(queries[0]), atol=0.05)
+
+
+def naive(one, queries):
+    """Equations (8) and (9) and the covariance of IJRR 2019 for functionals, as they stand."""
+    known, n = one._solution.database.functionals, len(one.inputs)
+    sigma = np.zeros((n, 3, n, 3))
+    sigma[np.arange(n), :, np.arange(n)] = one.reference.covariance
+    m = np.kron(between(one.kernel, known, known), np.eye(3)) + one.lambda_mean * sigma.reshape(3 * n, 3 * n)
+    k = np.kron(between(one.kernel, Functionals(queries), known), np.eye(3))
+    right = one.reference.mean - known.values[:, None] * one.prior_mean
+    mean = (k @ np.linalg.solve(m, right.ravel())).reshape(-1, 3) + one.prior_mean
+    left = np.eye(3 * len(queries)) - k @ np.linalg.solve(m, k.T)
+    blocks = [left[i : i + 3, i : i + 3] for i in range(0, len(left), 3)]
+    return mean, np.array(blocks) * len(one.base.inputs) / one.lambda_covariance
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
+    one = taught(base(representation), deviation=0.1)
+    queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
+    mean, covariance = naive(one, queries)
+    found = one.predict(queries)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-8)
+    for query, wanted in zip(queries, covariance, strict=True):
+        np.testing.assert_allclose(one.predict(query[None]).covariance[0], wanted, rtol=1e-5, atol=1e-8)
+        moving = one.predict_motion(query, np.ones(4), np.zeros(4))
+        np.testing.assert_allclose(moving.covariance, wanted, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_was(representation):
+    before = base(representation).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    after = taught(base(representation))
+    near, far = PLACE + 0.05, np.full((1, 4), 9.0)
+    a, b = (np.trace(one.predict(near).covariance[0]) for one in (before, after))
+    assert b < 0.5 * a
+    a, b = (one.predict(far) for one in (before, after))
+    np.testing.assert_allclose(b.mean, a.mean, atol=1e-9)
+    np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("kernel", ["one length", "a length an input"])
+def test_the_motion_of_one_query_is_that_of_finite_differences_compiled_or_not(representation, kernel, monkeypatch):
+    one, h = taught(base(representation, kernel)), 1e-4
+    s, v, a = PLACE[0] + 0.03, *RANDOM.normal(size=(2, 4))
+    behind, here, ahead = one.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
+    found, plain = one.predict_motion(s, v, a), one._query.motion(s, v, a, covariance=True)
+    for motion in (found, plain):
+        np.testing.assert_allclose(motion.mean, here, atol=1e-9)
+        np.testing.assert_allclose(motion.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(motion.acceleration, (ahead - 2 * here + behind) / h**2, rtol=1e-3, atol=1e-3)
+    for compiled, other in zip(found, plain, strict=True):
+        np.testing.assert_allclose(compiled, other, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(one.curvature(s, v), found.curvature, atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", ["periodic", "velocity"])
+def test_over_time_a_derivative_can_be_taught_too(kernel):
+    t = np.linspace(0, 2.4, 50)[:, None]
+    w = 2 * np.pi / 2.5
+    mean = np.hstack([np.sin(w * t), w * np.cos(w * t)])
+    reference = Gaussians(mean, np.tile(np.diag([1e-3, 1e-2]), (50, 1, 1)))
+    one = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
+    wanted = Gaussians([[5.0, 2.0]], [1e-8 * np.eye(2)])
+    adapted, h = one.adapt([[0.6]], wanted, tolerance=0, directions=[[1.0]]), 1e-5
+    ahead, behind = adapted.mean([[0.6 + h]]), adapted.mean([[0.6 - h]])
+    np.testing.assert_allclose((ahead - behind) / (2 * h), wanted.mean, atol=1e-3)
+    np.testing.assert_allclose(adapted.jacobian([0.6])[:, 0], [5.0, 2.0], atol=1e-3)
+    bend = (adapted.jacobian([0.9 + h]) - adapted.jacobian([0.9 - h]))[:, 0] / (2 * h)
+    np.testing.assert_allclose(adapted.curvature([0.9], [1.0]), bend, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_a_velocity_is_a_derivative_along_the_inputs_velocity(representation):
+    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians([[0.1, 0.2, -0.3]], [1e-8 * np.eye(3)])
+    one = base(representation).adapt(PLACE, wanted, tolerance=9.0, directions=v)
+    np.testing.assert_allclose(one.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, wanted.mean[0], atol=1e-5)
+    assert len(one.inputs) == 61  # no reference point gave way
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_a_database_may_hold_derivatives_from_the_start(representation):
+    inputs = np.concatenate([S[:30], np.repeat(S[:10], 4, axis=0)])
+    directions = np.concatenate([np.zeros((30, 4)), np.tile(np.eye(4), (10, 1))])
+    h = 1e-6
+    rates = (TRUTH(inputs[30:] + h * directions[30:]) - TRUTH(inputs[30:] - h * directions[30:])) / (2 * h)
+    means, noise = np.concatenate([TRUTH(S[:30]), rates]), np.tile(1e-6 * np.eye(3), (70, 1, 1))
+    options = {"kernel": GaussianKernel(0.3), "lambda_mean": 1.0, "representation": representation}
+    one = KMP.fit(inputs, Gaussians(means, noise), directions=directions, **options)
+    values = KMP.fit(S[:30], Gaussians(means[:30], noise[:30]), **options)
+    near = S[:10] + 0.2
+    a, b = (np.sqrt(((found.mean(near) - TRUTH(near)) ** 2).mean()) for found in (values, one))
+    assert b < 0.5 * a
+    np.testing.assert_allclose(one.mean(near), KMP.from_arrays(one.to_arrays()).mean(near), atol=0)
+    again = one.refitted(one.reference)
+    assert np.array_equal(again.mean(near), one.mean(near))
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_files_and_pickles_give_it_back_bit_for_bit_and_more_can_be_taught(tmp_path, representation):
+    one = taught(base(representation))
+    kmp.save(tmp_path / "skill", one, input_unit="m", output_unit="m")
+    for again in (kmp.load(tmp_path / "skill").primitive, pickle.loads(pickle.dumps(one))):
+        assert np.array_equal(again.mean(S), one.mean(S))
+        assert np.array_equal(again.predict(PLACE).covariance, one.predict(PLACE).covariance)
+        more = Gaussians(TRUTH(S[5:6]) + 0.1, [1e-6 * np.eye(3)])
+        a, b = (x.adapt(S[5:6], more, tolerance=0.1) for x in (one, again))
+        assert np.array_equal(a.mean(S), b.mean(S))
+        np.testing.assert_allclose(a.jacobian(PLACE[0]), FOLLOW[0], atol=1e-4)
+
+
+def test_so_many_derivatives_that_the_low_rank_solution_is_fitted_anew():
+    options = {"kernel": "one length"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)
+        dense, low = (
+            base(r, **options).adapt_jacobian(S[:20], np.tile(FOLLOW, (20, 1, 1)), deviation=0.3)
+            for r in ("dense", "low_rank")
+        )
+    assert len(low.inputs) == 60 + 80
+    np.testing.assert_allclose(low.mean(S), dense.mean(S), atol=1e-5)
+    assert np.linalg.norm(low.mean(S) - dense.mean(S), axis=1).max() <= low.error_bound
+    np.testing.assert_allclose(low.predict(S).covariance, dense.predict(S).covariance, rtol=1e-3, atol=1e-6)
+
+
+def test_jacobians_that_contradict_are_named():
+    twice = np.concatenate([PLACE, PLACE])
+    with pytest.warns(ViaPointMissed, match=r"0 by .* deviations") as told:
+        one = base().adapt_jacobian(twice, np.concatenate([FOLLOW, -FOLLOW]), deviation=1e-2)
+    assert told[0].filename == __file__
+    np.testing.assert_array_equal(one.via_directions, np.tile(np.eye(4), (2, 1)))
+    assert base().via_directions.shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: base().adapt_jacobian(PLACE, FOLLOW[0], deviation=1), r"jacobians: shape \(3, 4\) given, \(1, 3, 4\)"),
+        (lambda: base().adapt_jacobian(PLACE, FOLLOW, deviation=0), "deviation is 0, and must be finite and above 0"),
+        (
+            lambda: base().adapt(PLACE, REFERENCE.take(slice(0, 1)), tolerance=0, directions=[1.0]),
+            r"directions: shape \(1,\) given, \(1, 4\) needed",
+        ),
+        (
+            lambda: KMP.fit(S, REFERENCE, kernel=GaussianKernel(1.0), lambda_mean=1, directions=S[:3]),
+            r"directions: shape \(3, 4\) given, \(60, 4\) needed",
+        ),
+    ],
+)
+def test_what_is_no_derivative_is_refused_with_what_would_be(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()

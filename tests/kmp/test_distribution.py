@@ -1,0 +1,81 @@
+"""kmp as a distribution of its own: what it needs and holds, and that it serves without Numba."""
+
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+
+import numpy as np
+import pytest
+from tests_paths import ROOT
+
+import kmp
+from kmp import KMP, GaussianKernel, Gaussians
+
+WITHOUT_NUMBA = """
+import json, sys
+sys.path[:0] = [{site!r}, {libraries!r}]
+sys.modules["numba"] = None
+import numpy as np
+import kmp
+from kmp.compiled import AVAILABLE
+from kmp import KMP, GaussianKernel, Gaussians
+s = np.linspace(0, 2, 40)[:, None] * [1.0, -0.5]
+one = KMP.fit(s, Gaussians(np.sin(s), np.tile(1e-3 * np.eye(2), (40, 1, 1))), kernel=GaussianKernel(2.0), lambda_mean=1)
+one = one.adapt_jacobian(s[5:6], [np.eye(2)], deviation=0.1)
+found = one.predict_motion([0.3, 0.2], [1.0, 0.5], [0.0, 0.1])
+print(json.dumps([kmp.__file__, AVAILABLE, *(np.asarray(part).tolist() for part in found)]))
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT / "kmp", folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(folder), str(folder / "source")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    [path] = folder.glob("kmp-*.whl")
+    return path
+
+
+def test_it_holds_this_tree_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+        metadata = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
+    assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "kmp").rglob("*.py")} | {"kmp/py.typed"}
+    needed = {line.removeprefix("Requires-Dist: ") for line in metadata.splitlines() if line.startswith("Requires-D")}
+    assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scikit-learn>=1.6", "scipy>=1.14"}
+    assert any(line.startswith("numba") and "extra == 'fast'" in line for line in needed)
+    assert wheel.stat().st_size < 250_000
+
+
+def test_it_needs_what_the_project_needs_of_the_same():
+    whole, alone = (tomllib.loads((ROOT / path).read_text()) for path in ("pyproject.toml", "kmp/pyproject.toml"))
+    extra = alone["project"]["optional-dependencies"]["fast"]
+    assert {*alone["project"]["dependencies"], *extra} <= set(whole["project"]["dependencies"])
+    assert alone["project"]["requires-python"] == whole["project"]["requires-python"]
+
+
+def test_installed_without_numba_it_predicts_the_same(wheel, tmp_path):
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    code = WITHOUT_NUMBA.format(site=str(tmp_path), libraries=sysconfig.get_path("purelib"))
+    command = [sys.executable, "-I", "-S", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    where, compiled, *found = json.loads(done.stdout)
+    assert where.startswith(str(tmp_path))
+    assert not compiled
+    s = np.linspace(0, 2, 40)[:, None] * [1.0, -0.5]
+    reference = Gaussians(np.sin(s), np.tile(1e-3 * np.eye(2), (40, 1, 1)))
+    one = KMP.fit(s, reference, kernel=GaussianKernel(2.0), lambda_mean=1)
+    one = one.adapt_jacobian(s[5:6], [np.eye(2)], deviation=0.1)
+    wanted = one.predict_motion([0.3, 0.2], [1.0, 0.5], [0.0, 0.1])
+    assert kmp.__file__ != where
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)

@@ -1,0 +1,51 @@
+"""The estimator by scikit-learn's own rules, and as part of its pipelines and searches."""
+
+import warnings
+
+import numpy as np
+import pytest
+from sklearn.exceptions import NotFittedError, SkipTestWarning
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils.estimator_checks import check_estimator
+
+from kmp.estimator import KMPRegressor
+
+RANDOM = np.random.default_rng(0)
+X = RANDOM.uniform(-2, 2, size=(150, 2))
+Y = np.stack([np.sin(2 * X[:, 0]) * X[:, 1], 100 + 50 * np.cos(X[:, 1])], axis=1)
+
+
+@pytest.mark.parametrize("components", [None, 2])
+def test_scikit_learns_own_checks_pass(components):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SkipTestWarning)  # of checks that need other packages
+        check_estimator(KMPRegressor(components=components))
+
+
+def test_it_learns_outputs_of_any_unit_and_tells_how_sure_it_is():
+    noisy = Y + [0.02, 1.0] * RANDOM.normal(size=Y.shape)
+    one = KMPRegressor().fit(X[:120], noisy[:120])
+    assert one.score(X[120:], Y[120:]) > 0.95
+    mean, deviation = one.predict(np.array([X[0], [9.0, 9.0]]), return_std=True)
+    assert mean.shape == deviation.shape == (2, 2)
+    assert (deviation[1] > 3 * deviation[0]).all()
+    np.testing.assert_allclose(mean[1], noisy[:120].mean(axis=0), rtol=1e-3, atol=1e-3)
+    assert one.primitive_.jacobian(X[0]).shape == (2, 2)
+
+
+def test_it_is_found_in_pipelines_and_searches():
+    pipeline = make_pipeline(StandardScaler(), KMPRegressor(ell=1.0))
+    assert cross_val_score(pipeline, X, Y[:, 0], cv=3).min() > 0.9
+    search = GridSearchCV(KMPRegressor(), {"ell": [0.001, 0.5], "noise": [0.05, 0.2]}, cv=3).fit(X, Y[:, 0])
+    assert search.best_params_["ell"] == 0.5
+
+
+def test_what_cannot_be_done_is_refused():
+    with pytest.raises(NotFittedError):
+        KMPRegressor().predict(X)
+    with pytest.raises(ValueError, match="ell: 'wide' given"):
+        KMPRegressor(ell="wide").fit(X, Y)
+    with pytest.raises(ValueError, match="noise is 0, and must be finite and above 0"):
+        KMPRegressor(noise=0).fit(X, Y)

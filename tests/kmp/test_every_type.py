@@ -1,0 +1,165 @@
+"""What holds for every type: to a file and back, a short repr, and clear answers to wrong calls."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import kmp
+from kmp import (
+    KMP,
+    CoordinateFrame,
+    Correlation,
+    GaussianKernel,
+    GaussianMixture,
+    Gaussians,
+    LinearConstraints,
+    LocalKMP,
+    OrientationKMP,
+    PeriodicKernel,
+    VelocityKernel,
+)
+
+S = np.random.default_rng(0).normal(size=(20, 2))
+R = Gaussians(S, np.tile(0.01 * np.eye(2), (20, 1, 1)))
+EYES = np.tile(0.01 * np.eye(3), (20, 1, 1))
+K = GaussianKernel(1.0)
+ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
+CONSTRAINED = ONE.constrained(LinearConstraints(S[:3], S[:3], np.zeros(3)))
+TURNING = OrientationKMP(KMP.fit(S, Gaussians(0.1 * S @ np.eye(2, 3), EYES), kernel=K, lambda_mean=1.0), [0, 0, 0, 1])
+DEMONSTRATIONS = [(S, S + 0.1 * i) for i in range(3)]
+FRAMES = [(CoordinateFrame.at([0.1 * i, 0]), CoordinateFrame.at([0, 1])) for i in range(3)]
+LOCAL = LocalKMP.learn(DEMONSTRATIONS, FRAMES, S, kernel=K, lambda_mean=1.0, components=2, seed=0)
+NEUTRAL = Correlation.neutral(S[:2], width=1.0, outputs=2)
+LEARNED = kmp.learn(DEMONSTRATIONS, components=2, seed=0, count=20, kernel=K, lambda_mean=1.0)
+IMPROVED = kmp.improve(
+    ONE, lambda x: -float(x.sum()), S[:3], correlation=NEUTRAL, exploration=0.1, updates=1, rollouts=2, seed=0
+)
+VALUES = [
+    *(ONE, CONSTRAINED, ONE.adapt_jacobian(S[:1], [np.eye(2)], deviation=1.0), TURNING, LOCAL, FRAMES[1][0]),
+    *(R, GaussianMixture.fit(np.hstack([S, S]), components=2, seed=0), NEUTRAL, IMPROVED, LEARNED, LEARNED.scores[0]),
+    *(K, GaussianKernel([1.0, 2.0]), PeriodicKernel(1.0, 2.0), VelocityKernel(1.5), ONE.uncertainty(S)),
+    *(ONE.predict_motion(S[0], S[1], S[2]), ONE.predict_motion(S[0], S[1], S[2], covariance=False)),
+    *(LinearConstraints(S, S, S[:, 0]), LinearConstraints(S, S, S[:, 0], S)),
+]
+
+
+def same(a, b):
+    """Whether two values are the same, bit for bit."""
+    if isinstance(a, KMP):
+        return isinstance(b, KMP) and same(a.to_arrays(), b.to_arrays()) and np.array_equal(a.mean(S), b.mean(S))
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b) and a.dtype == b.dtype
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[name], b[name]) for name in a)
+    if isinstance(a, tuple):
+        return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(
+            same(getattr(a, n), getattr(b, n)) for n in (one.name for one in dataclasses.fields(a))
+        )
+    return a == b
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_each_goes_to_a_file_and_back_bit_for_bit(tmp_path, value):
+    kmp.save(tmp_path / "value", value, input_unit="m", output_unit="rad")
+    stored = kmp.load(tmp_path / "value")
+    assert same(value, stored.value)
+    assert (stored.input_unit, stored.output_unit) == ("m", "rad")
+    assert same(stored.primitive, value) if isinstance(value, KMP) else True
+
+
+def test_all_types_that_the_package_offers_are_among_them():
+    types = {name for name in kmp.__all__ if isinstance(getattr(kmp, name), type)}
+    offered = {n for n in types if not issubclass(getattr(kmp, n), Warning)} - {"Stored"}
+    assert offered == {type(value).__name__ for value in VALUES}
+
+
+def test_what_is_no_primitive_says_so_and_a_file_of_nothing_known_is_refused(tmp_path):
+    kmp.save(tmp_path / "value", R, input_unit="m", output_unit="m")
+    with pytest.raises(ValueError, match="the stored value: Gaussians given, KMP needed: take `value`"):
+        _ = kmp.load(tmp_path / "value").primitive
+    arrays = dict(np.load(tmp_path / "value"))
+    del arrays["checksum"]
+    np.savez(tmp_path / "other.npz", **(arrays | {"kind": np.array("Skill")}))
+    with pytest.raises(ValueError, match=r"other\.npz: kind: Skill given, one of KMP, .* needed"):
+        kmp.load(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match=r"value: ndarray given, one of KMP, .* needed"):
+        kmp.save(tmp_path / "value", S, input_unit="m", output_unit="m")
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_each_has_a_repr_of_a_line_that_names_it(value):
+    if isinstance(value, tuple):
+        return  # NumPy's own, of a few numbers
+    assert repr(value).startswith(type(value).__name__)
+    assert "\n" not in repr(value)
+    assert len(repr(value)) < 600
+
+
+def test_a_repr_tells_what_matters():
+    assert repr(ONE) == "KMP(20 points: 2 inputs, 2 outputs, GaussianKernel(ell=1.0), dense)"
+    assert repr(R) == "Gaussians(20 over 2 outputs)"
+    assert repr(K) == "GaussianKernel(ell=1.0)"
+    assert repr(FRAMES[0][0]) == "CoordinateFrame(matrix=array(2, 2), offset=array(2,))"
+
+
+def test_gaussians_are_chosen_by_index_as_numpy_would():
+    for index in (3, -1, slice(2, 5), [1, 2], S[:, 0] > 0, np.arange(0)):
+        chosen = R[index]
+        assert isinstance(chosen, Gaussians)
+        assert np.array_equal(chosen.mean, np.atleast_2d(R.mean[index]))
+        assert np.array_equal(chosen.covariance, R.covariance[np.atleast_1d(np.arange(20)[index])])
+    assert [len(one) for one in R] == [1] * 20
+    with pytest.raises(IndexError):
+        R[20]
+
+
+COMPLEX = np.full((1, 2), 1j)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: KMP.fit(S, R, kernel=8.0, lambda_mean=1), r"kernel: 8.0 given, a kernel needed: GaussianKernel\("),
+        (lambda: KMP.fit(S, R, kernel=GaussianKernel, lambda_mean=1), "kernel: <class .* given, a kernel needed"),
+        (lambda: KMP.fit(S, S, kernel=K, lambda_mean=1), r"reference: ndarray given, Gaussians needed: Gaussians\("),
+        (lambda: KMP.fit(S, R, kernel=K, lambda_mean=None), "lambda_mean: numbers of type object given, real ones"),
+        (lambda: KMP.fit(S, R, kernel=K, lambda_mean=1, rank=2.5), "rank is 2.5, and must be a whole number"),
+        (lambda: ONE.adapt(S[:1], S[:1], tolerance=0), "desired: ndarray given, Gaussians needed"),
+        (lambda: ONE.adapt(S[:1], R[:1], tolerance="near"), "tolerance: numbers of type <U4 given, real ones needed"),
+        (lambda: ONE.refitted(S), "ndarray given, Gaussians needed"),
+        (
+            lambda: kmp.learn(np.zeros((3, 50, 4)), components=2, seed=0),
+            r"demonstrations\[0\]: ndarray of shape \(50, 4\) given, a pair needed: inputs \(T, I\) and outputs",
+        ),
+        (lambda: kmp.learn([(S[None], S[None])], components=2, seed=0), r"shape \(1, 20, 2\) given, \(T, I\) needed"),
+        (lambda: ONE.curvature([np.nan, 0], [0, 0]), r"query\[0\] is nan, and every number must be finite"),
+        (lambda: ONE.mean([[np.inf, 0]]), r"queries\[0, 0\] is inf, and every number must be finite"),
+        (lambda: ONE.mean(COMPLEX), "queries: numbers of type complex128 given, real ones needed"),
+        (lambda: ONE.jacobian(COMPLEX[0]), "query: numbers of type complex128 given"),
+        (lambda: ONE.predict_motion(S[0], COMPLEX[0], S[0]), "velocity: numbers of type complex128 given"),
+        (lambda: ONE.uncertainty(COMPLEX), "queries: numbers of type complex128 given"),
+        (lambda: ONE.mean([["a", "b"]]), "queries: numbers of type <U1 given"),
+        (lambda: ONE.mean(None), "queries: numbers of type object given"),
+        (lambda: ONE.sample(S, 1.5, seed=0), "count is 1.5, and must be a whole number"),
+        (lambda: GaussianKernel(1j), "ell: numbers of type complex128 given"),
+        (lambda: VelocityKernel([1.0, 2.0]), r"ell: shape \(2,\) given, \(\) needed"),
+        (lambda: TURNING.angular_velocity(COMPLEX[0], S[0]), "query: numbers of type complex128 given"),
+        (lambda: TURNING.adapt(S[:1], [[0, 0, 0, 1]], 1j * np.eye(3), tolerance=0), "covariance: numbers of type"),
+        (lambda: OrientationKMP(S, [0, 0, 0, 1]), "primitive: ndarray given, KMP needed"),
+        (lambda: LOCAL.mean([[np.inf, 0]]), r"queries\[0, 0\] is inf"),
+        (lambda: kmp.superposed([S], [1.0]), r"references\[0\]: ndarray given, Gaussians needed"),
+        (lambda: kmp.superposed([R], [1j]), "priorities: numbers of type complex128 given"),
+        (lambda: R.product(S), "product: ndarray given, Gaussians needed"),
+        (lambda: NEUTRAL.applied(S), "primitive: ndarray given, KMP needed"),
+        (
+            lambda: LocalKMP.learn(np.zeros((3, 20, 2)), FRAMES, S, kernel=K, lambda_mean=1.0, components=2, seed=0),
+            r"demonstrations\[0\]: ndarray of shape \(20, 2\) given, a pair needed",
+        ),
+    ],
+)
+def test_a_wrong_call_is_answered_with_what_would_be_right(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()

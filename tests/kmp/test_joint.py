@@ -1,0 +1,131 @@
+"""Several queries together: their joint covariance, trajectories drawn, Jacobians in a batch."""
+
+import numpy as np
+import pytest
+
+from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel
+
+KERNELS = {"gaussian": GaussianKernel(0.5), "periodic": PeriodicKernel(0.5, 2.5), "velocity": VelocityKernel(2.0)}
+T = np.linspace(0, 2, 40)[:, None]
+QUERIES = np.concatenate([T[::8] + 0.01, [[5.0]]])
+
+
+def fitted(kernel="gaussian", representation="dense", adapted=False):
+    mean = np.hstack([np.sin(2 * T), 2 * np.cos(2 * T)])
+    root = 0.05 * np.random.default_rng(0).normal(size=(40, 2, 2))
+    reference = Gaussians(mean, root @ root.swapaxes(1, 2) + 1e-3 * np.eye(2))
+    options = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "representation": representation}
+    one = KMP.fit(T, reference, kernel=KERNELS[kernel], **options)
+    if not adapted:
+        return one
+    return one.adapt(
+        [[0.5], [1.51]], Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))), tolerance=0.02
+    )
+
+
+@pytest.fixture(params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)], ids=str)
+def skill(request):
+    return fitted(*request.param)
+
+
+def test_the_blocks_on_the_diagonal_are_the_covariances_of_each(skill):
+    joint, each = skill.predict_joint(QUERIES), skill.predict(QUERIES)
+    assert joint.mean.shape == (1, 12)
+    np.testing.assert_array_equal(joint.mean.reshape(6, 2), each.mean)
+    blocks = [joint.covariance[0][i : i + 2, i : i + 2] for i in range(0, 12, 2)]
+    np.testing.assert_allclose(blocks, each.covariance, rtol=1e-6, atol=1e-9)
+    assert np.linalg.eigvalsh(joint.covariance[0])[0] > 0
+
+
+def test_the_joint_covariance_is_that_of_the_naive_solution():
+    skill = fitted(adapted=True)
+    k = skill.kernel(skill.inputs, skill.inputs)
+    sigma = np.zeros((len(k), 2, len(k), 2))
+    sigma[np.arange(len(k)), :, np.arange(len(k))] = skill.reference.covariance
+    m = np.kron(k, np.eye(2)) + 3.0 * sigma.reshape(2 * len(k), -1)
+    row = np.kron(skill.kernel(QUERIES, skill.inputs), np.eye(2))
+    own = np.kron(skill.kernel(QUERIES, QUERIES), np.eye(2))
+    wanted = (own - row @ np.linalg.solve(m, row.T)) * 40 / 3.0
+    np.testing.assert_allclose(skill.predict_joint(QUERIES).covariance[0], wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_all_solutions_agree_on_how_queries_go_together(representation):
+    found = fitted(representation=representation, adapted=True).predict_joint(QUERIES).covariance
+    np.testing.assert_allclose(found, fitted(adapted=True).predict_joint(QUERIES).covariance, atol=1e-6)
+
+
+def test_trajectories_have_the_mean_and_the_joint_covariance_and_follow_from_the_seed():
+    skill = fitted()
+    drawn, joint = skill.sample(QUERIES, 20_000, seed=3), skill.predict_joint(QUERIES)
+    assert drawn.shape == (20_000, 6, 2)
+    flat, scale = drawn.reshape(20_000, -1), np.sqrt(np.diagonal(joint.covariance[0]))
+    np.testing.assert_allclose((flat.mean(axis=0) - joint.mean[0]) / scale, 0, atol=0.04)
+    np.testing.assert_allclose((np.cov(flat.T) - joint.covariance[0]) / np.outer(scale, scale), 0, atol=0.05)
+    np.testing.assert_array_equal(skill.sample(QUERIES, 2, seed=3), skill.sample(QUERIES, 2, seed=3))
+    assert not np.array_equal(skill.sample(QUERIES, 2, seed=3), skill.sample(QUERIES, 2, seed=4))
+
+
+def test_a_trajectory_is_smooth_where_points_drawn_alone_are_not():
+    skill, near = fitted(), np.linspace(0.7, 0.75, 30)[:, None]
+    path = skill.sample(near, 20, seed=0) - skill.mean(near)
+    alone = np.sqrt(skill.predict(near).covariance[:, 0, 0])
+    assert np.abs(np.diff(path, axis=1)).max() < 0.05 * alone.min()
+
+
+def test_jacobians_are_those_of_one_by_one(skill):
+    found = skill.jacobians(QUERIES)
+    assert found.shape == (6, 2, 1)
+    np.testing.assert_allclose(found, [skill.jacobian(s) for s in QUERIES], atol=1e-9)
+    assert skill.jacobians(QUERIES[:0]).shape == (0, 2, 1)
+
+
+def test_jacobians_of_more_queries_than_a_batch_over_several_inputs():
+    random = np.random.default_rng(0)
+    s, queries = random.normal(size=(50, 3)), random.normal(size=(600, 3))
+    reference = Gaussians(np.sin(s[:, :2]), np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+    skill = KMP.fit(s, reference, kernel=GaussianKernel([0.2, 0.3, 0.4]), lambda_mean=1.0)
+    found = skill.jacobians(queries)
+    for n in (0, 255, 256, 599):
+        np.testing.assert_allclose(found[n], skill.jacobian(queries[n]), atol=1e-9)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_a_rhythmic_skill_has_no_seam(representation):
+    phase = np.linspace(0, 2 * np.pi, 60, endpoint=False)[:, None]
+    mean = np.hstack([np.sin(phase), np.cos(2 * phase)])
+    reference = Gaussians(mean, np.tile(1e-4 * np.eye(2), (60, 1, 1)))
+    kernel = PeriodicKernel(1.0, 2 * np.pi)
+    one = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
+    via = one.adapt([[2 * np.pi - 0.02]], Gaussians([[0.2, 0.9]], [1e-8 * np.eye(2)]), tolerance=0.06)
+    assert list(via._changes.replaced) == [0]  # the nearest round the circle
+    a, b = np.zeros((1, 1)), np.full((1, 1), 2 * np.pi)
+    for skill in (one, via):
+        assert np.array_equal(skill.mean(a), skill.mean(b))
+        assert np.array_equal(skill.predict(a).covariance, skill.predict(b).covariance)
+        assert np.array_equal(skill.jacobian(a[0]), skill.jacobian(b[0]))
+        assert np.array_equal(skill.curvature(a[0], [1.0]), skill.curvature(b[0], [1.0]))
+        many = np.linspace(-9, 9, 7)[:, None]
+        np.testing.assert_allclose(skill.mean(many + 4 * np.pi), skill.mean(many), atol=1e-9)
+        just = np.array([[2 * np.pi - 1e-9], [1e-9]])
+        np.testing.assert_allclose(*skill.mean(just), atol=1e-7)
+    np.testing.assert_allclose(one.mean(phase), mean, atol=1e-2)
+    np.testing.assert_allclose(via.mean([[2 * np.pi - 0.02]]), [[0.2, 0.9]], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: fitted().predict_joint(np.empty((0, 1))), "queries: none given, at least 1 needed"),
+        (lambda: fitted().sample(QUERIES, 0, seed=0), "count is 0, and must be at least 1"),
+        (lambda: fitted().jacobians([0.0]), r"queries: shape \(1,\) given, \(M, 1\) needed"),
+        (lambda: PeriodicKernel(1.0, 0.0), "period is 0, and must be finite and above 0"),
+        (
+            lambda: KMP.fit([[0, 0]], Gaussians([[0]], [[[1]]]), kernel=PeriodicKernel(1.0, 1.0), lambda_mean=1),
+            "2 inputs given; a periodic kernel needs 1",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_what_could(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()

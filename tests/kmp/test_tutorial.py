@@ -1,0 +1,25 @@
+"""The tutorial's blocks of code, run in order as they stand."""
+
+import re
+
+import pytest
+from tests_paths import ROOT
+
+PAGE = ROOT / "kmp" / "README.md"
+BLOCKS = [
+    (PAGE.read_text(encoding="utf-8")[: match.start(1)].count("\n"), match.group(1))
+    for match in re.finditer(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+]
+
+
+def test_the_tutorial_runs_as_it_stands_and_shows_what_it_says():
+    names: dict[str, object] = {}
+    for line, block in BLOCKS:
+        code = compile("\n" * line + block, str(PAGE), "exec")  # so that a failure names the page's line
+        exec(code, names)
+
+
+@pytest.mark.parametrize("subject", ["learn", "predict", "adapt", "uncertainty", "OrientationKMP", "PeriodicKernel"])
+def test_each_subject_has_a_block_that_checks_itself(subject):
+    assert any(subject in block for _, block in BLOCKS)
+    assert sum("assert" in block for _, block in BLOCKS) > 0.8 * len(BLOCKS) - 2
