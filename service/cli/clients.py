@@ -29,6 +29,8 @@ def via_points(args: argparse.Namespace) -> int:
         print(f"{point['name']:<16} tool {tool}   missed by {1000 * point['missed_by_m']:.1f} mm")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
+    for warning in reply.get("warnings", ()):
+        print(f"warning: {warning}", file=sys.stderr)
     return 0
 
 

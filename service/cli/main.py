@@ -151,8 +151,9 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "learn",
-        "Learns a skill from demonstrations.",
-        "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz",
+        "Learns a skill from demonstrations and judges it by leaving out one at a time. Where it would be unsafe, "
+        "exit 1 and no file.",
+        "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
     )
     c.add_argument(
         "demonstrations",
@@ -162,7 +163,18 @@ def parser() -> argparse.ArgumentParser:
         help="MCAP files with hands/left, hands/right and tool/pose",
     )
     c.add_argument("--output", metavar="FILE", type=Path, required=True, help="the skill, .npz")
+    c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
+    c.add_argument("--config", metavar="FILE", type=Path, help="settings of the cell, for the arm's reach")
+    c.add_argument("--points", metavar="N", type=_count, default=200, help="of the reference (default: %(default)s)")
+    c.add_argument("--ell", metavar="L", type=_positive, help="of the kernel [1/m²] (default: chosen; mixture: 5)")
+    c.add_argument(
+        "--components",
+        metavar="K",
+        type=_count,
+        help="take the reference from a mixture of K, the paper's way (default: from the demonstrations themselves)",
+    )
+    c.add_argument("--penalty", metavar="L", type=_positive, help="the mixture's lambda (default: 2)")
     c.add_argument(
         "--seed", type=int, default=0, help="of the mixture's start and the sampled inputs (default: %(default)s)"
     )
@@ -257,6 +269,19 @@ def _rate(given: str) -> int:
     if given.isdecimal() and low <= int(given) <= high:
         return int(given)
     raise argparse.ArgumentTypeError(f"{given} given, {low} to {high} Hz needed")
+
+
+def _count(given: str) -> int:
+    if given.isdecimal() and 1 <= int(given) <= 2500:
+        return int(given)
+    raise argparse.ArgumentTypeError(f"{given} given, 1 to 2500 needed")
+
+
+def _positive(given: str) -> float:
+    with contextlib.suppress(ValueError):
+        if 1e-3 <= float(given) <= 1e4:
+            return float(given)
+    raise argparse.ArgumentTypeError(f"{given} given, 0.001 to 10000 needed")
 
 
 def _reach(sub: argparse.ArgumentParser) -> None:

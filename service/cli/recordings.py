@@ -6,12 +6,16 @@ import argparse
 import sys
 import time
 
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
 from service.client import UnreachableError, open_session
+from service.config import load
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
+from service.learning.judgement import table
+from service.learning.learn import Evidence
 from service.learning.learn import learn as learned
+from service.learning.picture import draw
 from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.mcap_file import ends_early
 from service.recorder.replay import replay as replayed
@@ -72,7 +76,9 @@ def replay(args: argparse.Namespace) -> int:
 
 
 def learn(args: argparse.Namespace) -> int:
-    """Exit code 0 once the skill is written."""
+    """Exit code 0 once the skill is written; 1, and nothing written, where it would be unsafe."""
+    for path in filter(None, (args.output, args.plot)):
+        check_writable(path)
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(path, say=lambda line: print(line, file=sys.stderr, flush=True))
@@ -80,12 +86,26 @@ def learn(args: argparse.Namespace) -> int:
         lasts_s = demonstration.period_s * count
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
         demonstrations.append(demonstration)
+    evidence: list[Evidence] = []
     skill = learned(
         demonstrations,
         name=args.name or args.output.stem,
+        names=[path.stem for path in args.demonstrations],
+        components=args.components,
+        points=args.points,
+        ell=args.ell,
+        penalty=args.penalty,
         seed=args.seed,
+        reach=load(args.config).reach if args.config else None,
         progress=lambda line: print(line, file=sys.stderr, flush=True),
+        show=evidence.append,
     )
+    figures = evidence[0].figures
+    print(table(figures))
+    if args.plot:
+        draw(evidence[0], args.plot)
+    if figures.unsafe:
+        raise ExplainedError(f"{args.output} is not written: {'; '.join(figures.unsafe)}")
     args.output.write_bytes(skill.file)
     print(
         f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where the "

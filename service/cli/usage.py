@@ -4,6 +4,7 @@ files are, and free ports.
 
 from __future__ import annotations
 
+import os
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,17 @@ SHIPPED_SKILL = "soldering.npz"
 
 class UsageError(ValueError):
     """A command line that cannot be meant."""
+
+
+def check_writable(path: Path) -> None:
+    """Raises UsageError where no file can be written under this name: asked before long work."""
+    folder = path.parent
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder, the name of a file needed")
+    if not folder.is_dir():
+        raise UsageError(f"{path}: there is no folder {folder}")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise UsageError(f"{path} cannot be written: no permission")
 
 
 def recordings() -> Path:

@@ -83,10 +83,14 @@ class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The answer to a request: the tick from which it holds, and the via-points in force."""
+    """The answer to a request: the tick from which it holds, and the via-points in force.
+
+    `warnings` say which of them are missed by more than 5 mm, and which others were moved by more.
+    """
 
     tick: int
     points: tuple[ViaPointInForce, ...] | None = None
+    warnings: tuple[str, ...] = ()
 
 
 class RequestError(ExplainedError, ValueError):

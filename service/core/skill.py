@@ -44,9 +44,10 @@ class Skill:
     workspace: Vector  # (2, 3) lower and upper corner for targets [m]
     threshold: float  # [m] a deviation above it is far from the demonstrations
     learned_from: str  # hash of the demonstrations
-    components: int = 0  # of the mixture that it was learned with
+    components: int = 0  # of the mixture that it was learned with, 0 for none
     via_points: tuple[ViaPoint, ...] = ()
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
+    figures: str = ""  # JSON of what was found in learning; empty where it was not judged
     file: bytes = field(default=b"", repr=False)  # all of the above, as it is stored and recorded
 
     def predict(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from service.contract.messages import BASE
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
@@ -24,6 +25,7 @@ class Demonstration(NamedTuple):
     left: Vector
     right: Vector
     tool: Vector
+    frame: str = BASE
 
     @property
     def hands(self) -> Vector:
@@ -37,7 +39,9 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
-        return Demonstration(self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step])
+        return Demonstration(
+            self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step], self.frame
+        )
 
 
 def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:
@@ -45,9 +49,9 @@ def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vect
 
     With a tool that lags, one position of the hands would go with two of the tool.
     """
-    if len({len(part) for part in demonstration}) > 1:
+    if len({len(part) for part in demonstration[:4]}) > 1:
         counts = ", ".join(
-            f"{len(part)} {name}" for name, part in zip(Demonstration._fields, demonstration, strict=True)
+            f"{len(part)} {name}" for name, part in zip(Demonstration._fields[:4], demonstration[:4], strict=True)
         )
         raise SkillError(f"a demonstration of {counts}: as many of each needed")
     hands, tool, period_s = demonstration.hands, demonstration.tool, demonstration.period_s

@@ -1,86 +1,182 @@
-"""Learning: from demonstrations to a skill.
+"""Learning: from demonstrations to a skill, judged by demonstrations that were held out.
 
-A mixture by EM, its regression at sampled inputs, a KMP of that reference.
+By default a KMP whose reference points are the demonstrations' own, its hyper-parameters chosen by
+leaving one demonstration out. With a number of components, the paper's way: a mixture by EM, its
+regression at sampled inputs, a KMP of that with parameters as given.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from service.config import Reach
 from service.core.frame import Vector
 from service.core.skill import Skill
+from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, in_phase
+from service.learning.gate import deviations, gate
+from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.skill_file import SkillError, with_file
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
-GATE = 2.0  # times the largest deviation along a demonstration that was held out is off the data
+ELL, PENALTY = 5.0, 2.0  # of the paper's way, in metres
+
+
+class Evidence(NamedTuple):
+    """What a skill is judged by: hands (T, 6) and tool (T, 3) [m] of each demonstration, and what
+    the others' primitive predicts of it.
+    """
+
+    skill: Skill
+    figures: Figures
+    paths: Sequence[tuple[Vector, Vector]]
+    held_out: Sequence[HeldOut]
+
+
+Fit = Callable[[Sequence[int]], KMP]  # the primitive of the demonstrations with these indices
 
 
 def learn(
     demonstrations: Sequence[Demonstration],
     *,
     name: str = "skill",
-    components: int = 10,
+    names: Sequence[str] = (),
+    components: int | None = None,
     points: int = 200,
-    ell: float = 5.0,
-    penalty: float = 2.0,
+    ell: float | None = None,
+    penalty: float | None = None,
     spread_m: float = 0.01,
     seed: int = 0,
+    reach: Reach | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    show: Callable[[Evidence], None] = lambda evidence: None,
 ) -> Skill:
-    """The skill of some demonstrations: a mixture (EM), its regression at sampled inputs, a KMP.
+    """The skill of some demonstrations, with its figures.
 
-    Raises SkillError.
+    `ell` [1/m²] not given is chosen. With `components` a mixture of so many makes the reference,
+    `ell` and `penalty` (lambda) are as in the paper, in metres, and `spread_m` is added to the
+    reference's standard deviation. `names` are those of the demonstrations in the figures; `reach`
+    is the arm's; `show` is given what the skill is judged by.
 
-    ell [1/m²] and penalty (lambda) as in the paper, in metres; `spread_m` is added to the
-    reference's standard deviation.
+    Raises SkillError where nothing can be learned. A skill that is learned and unsafe says so in
+    its figures.
     """
     if not demonstrations:
         raise SkillError("no demonstrations given, at least 1 needed")
+    if components is None and penalty is not None:
+        raise SkillError("a penalty goes with a number of components: without them it is chosen")
     pairs = [in_phase(demonstration) for demonstration in demonstrations]
-
-    def fitted(samples: Vector) -> KMP:
-        try:
-            mixture = GaussianMixture.fit(samples, components=components, seed=seed)
-            inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)
-            reference = mixture.regress(inputs)
-            reference = Gaussians(reference.mean, reference.covariance + spread_m**2 * np.eye(3))
-            return KMP.fit(
-                inputs,
-                reference,
-                kernel=GaussianKernel(ell),
-                lambda_mean=penalty,
-                prior_mean=samples[:, 6:].mean(axis=0),
+    names = list(names) or [f"demonstration {i + 1}" for i in range(len(pairs))]
+    twins = repeated(pairs)
+    remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
+    kept = [i for i in range(len(pairs)) if i not in twins]
+    demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
+    paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
+    try:
+        if components is None:
+            progress(f"choosing parameters over {len(paths)} demonstrations")
+            fit = _from_demonstrations(paths, points, ell)
+        else:
+            fit = _from_mixture(
+                paths,
+                components=components,
+                points=points,
+                ell=ell or ELL,
+                penalty=penalty or PENALTY,
+                spread_m=spread_m,
+                seed=seed,
             )
-        except ValueError as error:
-            raise SkillError(f"cannot learn from {len(samples)} samples: {error}") from None
-
-    each = [np.hstack([hands, tool[:, :3]]) for hands, tool in pairs]
-    samples = np.concatenate(each)
-    deviations = []
-    for i, held_out in enumerate(each):
-        progress(f"holding out demonstration {i + 1} of {len(each)}")
-        others = np.concatenate(each[:i] + each[i + 1 :]) if len(each) > 1 else held_out
-        covariance = fitted(others).predict(held_out[:, :6]).covariance
-        deviations.append(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3).max())
-    progress(f"learning from all {len(each)}")
+        progress(f"learning from all {len(paths)}")
+        primitive = fit(range(len(paths)))
+        held_out = list(_held_out(paths, fit, progress))
+    except ValueError as error:
+        if isinstance(error, SkillError):
+            raise
+        raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
+    found = gate(
+        primitive,
+        np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in paths]),
+        np.concatenate([one.deviations for one in held_out]),
+        calibration=_calibration(held_out) if components else 1.0,
+    )
+    judged = figures(demonstrations, paths, names, held_out, found, reach=reach or Reach(), remarks=remarks)
+    tools = np.concatenate([pairs[i][1] for i in kept])
     skill = Skill(
         name=name,
-        primitive=fitted(samples),
-        orientation=mean_orientation(np.concatenate([tool[:, 3:] for _, tool in pairs])),
-        workspace=np.stack([samples[:, 6:].min(axis=0) - MARGIN_M, samples[:, 6:].max(axis=0) + MARGIN_M]),
-        threshold=float(GATE * max(deviations)),
+        primitive=primitive,
+        orientation=mean_orientation(tools[:, 3:]),
+        workspace=np.stack([tools[:, :3].min(axis=0) - MARGIN_M, tools[:, :3].max(axis=0) + MARGIN_M]),
+        threshold=found.threshold,
         learned_from=hashlib.blake2b(
             b"".join(d.hands.tobytes() + d.tool.tobytes() for d in demonstrations), digest_size=16
         ).hexdigest(),
-        components=components,
+        components=components or 0,
+        figures=msgspec.json.encode(judged).decode(),
     )
-    return with_file(skill)
+    skill = with_file(skill)
+    show(Evidence(skill, judged, paths, held_out))
+    return skill
+
+
+def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
+    choice = Choice.of(paths, points)
+    parameters = choice.parameters(ell)
+    residuals = choice.residuals(parameters.ell, parameters.noise)
+
+    def fit(members: Sequence[int]) -> KMP:
+        (without,) = {*range(len(paths))} - {*members} or {None}
+        return choice.primitive(parameters, residuals, without=without)
+
+    return fit
+
+
+def _from_mixture(
+    paths: Sequence[tuple[Vector, Vector]],
+    *,
+    components: int,
+    points: int,
+    ell: float,
+    penalty: float,
+    spread_m: float,
+    seed: int,
+) -> Fit:
+    def fit(members: Sequence[int]) -> KMP:
+        samples = np.concatenate([np.hstack(paths[i]) for i in members])
+        mixture = GaussianMixture.fit(samples, components=components, seed=seed)
+        inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)
+        reference = mixture.regress(inputs)
+        return KMP.fit(
+            inputs,
+            Gaussians(reference.mean, reference.covariance + spread_m**2 * np.eye(3)),
+            kernel=GaussianKernel(ell),
+            lambda_mean=penalty,
+            prior_mean=samples[:, 6:].mean(axis=0),
+        )
+
+    return fit
+
+
+def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callable[[str], None]) -> Iterator[HeldOut]:
+    """What is predicted of each demonstration from the others; of a single one, from itself."""
+    for h, (hands, tool) in enumerate(paths):
+        progress(f"holding out demonstration {h + 1} of {len(paths)}")
+        primitive = fit([i for i in range(len(paths)) if i != h] or [h])
+        predicted = primitive.predict(hands)
+        yield HeldOut(tool - predicted.mean, predicted.covariance, deviations(predicted))
+
+
+def _calibration(held_out: Sequence[HeldOut]) -> float:
+    """By how much predicted deviations are greater than errors, at least 1."""
+    errors = np.concatenate([one.errors for one in held_out])
+    predicted = np.concatenate([one.deviations for one in held_out])
+    return max(1.0, float(np.sqrt((predicted**2).mean() / max(float((errors**2).mean()), 1e-12))))
 
 
 def mean_orientation(quaternions: ArrayLike) -> Vector:

@@ -25,14 +25,17 @@ from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
 from service.core.skill import Skill
 
-FORMAT = 1
+# The second holds what was found in learning; a skill of the first stays one, to the byte.
+PLAIN, JUDGED = FORMATS = (1, 2)
 INPUTS, OUTPUTS = 6, 3
 LARGEST_FILE = 100_000_000  # bytes, unpacked
 MOST_POINTS = 2500  # of the reference: a tick takes as long
 FARTHEST_M = 10.0  # of anything from the base plate
+HIGHEST_GATE_M = 1.0  # a skill that is as unsure as that is not followed
 LONGEST_TEXT = 200  # letters
+LONGEST_FIGURES = 1_000_000
 RANGES = {  # of the numbers in each array
-    "threshold": (1e-6, FARTHEST_M, "m"),
+    "threshold": (1e-6, HIGHEST_GATE_M, "m"),
     "tolerance": (0.0, FARTHEST_M, "m"),
     "ell": (1e-3, 1e4, "1/m²"),
     "lambda_mean": (1e-9, 1e9, ""),
@@ -58,7 +61,7 @@ def with_file(skill: Skill) -> Skill:
     """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
-        format=np.array(FORMAT),
+        format=np.array(JUDGED if skill.figures else PLAIN),
         units=np.array("inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"),
         name=np.array(skill.name),
         orientation=skill.orientation,
@@ -70,6 +73,8 @@ def with_file(skill: Skill) -> Skill:
         tolerance=np.array(skill.tolerance),
         **skill.primitive.to_arrays(),
     )
+    if skill.figures:
+        arrays["figures"] = np.array(skill.figures)
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue())
 
@@ -88,8 +93,10 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             if size > LARGEST_FILE:
                 raise SkillError(f"{origin}: {size} bytes unpacked, at most {LARGEST_FILE} accepted")
             arrays = dict(archive)
-        if (kind := arrays["format"].item()) != FORMAT:
-            raise SkillError(f"{origin}: skill of format {kind}, {FORMAT} needed")
+        if (kind := arrays["format"].item()) not in FORMATS:
+            raise SkillError(
+                f"{origin}: skill of format {kind}, {PLAIN} or {JUDGED} needed: written by a later version?"
+            )
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
         skill = Skill(
@@ -102,6 +109,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             components=int(arrays["components"]),
             via_points=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
             tolerance=float(arrays["tolerance"]),
+            figures=str(arrays["figures"]) if kind == JUDGED else "",
             file=bytes(data),
         )
         for fault in _faults(skill):
@@ -129,6 +137,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
+    if "figures" in arrays and not _is_json(arrays["figures"]):
+        yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
     if len(arrays["base_inputs"]) > MOST_POINTS:
         yield f"{len(arrays['base_inputs'])} reference points, at most {MOST_POINTS} accepted"
     if "checksum" in arrays:
@@ -136,6 +146,14 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
     elif not recorded:
         yield "no checksum: written by an earlier version, or changed; learn it anew"
+
+
+def _is_json(array: NDArray[Any]) -> bool:
+    try:
+        msgspec.json.decode(str(array))
+    except msgspec.DecodeError:
+        return False
+    return array.dtype.kind == "U" and len(str(array)) <= LONGEST_FIGURES
 
 
 def _faults(skill: Skill) -> Iterator[str]:

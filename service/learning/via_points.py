@@ -20,6 +20,7 @@ from service.learning.skill_file import SkillError, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
+NOTED_M = 0.005  # a via-point missed or moved by more is told of
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 
 
@@ -33,13 +34,22 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
     inputs, outputs, deviations = neighbourhoods(via_points)
     _check_agreement(via_points, inputs, outputs, deviations)
     try:
-        desired = Gaussians(outputs, deviations[:, None, None] ** 2 * np.eye(3))
+        desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
             primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
+
+
+def _weight(skill: Skill) -> float:
+    """What a via-point's variance is multiplied by.
+
+    The covariance of IJRR 2019 is N times that of a point that stands alone. Where the reference
+    was scaled to that, so that predicted deviations are true, a via-point's must be too.
+    """
+    return 1.0 if skill.components else 1.0 / len(skill.primitive.base.inputs)
 
 
 def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
@@ -66,6 +76,24 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
         )
         for point in skill.via_points
     )
+
+
+def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
+    """What is to be said where one skill takes another's place: which via-points are missed, and
+    which that were there already are moved, by more than 5 mm.
+    """
+    out = [
+        f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was demonstrated or taught "
+        "near it says otherwise. A smaller std makes it count more; a greater tolerance removes what was shown there"
+        for point in in_force(after)
+        if point.missed_by_m > NOTED_M
+    ]
+    for point in set(before.via_points) & set(after.via_points):
+        hands = [[*point.left, *point.right]]
+        moved_m = math.dist(before.primitive.mean(hands)[0], after.primitive.mean(hands)[0])
+        if moved_m > NOTED_M:
+            out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
+    return tuple(sorted(out))
 
 
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:

@@ -27,7 +27,7 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
 
     The same arrays give the same bytes. Raises ValueError.
     """
-    stamps_ns, left, right, tool = demonstration
+    stamps_ns, left, right, tool = demonstration[:4]
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
     for name, stream in zip(_STREAMS, poses, strict=True):
         if stream.shape != (len(stamps_ns), 7) or not np.isfinite(stream).all():
@@ -97,7 +97,7 @@ def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda 
         )
     left, right, tool = (_resampled(stamps, *track) for track in tracks)
     stamps.setflags(write=False)
-    return Demonstration(stamps, left, right, tool)
+    return Demonstration(stamps, left, right, tool, next(iter(frames.values())))
 
 
 def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:

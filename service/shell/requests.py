@@ -29,7 +29,7 @@ from service.core.frame import Event, order
 from service.core.skill import Skill
 from service.core.workspace import is_reachable
 from service.learning.skill_file import SkillError
-from service.learning.via_points import in_force, points_made_of
+from service.learning.via_points import in_force, misgivings, points_made_of
 from service.shell import watch
 from service.shell.clock import run_beside_real_time
 from service.shell.saved_via_points import SavedViaPoints
@@ -219,8 +219,8 @@ class Requests:
             draft.replace(self._saved.path)
         finally:
             draft.unlink(missing_ok=True)
-        self._skill, self._in_force = skill, in_force(skill)
-        return Reply(tick, self._in_force)
+        before, self._skill, self._in_force = self._skill, skill, in_force(skill)
+        return Reply(tick, self._in_force, misgivings(before, skill))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()

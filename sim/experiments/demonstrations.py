@@ -36,7 +36,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     for draw_number in range(draws):
         order = random.permutation(len(known))
         for count in counts:
-            skill = learn([known[k] for k in order[:count]], seed=draw_number)
+            skill = learn([known[k] for k in order[:count]], components=10, seed=draw_number)
             reproduction[count - 1, draw_number] = _reproduction_mm(skill, held_out)
             taught[count - 1, draw_number] = _reproduction_mm(
                 adapted(skill, Scene().via_points(), tolerance=TOLERANCE_M), held_out

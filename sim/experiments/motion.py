@@ -74,8 +74,8 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
         tool = centre + LEFT_GAIN * moved[:, :3] + RIGHT_GAIN * moved[:, 3:]
         stamps_ns = np.arange(len(hands)) * round(1e9 * PERIOD_S * TAUGHT_EVERY)
         poses = [np.hstack([x, np.tile(shipped.orientation, (len(x), 1))]) for x in (hands[:, :3], hands[:, 3:], tool)]
-        demonstrations.append(Demonstration(stamps_ns, *poses))
-    return learn(demonstrations, name="of such hands")
+        demonstrations.append(Demonstration(stamps_ns, poses[0], poses[1], poses[2]))
+    return learn(demonstrations, name="of such hands", components=10)
 
 
 def followers(skill: Skill, share: float) -> dict[str, Follower]:

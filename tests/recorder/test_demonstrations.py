@@ -25,7 +25,8 @@ def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path:
     write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, *poses), cell="north/3")
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     got = read_demonstration(tmp_path / "a.mcap")
-    for a, b in zip(got, (stamps, *poses), strict=True):
+    assert got.frame == "base"
+    for a, b in zip(got[:4], (stamps, *poses), strict=True):
         np.testing.assert_array_equal(a, b)
         assert not a.flags.writeable
 
@@ -73,7 +74,7 @@ def test_streams_with_stamps_of_their_own_are_brought_to_those_of_the_tool(tmp_p
     )
     got = read_demonstration(tmp_path / "a.mcap")
     assert (got.stamps_ns[0], got.stamps_ns[-1]) == (30_000_000, 895_000_000)
-    for poses, slope in zip(got[1:], (1, 2, 3), strict=True):
+    for poses, slope in zip(got[1:4], (1, 2, 3), strict=True):
         np.testing.assert_allclose(poses[:, 0], slope * got.stamps_ns / 1e9, atol=1e-12)
         np.testing.assert_allclose(np.abs(poses[:, 6]), 1.0, atol=1e-12)
 

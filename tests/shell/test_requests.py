@@ -193,6 +193,15 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     assert cell.taken[0].value.via_points == PLACES
 
 
+def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
+    assert "warnings" not in cell.client.add(PLACES)
+    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
+    missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
+    assert missed > 0.1
+    assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
+
+
 def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Skill) -> None:
     cell.client.add(PLACES, tolerance=0.04)
     (event,) = cell.taken

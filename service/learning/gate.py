@@ -1,0 +1,69 @@
+"""The gate: the deviation above which hands are far from the demonstrations, and what it catches.
+
+Chosen between what held-out demonstrations reach and what planted nonsense reaches.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kmp import KMP, Gaussians
+from service.core.frame import Vector
+from service.learning.skill_file import HIGHEST_GATE_M
+
+HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
+CEILING_M = 0.15  # and no tool is followed that may be so far off, each axis: a thing held is as large
+MISSED = 0.05  # of the nonsense may pass, and
+FALSE = 0.02  # of the time may a gate hold that does not separate the two
+BESIDE_M = 0.3
+
+
+class Caught(NamedTuple):
+    """Shares of planted nonsense that a gate holds, 0 to 1."""
+
+    swapped: float  # left and right hand for each other
+    beside: float  # both hands 30 cm beside where they were
+    one_beside: float  # one of them
+
+
+class Gate(NamedTuple):
+    """A threshold [m] on a prediction's deviation, and what it catches."""
+
+    threshold: float
+    caught: Caught
+    capped: bool  # whether the ceiling alone made it
+
+
+def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float) -> Gate:
+    """The gate of a primitive, for hands (M, 6) [m] that were demonstrated and the deviations (T,)
+    [m] of held-out demonstrations.
+
+    `calibration`: by how much deviations are greater than errors; 1 where they were made alike. The
+    ceiling holds for errors.
+    """
+    swapped, beside, one_beside = (deviations(primitive.predict(x)) for x in nonsense(hands))
+    most = float(held_out.max())
+    least = min(float(np.quantile(x, MISSED)) for x in (swapped, beside, one_beside))
+    if least > most:
+        threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
+    else:
+        threshold = min(max(least, float(np.quantile(held_out, 1 - FALSE))), most)
+    ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
+    threshold, capped = min(threshold, ceiling), threshold > ceiling
+    return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in (swapped, beside, one_beside))), capped)
+
+
+def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
+    """Hands (M, 6) [m] swapped, both beside, and one beside: 30 cm along each axis, either way."""
+    ways = BESIDE_M * np.concatenate([np.eye(3), -np.eye(3)])
+    none = np.zeros_like(ways)
+    both, one = np.hstack([ways, ways]), np.concatenate([np.hstack([ways, none]), np.hstack([none, ways])])
+    moved = ((hands[:, None] + steps).reshape(-1, 6) for steps in (both, one))
+    return (np.roll(hands, 3, axis=1), *moved)  # type: ignore[return-value]
+
+
+def deviations(predicted: Gaussians) -> Vector:
+    """Standard deviations (M,) [m] of M predictions, root mean square over the axes."""
+    return np.asarray(np.sqrt(np.trace(predicted.covariance, axis1=1, axis2=2) / 3))

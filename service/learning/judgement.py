@@ -1,0 +1,230 @@
+"""What is to be said of a skill before it is used: figures from demonstrations that were held out,
+and what makes it unsafe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from service.config import Reach
+from service.contract.messages import BASE
+from service.core.frame import Vector
+from service.core.workspace import is_reachable
+from service.learning.choice import REGIONS, mahalanobis, rms
+from service.learning.demonstration import Demonstration
+from service.learning.gate import Gate
+
+SAME_M = 0.003  # demonstrations nearer to each other, root mean square, are one that was repeated
+NEAR_M, APART_M = 0.02, 0.10  # hands so near that go with tools so far apart contradict each other
+COMPARED = 100  # samples of a demonstration, of which each is compared with each
+STANDS_OUT = 2.5  # times the median error of all demonstrations, and
+NOTED_MM, UNSAFE_MM = 50.0, 100.0  # errors that are noted, and that are no skill
+NOTED, UNSAFE = 1.0, 10.0  # [%] of the samples that contradict others
+CAUGHT, CAUGHT_UNSAFE = 95.0, 50.0  # [%] of nonsense
+HELD, HELD_UNSAFE = 5.0, 20.0  # [%] of the time that the gate holds what was demonstrated
+BEYOND_UNSAFE = 20.0  # [%] of the tool's way that the arm cannot reach
+COVERAGE = ((30.0, 80.0), (88.0, 100.0))  # [%] beyond these a region is not what it says
+
+
+class HeldOut(NamedTuple):
+    """What the others' primitive predicts of a demonstration: errors (T, 3) [m], tool less mean,
+    covariances (T, 3, 3) [m²] and deviations (T,) [m].
+    """
+
+    errors: Vector
+    covariance: Vector
+    deviations: Vector
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """A demonstration, predicted by what was learned from the others; or all of them."""
+
+    name: str
+    error_mm: float  # root mean square
+    worst_mm: float
+    predicted_mm: float  # what the covariance says of the error
+    within_50: float  # [%] of the samples inside the region that should hold 50 %
+    within_95: float
+    held: float  # [%] of the time that the gate would hold
+
+
+class Figures(msgspec.Struct, frozen=True, kw_only=True):
+    """What a skill's file says of the skill. Shares in per cent."""
+
+    demonstrations: tuple[Row, ...]
+    all: Row
+    gate_mm: float
+    swapped: float  # of planted nonsense that is held: hands swapped,
+    beside: float  # both 30 cm beside,
+    one_beside: float  # one of them
+    ambiguous: float  # of the samples contradict another: same hands, other tool
+    beyond_reach: float  # of the tool's way
+    warnings: tuple[str, ...] = ()
+    unsafe: tuple[str, ...] = ()  # reasons not to use it
+
+
+def figures(
+    demonstrations: Sequence[Demonstration],
+    paths: Sequence[tuple[Vector, Vector]],
+    names: Sequence[str],
+    held_out: Sequence[HeldOut],
+    gate: Gate,
+    *,
+    reach: Reach,
+    remarks: Sequence[str] = (),
+) -> Figures:
+    """The figures of a skill: its demonstrations, their hands (T, 6) and tools (T, 3) [m] in phase,
+    what was predicted of each, and its gate.
+    """
+    rows = tuple(_row(name, one, gate.threshold) for name, one in zip(names, held_out, strict=True))
+    total = HeldOut(*(np.concatenate(parts) for parts in zip(*held_out, strict=True)))
+    ambiguous, contradiction = ambiguity(paths, names)
+    out = np.array([not is_reachable(at, reach) for _, tool in paths for at in tool[:: max(1, len(tool) // COMPARED)]])
+    found = Figures(
+        demonstrations=rows,
+        all=_row("all", total, gate.threshold),
+        gate_mm=1000 * gate.threshold,
+        swapped=100 * gate.caught.swapped,
+        beside=100 * gate.caught.beside,
+        one_beside=100 * gate.caught.one_beside,
+        ambiguous=100 * ambiguous,
+        beyond_reach=100 * float(out.mean()),
+    )
+    warnings, unsafe = _verdicts(found, demonstrations, contradiction, capped=gate.capped)
+    return msgspec.structs.replace(found, warnings=(*remarks, *warnings), unsafe=tuple(unsafe))
+
+
+def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
+    """The demonstrations that repeat an earlier one, and which: as many stamps as that has, or
+    other ones.
+    """
+    paths = []
+    for hands, tool in pairs:
+        both, at = np.hstack([hands, tool[:, :3]]), np.linspace(0.0, 1.0, COMPARED)
+        paths.append(np.stack([np.interp(at, np.linspace(0.0, 1.0, len(both)), column) for column in both.T], axis=1))
+    out: dict[int, int] = {}
+    for i, path in enumerate(paths):
+        for j in range(i):
+            if j not in out and rms(path - paths[j]) < SAME_M:
+                out[i] = j
+                break
+    return out
+
+
+def ambiguity(paths: Sequence[tuple[Vector, Vector]], names: Sequence[str]) -> tuple[float, str]:
+    """The share of samples that have another with the same hands and the tool elsewhere, and the
+    worst such pair in words.
+    """
+    at = [np.linspace(0, len(hands) - 1, min(COMPARED, len(hands))).round().astype(int) for hands, _ in paths]
+    hands = np.concatenate([h[i] for (h, _), i in zip(paths, at, strict=True)])
+    tools = np.concatenate([t[i] for (_, t), i in zip(paths, at, strict=True)])
+    owner = [(name, int(i)) for name, some in zip(names, at, strict=True) for i in some]
+    squares = (hands**2).sum(axis=1)
+    near = squares[:, None] + squares - 2 * hands @ hands.T < NEAR_M**2
+    squares = (tools**2).sum(axis=1)
+    apart = np.sqrt(np.maximum(squares[:, None] + squares - 2 * tools @ tools.T, 0.0)) * near
+    i, j = np.unravel_index(int(apart.argmax()), apart.shape)
+    worst = (
+        f"{owner[i][0]} (sample {owner[i][1]}) and {owner[j][0]} (sample {owner[j][1]}) have the hands "
+        f"{1000 * np.linalg.norm(hands[i] - hands[j]):.0f} mm from each other and the tools {1000 * apart[i, j]:.0f} mm"
+    )
+    return float((apart.max(axis=1) > APART_M).mean()), worst
+
+
+def _row(name: str, one: HeldOut, threshold: float) -> Row:
+    distances = mahalanobis(one.errors, one.covariance)
+    lengths = np.linalg.norm(one.errors, axis=1)
+    return Row(
+        name=name,
+        error_mm=1000 * rms(one.errors),
+        worst_mm=1000 * float(lengths.max()),
+        predicted_mm=1000 * float(np.sqrt(3 * (one.deviations**2).mean())),
+        within_50=100 * float((distances <= REGIONS[0]).mean()),
+        within_95=100 * float((distances <= REGIONS[1]).mean()),
+        held=100 * float((one.deviations > threshold).mean()),
+    )
+
+
+def _verdicts(
+    found: Figures, demonstrations: Sequence[Demonstration], contradiction: str, *, capped: bool
+) -> tuple[list[str], list[str]]:
+    warnings: list[str] = []
+    unsafe: list[str] = []
+
+    def say(text: str, *, bad: bool) -> None:
+        (unsafe if bad else warnings).append(text)
+
+    overall = found.all
+    frames = sorted({one.frame for one in demonstrations})
+    if len(frames) > 1:
+        say(f"the demonstrations are in different frames: {', '.join(map(repr, frames))}; one needed", bad=True)
+    elif frames[0] not in ("", BASE):
+        say(
+            f"the demonstrations are in frame {frames[0]!r}: it is taken to be {BASE!r}, the arm's base plate",
+            bad=False,
+        )
+    if len(found.demonstrations) < 3:
+        say(
+            f"{len(found.demonstrations)} demonstrations tell little of how sure the skill may be; 5 advised", bad=False
+        )
+    if overall.error_mm > NOTED_MM:
+        say(
+            f"held-out demonstrations are missed by {overall.error_mm:.0f} mm: the hands' places tell little of the "
+            f"tool's; up to {UNSAFE_MM:.0f} mm accepted",
+            bad=overall.error_mm > UNSAFE_MM,
+        )
+    usual = float(np.median([row.error_mm for row in found.demonstrations]))
+    for row in found.demonstrations:
+        if len(found.demonstrations) > 2 and row.error_mm > max(STANDS_OUT * usual, NOTED_MM / 2):
+            say(f"{row.name} is unlike the others: missed by {row.error_mm:.0f} mm, they by {usual:.0f}", bad=False)
+    if found.ambiguous > NOTED:
+        say(
+            f"{found.ambiguous:.0f} % of the samples contradict others, up to {UNSAFE:.0f} % accepted: {contradiction}",
+            bad=found.ambiguous > UNSAFE,
+        )
+    if found.beyond_reach > 0:
+        say(
+            f"{found.beyond_reach:.1f} % of the tool's way is out of the arm's reach, up to {BEYOND_UNSAFE:.0f} % "
+            "accepted: is it in metres, in frame base?",
+            bad=found.beyond_reach > BEYOND_UNSAFE,
+        )
+    if overall.held > HELD:
+        why = "its ceiling" if capped else "nonsense beyond it"
+        say(
+            f"the gate, kept low by {why}, holds {overall.held:.0f} % of what was demonstrated, up to "
+            f"{HELD_UNSAFE:.0f} % accepted",
+            bad=overall.held > HELD_UNSAFE,
+        )
+    for what, share in (("hands swapped", found.swapped), ("hands 30 cm beside", found.beside)):
+        if share < CAUGHT:
+            bad = share < CAUGHT_UNSAFE
+            wanted = f"at least {CAUGHT_UNSAFE:.0f} % needed" if bad else f"{CAUGHT:.0f} % wanted"
+            say(f"the gate holds {share:.1f} % of {what}, {wanted}", bad=bad)
+    for nominal, share, (low, high) in zip((50, 95), (overall.within_50, overall.within_95), COVERAGE, strict=True):
+        if not low <= share <= high:
+            say(f"the {nominal} % regions hold {share:.0f} % of held-out samples", bad=False)
+    return warnings, unsafe
+
+
+def table(found: Figures) -> str:
+    """The figures as a short table for a terminal."""
+    width = max(len(row.name) for row in (*found.demonstrations, found.all))
+    lines = [f"{'held out':<{width}}   error  predicted   worst   in 50 %  in 95 %   held"]
+    for row in (*found.demonstrations, found.all):
+        lines.append(
+            f"{row.name:<{width}}  {row.error_mm:4.0f} mm    {row.predicted_mm:4.0f} mm {row.worst_mm:4.0f} mm"
+            f"   {row.within_50:5.0f} %  {row.within_95:5.0f} %  {row.held:4.1f} %"
+        )
+    lines += [
+        f"gate {found.gate_mm:.0f} mm: holds {found.swapped:.0f} % of hands swapped, {found.beside:.0f} % of both "
+        f"30 cm beside, {found.one_beside:.0f} % of one",
+        f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
+        "out of reach",
+        *(f"warning: {text}" for text in found.warnings),
+        *(f"unsafe: {text}" for text in found.unsafe),
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,52 @@
+"""`thirdhand learn` as a process: table, file and picture; exit 1 and no file where unsafe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cell import thirdhand
+
+from service.learning.skill_file import decoded
+from service.recorder.demonstrations import write_demonstration
+from sim.scene import Scene
+from sim.teach import demonstrations
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("demonstrations")
+    paths = [folder / f"demonstration-{number}.mcap" for number in (1, 2, 3)]
+    for path, one in zip(paths, demonstrations(Scene(), count=3, seed=1), strict=True):
+        write_demonstration(path, one.every(8))
+    return paths
+
+
+def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) -> None:
+    out, plot = tmp_path / "skill.npz", tmp_path / "skill.png"
+    done = thirdhand("learn", *map(str, files), "--output", str(out), "--plot", str(plot), "--points", "80")
+    assert done.returncode == 0, done.stderr
+    assert "demonstration-2 " in done.stdout
+    assert "gate " in done.stdout
+    assert plot.stat().st_size > 10_000
+    skill = decoded(out.read_bytes(), origin="skill")
+    assert f"exceeds {1000 * skill.threshold:.0f} mm" in done.stdout
+
+
+def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:
+    one = demonstrations(Scene(), count=1, seed=1)[0].every(8)
+    mirrored = one.tool * np.array([1, -1, 1, 1, 1, 1, 1])
+    write_demonstration(tmp_path / "mirrored.mcap", one._replace(tool=mirrored))
+    out = tmp_path / "skill.npz"
+    done = thirdhand("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out), "--points", "80")
+    assert done.returncode == 1
+    assert "is not written: " in done.stderr
+    assert "contradict others" in done.stderr
+    assert not out.exists()
+
+
+def test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read(tmp_path: Path) -> None:
+    done = thirdhand("learn", "no-such.mcap", "--output", str(tmp_path / "missing" / "skill.npz"))
+    assert done.returncode == 2
+    assert "there is no folder" in done.stderr

@@ -1,0 +1,35 @@
+"""What the tests of learning share: demonstrations, and skills learned from them once."""
+
+from __future__ import annotations
+
+import pytest
+from taught_scene import PLACES, demonstrated, quickly
+
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
+from service.learning.via_points import adapted
+
+
+@pytest.fixture(scope="session")
+def taught() -> list[Demonstration]:
+    """Three demonstrations to learn from and three to hold out."""
+    return demonstrated(6)
+
+
+@pytest.fixture(scope="session")
+def learned(taught: list[Demonstration]) -> Skill:
+    """A skill of three demonstrations, its parameters chosen."""
+    return learn(taught[:3], name="soldering")
+
+
+@pytest.fixture(scope="session")
+def coarse(taught: list[Demonstration]) -> Skill:
+    """One of two, from few points."""
+    return quickly(taught[:2])
+
+
+@pytest.fixture(scope="session")
+def aimed(learned: Skill) -> Skill:
+    """The skill of three, taught the scene's places."""
+    return adapted(learned, PLACES, tolerance=0.05)

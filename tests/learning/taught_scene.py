@@ -1,0 +1,51 @@
+"""The soldering scene's demonstrations and places, for the tests of learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from service.contract.requests import ViaPoint
+from service.core.frame import Vector
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
+from sim.scene import Scene
+from sim.teach import demonstrations
+
+SCENE = Scene()
+PLACES = SCENE.via_points()
+HANDOVER = PLACES[0]
+
+
+def demonstrated(count: int, *, late: int = 0) -> list[Demonstration]:
+    """Demonstrations of the scene, in which the tool trails the hands by some samples."""
+    out = []
+    for taught in demonstrations(SCENE, count=count, seed=1):
+        stamps, left, right = (part[late:] for part in taught[:3])
+        out.append(Demonstration(stamps, left, right, taught.tool[: len(taught.tool) - late]))
+    return out
+
+
+def quickly(taught: Sequence[Demonstration]) -> Skill:
+    """A coarse skill of two demonstrations, learned in no time."""
+    return learn(taught, name="coarse", components=5, points=60)
+
+
+def error_m(skill: Skill, held_out: Sequence[Demonstration]) -> float:
+    """The mean distance between predicted and demonstrated tool [m]."""
+    return float(
+        np.mean([np.linalg.norm(skill.primitive.mean(one.hands) - one.tool[:, :3], axis=1).mean() for one in held_out])
+    )
+
+
+def deviations(skill: Skill, hands: Vector) -> Vector:
+    """Standard deviations (T,) of the predictions for hands (T, 6) at rest [m]."""
+    still = np.zeros((2, 3))
+    return np.array([skill.predict(one.reshape(2, 3), still, still).deviation for one in hands])
+
+
+def with_hands(place: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:
+    """Hands (6,) at a place, the left one off by some metres."""
+    return np.array([*(np.array(place.left) + left), *place.right])

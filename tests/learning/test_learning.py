@@ -1,0 +1,83 @@
+"""Learning from demonstrations: what comes of it, in phase, deterministic, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from taught_scene import demonstrated, deviations, error_m, quickly
+
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn, mean_orientation
+from service.learning.skill_file import SkillError
+
+LATE = 40  # samples of 10 ms
+
+
+def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(
+    learned: Skill, taught: list[Demonstration]
+) -> None:
+    assert error_m(learned, taught[3:]) < 0.035
+
+
+def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstration]) -> None:
+    assert quickly(taught[:2]).file == coarse.file
+
+
+def test_a_tool_that_lags_is_put_in_phase(coarse: Skill, taught: list[Demonstration]) -> None:
+    late = quickly(demonstrated(2, late=LATE))
+    assert error_m(late, taught[3:]) < error_m(coarse, taught[3:]) + 0.006
+    assert late.learned_from != coarse.learned_from
+
+
+def test_the_box_holds_the_demonstrated_tool_with_a_margin(learned: Skill, taught: list[Demonstration]) -> None:
+    tool = np.concatenate([one.tool[:, :3] for one in taught[:3]])
+    np.testing.assert_allclose(learned.workspace, [tool.min(axis=0) - 0.25, tool.max(axis=0) + 0.25])
+
+
+def test_the_gate_lets_demonstrations_through_and_nothing_far_from_them(
+    aimed: Skill, taught: list[Demonstration]
+) -> None:
+    for one in taught:
+        assert deviations(aimed, one.hands[::20]).max() <= aimed.threshold
+        assert deviations(aimed, one.hands[::20] + np.array([0.0, 0.0, 0.5] * 2)).min() > aimed.threshold
+
+
+def test_the_tools_orientation_is_that_of_the_demonstrations(learned: Skill, taught: list[Demonstration]) -> None:
+    np.testing.assert_allclose(learned.orientation, taught[0].tool[0, 3:], atol=1e-6)
+
+
+def test_a_mean_orientation_does_not_mind_signs() -> None:
+    random = np.random.default_rng(0)
+    near = np.array([0.0, 0.9, 0.0, 0.44]) + 0.01 * random.normal(size=(50, 4))
+    flipped = near * random.choice([-1.0, 1.0], size=(50, 1))
+    np.testing.assert_allclose(mean_orientation(flipped), mean_orientation(near), atol=1e-12)
+    assert np.linalg.norm(mean_orientation(flipped)) == pytest.approx(1.0)
+
+
+def test_demonstrations_that_cannot_be_learned_from_are_refused(taught: list[Demonstration]) -> None:
+    one = taught[0]
+    turned = one.tool.copy()
+    turned[:, 3:] *= 2
+    for wrong, message in (
+        ([], "no demonstrations given, at least 1 needed"),
+        ([one.every(400)], "3 samples is too short"),
+        ([one._replace(stamps_ns=one.stamps_ns * 0)], "too short"),
+        ([one._replace(tool=np.full_like(one.tool, np.nan))], "not finite"),
+        ([one._replace(tool=turned)], "not quaternions of norm 1"),
+        ([one._replace(left=1000 * one.left)], "is it in metres"),
+        ([one], "1 demonstration given: at least 2 needed"),
+    ):
+        with pytest.raises(SkillError, match=message):
+            learn(wrong)
+
+
+def test_too_few_samples_for_a_mixture_are_counted(taught: list[Demonstration]) -> None:
+    few = taught[0].every(132)._replace(stamps_ns=taught[0].stamps_ns[:9])
+    with pytest.raises(SkillError, match="cannot learn from 9 samples"):
+        learn([few], components=10)
+
+
+def test_a_demonstration_of_unequal_lengths_is_refused(taught: list[Demonstration]) -> None:
+    with pytest.raises(SkillError, match="500 left"):
+        learn([taught[0]._replace(left=taught[0].left[:500])])

@@ -1,0 +1,235 @@
+"""A skill's file: the same to the bit after a trip, refused where it is not what was written."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from taught_scene import PLACES
+
+from kmp.storage import checksum
+from service.contract.requests import ViaPoint
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.judgement import Figures
+from service.learning.skill_file import SkillError, decoded, with_file
+from service.learning.via_points import adapted
+
+
+@pytest.mark.parametrize("places", [(), PLACES])
+def test_a_trip_through_a_file_changes_no_bit(
+    learned: Skill, places: tuple[ViaPoint, ...], taught: list[Demonstration]
+) -> None:
+    sent = adapted(learned, places, tolerance=0.04)
+    back = with_file(replace(decoded(sent.file, origin="a file"), file=b""))
+    assert back.file == sent.file
+    assert back.digest == sent.digest
+    assert (back.name, back.via_points, back.tolerance, back.threshold) == (
+        sent.name,
+        sent.via_points,
+        0.04,
+        sent.threshold,
+    )
+    queries = taught[5].hands[::50]
+    for one, other in zip(
+        (sent.primitive.mean(queries), sent.primitive.predict(queries).covariance, sent.primitive.jacobian(queries[3])),
+        (back.primitive.mean(queries), back.primitive.predict(queries).covariance, back.primitive.jacobian(queries[3])),
+        strict=True,
+    ):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_a_skill_from_a_file_adapts_as_the_one_that_was_written(learned: Skill) -> None:
+    back = decoded(learned.file, origin="a file")
+    assert adapted(back, PLACES, tolerance=0.05).file == adapted(learned, PLACES, tolerance=0.05).file
+
+
+def test_the_shipped_skill_is_what_its_file_says(skill: Skill) -> None:
+    assert skill.name == "soldering"
+    assert skill.via_points == ()
+    assert with_file(replace(skill, file=b"")).file == skill.file
+
+
+def test_a_file_holds_the_figures_and_one_without_them_is_read_as_before(skill: Skill, learned: Skill) -> None:
+    found = msgspec.json.decode(decoded(learned.file, origin="a file").figures, type=Figures)
+    assert [row.name for row in found.demonstrations] == ["demonstration 1", "demonstration 2", "demonstration 3"]
+    assert found.gate_mm == pytest.approx(1000 * learned.threshold)
+    assert decoded(skill.file, origin="a file").figures == ""
+
+
+def test_there_is_no_pickle_in_a_file(aimed: Skill) -> None:
+    with np.load(io.BytesIO(aimed.file), allow_pickle=False) as arrays:
+        assert all(arrays[name].dtype != object for name in arrays.files)
+        assert "[m]" in str(arrays["units"])
+
+
+def changed(skill: Skill, **arrays: Any) -> bytes:
+    """The skill's file with some arrays in place of its own, and their checksum; None leaves one
+    out.
+    """
+    with np.load(io.BytesIO(skill.file), allow_pickle=False) as original:
+        kept = {name: value for name, value in (dict(original) | arrays).items() if value is not None}
+    if not any(value.dtype == object for value in kept.values()):
+        kept |= {"checksum": np.array(checksum(kept))} if "checksum" not in arrays else {}
+    out = io.BytesIO()
+    np.savez(out, allow_pickle=True, **kept)
+    return out.getvalue()
+
+
+def array_file() -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.zeros(3))
+    return out.getvalue()
+
+
+def empty_archive() -> bytes:
+    out = io.BytesIO()
+    zipfile.ZipFile(out, "w").close()
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    "garbage", [b"", b"nonsense", b"PK\x03\x04 nonsense", pickle.dumps({"a": 1}), empty_archive(), array_file()]
+)
+def test_a_file_that_is_no_skill_is_refused_by_name(garbage: bytes) -> None:
+    with pytest.raises(SkillError, match=r"nonsense\.npz: not a skill"):
+        decoded(garbage, origin="nonsense.npz")
+
+
+def test_a_truncated_file_is_refused(skill: Skill) -> None:
+    whole = skill.file
+    for size in range(0, len(whole), len(whole) // 40):
+        with pytest.raises(SkillError, match=r"x\.npz"):
+            decoded(whole[:size], origin="x.npz")
+
+
+def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill) -> None:
+    random = np.random.default_rng(0)
+    whole = skill.file
+    directory = whole.index(b"PK\x01\x02")
+    for start in (0, directory):
+        for _ in range(200):
+            damaged = bytearray(whole)
+            damaged[random.integers(start, len(whole))] = random.integers(256)
+            try:
+                decoded(bytes(damaged), origin="x.npz")
+            except SkillError:
+                continue
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"format": np.array(3)}, "skill of format 3, 1 or 2 needed"),
+        ({"format": np.array(2)}, "'figures' is missing"),
+        ({"format": np.array(2), "figures": np.array("{")}, "figures is no JSON"),
+        ({"format": np.array([1, 2])}, "x.npz"),
+        ({"format": np.array("new")}, "x.npz"),
+        ({"box": None}, "box"),
+        ({"base_inputs": np.zeros(3)}, "inputs"),
+        ({"base_inputs": np.zeros((200, 2)), "via_inputs": np.zeros((0, 2))}, "2 inputs and 3 outputs, 6 and 3 needed"),
+        ({"ell": np.array(-1.0)}, "ell has -1"),
+        ({"places": np.array('[{"name": "a"}]')}, "left"),
+        ({"name": np.array([{}], dtype=object)}, "x.npz"),
+    ],
+)
+def test_a_wrong_array_is_named(skill: Skill, arrays: dict[str, Any], message: str) -> None:
+    with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
+        decoded(changed(skill, **arrays), origin="x.npz")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"threshold": np.array(np.nan)},
+        {"threshold": np.array(-1.0)},
+        {"box": np.full((2, 3), np.nan)},
+        {"box": np.zeros(3)},
+        {"box": np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])},
+        {"orientation": np.zeros(4)},
+        {"orientation": np.zeros(3)},
+        {"weights": np.full((200, 3), np.nan)},
+    ],
+    ids=lambda arrays: f"{next(iter(arrays))} {np.ravel(next(iter(arrays.values())))[0]:g}",
+)
+def test_an_array_that_would_harm_the_motion_is_refused(skill: Skill, arrays: dict[str, Any]) -> None:
+    with pytest.raises(SkillError, match=next(iter(arrays))):
+        decoded(changed(skill, **arrays), origin="x.npz")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"weights": np.full((200, 3), 1e300)}, "weights has 1e+300, -1e+12 to 1e+12 accepted"),
+        ({"base_weights": np.full((200, 3), 1e300), "weights": np.full((200, 3), 1e300)}, "base_weights has 1e+300"),
+        ({"base_weights": np.full((200, 3), 5e3), "weights": np.full((200, 3), 5e3)}, "where it was learned, the tool"),
+        ({"weights": np.zeros((200, 3), complex)}, "weights has numbers of type complex128, real ones needed"),
+        ({"threshold": np.array(0.5 + 2j)}, "threshold has numbers of type complex128"),
+        ({"ell": np.array(1e300)}, "ell has 1e+300, 0.001 to 10000 1/m² accepted"),
+        ({"lambda_mean": np.array(1e300)}, "lambda_mean has 1e+300"),
+        ({"lambda_covariance": np.array(1e-300)}, "lambda_covariance has 1e-300"),
+        ({"prior_mean": np.array([0.0, 1e5, 0.0])}, "prior_mean has 100000, -10 to 10 m accepted"),
+        ({"base_inputs": np.full((200, 6), 1e9)}, "base_inputs has 1e+09"),
+        ({"base_inputs": np.zeros((2501, 6))}, "2501 reference points, at most 2500 accepted"),
+        ({"box": np.array([[-1e9] * 3, [1e9] * 3])}, "box has -1e+09"),
+        ({"threshold": np.array(1e300)}, "threshold has 1e+300"),
+        ({"threshold": np.array(12.9)}, "threshold has 12.9, 1e-06 to 1 m accepted"),
+        ({"tolerance": np.array(-1.0)}, "tolerance has -1"),
+        ({"components": np.array(-3)}, "components has -3"),
+        ({"name": np.array("x" * 201)}, "name is no text of up to 200 letters"),
+        ({"name": np.array(3)}, "name is no text"),
+        ({"checksum": None}, "no checksum: written by an earlier version"),
+        ({"checksum": np.array("0" * 32)}, "the checksum is another"),
+        ({"tolerance": np.array(0.06), "checksum": np.array("0" * 32)}, "the checksum is another"),
+    ],
+    ids=lambda value: value[:40] if isinstance(value, str) else "",
+)
+def test_what_no_skill_has_is_refused_with_what_is_accepted(skill: Skill, arrays: dict[str, Any], message: str) -> None:
+    with pytest.raises(SkillError) as caught:
+        decoded(changed(skill, **arrays), origin="x.npz")
+    assert str(caught.value).startswith("x.npz: ")
+    assert message in str(caught.value)
+
+
+def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill) -> None:
+    random, whole = np.random.default_rng(8), aimed.file
+    same = 0
+    for _ in range(400):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << int(random.integers(8))
+        try:
+            back = decoded(bytes(damaged), origin="x.npz")
+        except SkillError:
+            continue
+        same += 1
+        assert with_file(replace(back, file=b"")).file == whole
+    assert same < 40
+
+
+def test_a_recording_may_hold_a_skill_of_an_earlier_version(skill: Skill) -> None:
+    old = changed(skill, checksum=None)
+    assert with_file(replace(decoded(old, origin="a recording", recorded=True), file=b"")).file == skill.file
+
+
+def test_a_file_that_unpacks_to_much_is_not_unpacked(skill: Skill) -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("format.npy", "w") as file:
+        file.write(b"\x93NUMPY\x01\x00")
+        for _ in range(101):
+            file.write(bytes(1_000_000))
+    with pytest.raises(SkillError, match=r"101000008 bytes unpacked, at most 100000000 accepted"):
+        decoded(out.getvalue(), origin="x.npz")
+
+
+def test_a_skill_file_can_be_read_from_disk_as_bytes(tmp_path: Path, aimed: Skill) -> None:
+    file = tmp_path / "aimed.npz"
+    file.write_bytes(aimed.file)
+    assert decoded(file.read_bytes(), origin=str(file)).digest == aimed.digest

@@ -1,0 +1,105 @@
+"""Via-points: met, followed around, forgotten, refused where they contradict, told of where they
+are missed or moved.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from taught_scene import HANDOVER, PLACES, with_hands
+
+from service.contract.requests import ViaPoint
+from service.core.skill import Skill
+from service.learning.skill_file import SkillError
+from service.learning.via_points import adapted, in_force, misgivings
+
+
+def test_places_are_met(aimed: Skill) -> None:
+    assert [point.name for point in in_force(aimed)] == ["handover", "glass", "soldering"]
+    assert all(point.missed_by_m < 0.003 for point in in_force(aimed))
+
+
+def test_a_place_without_neighbours_is_met(learned: Skill) -> None:
+    place = ViaPoint("there", left=(0.8, -0.2, 0.2), right=(0.95, 0.35, 0.1), tool=(0.5, 0.0, 0.3))
+    (point,) = in_force(adapted(learned, [place], tolerance=0.05))
+    assert point.missed_by_m < 0.0005
+
+
+@pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02), (-0.01, 0.01, 0.01)])
+def test_a_neighbourhood_follows_the_left_hand(aimed: Skill, step: tuple[float, ...]) -> None:
+    np.testing.assert_allclose(
+        aimed.primitive.mean([with_hands(HANDOVER, left=step)])[0], np.add(HANDOVER.tool, step), atol=0.006
+    )
+
+
+@pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02)])
+def test_a_flat_neighbourhood_stays_where_it_is(aimed: Skill, step: tuple[float, ...]) -> None:
+    glass = PLACES[1]
+    np.testing.assert_allclose(aimed.primitive.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006)
+
+
+def test_forgetting_all_places_gives_the_skill_as_it_was_learned(learned: Skill, aimed: Skill) -> None:
+    assert aimed.digest != learned.digest
+    assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
+
+
+def test_places_are_taught_to_the_base_and_not_on_top_of_each_other(learned: Skill, aimed: Skill) -> None:
+    anew = adapted(aimed, PLACES[1:], tolerance=0.05)
+    assert anew.file == adapted(learned, PLACES[1:], tolerance=0.05).file
+    assert [place.name for place in aimed.via_points] == ["handover", "glass", "soldering"]
+
+
+def test_places_that_cannot_be_taught_are_named(learned: Skill) -> None:
+    with pytest.raises(SkillError, match=r"handover.*tolerance is -1"):
+        adapted(learned, [HANDOVER], tolerance=-1.0)
+
+
+def moved(point: ViaPoint, name: str, *, hands: float, tool: float, **more: Any) -> ViaPoint:
+    """A via-point whose left hand and tool are elsewhere [m]."""
+    left, at = point.left, point.tool
+    return msgspec.structs.replace(
+        point, name=name, left=(left[0] + hands, left[1], left[2]), tool=(at[0], at[1] + tool, at[2]), **more
+    )
+
+
+EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
+
+
+@pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
+def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, hands: float) -> None:
+    steep = 4.0 * hands + 0.001 + 0.0006
+    with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
+        adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
+    assert f"4 times as far, {steep:.4f} m, accepted" in str(caught.value)
+    allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
+    here = np.array([*EXACT.left, *EXACT.right])
+    assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 10.0
+
+
+def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill: Skill) -> None:
+    adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
+    apart = moved(EXACT, "twin", hands=0.05, tool=0.12)
+    adapted(skill, (EXACT, apart), tolerance=0.05)
+    with pytest.raises(SkillError, match="contradict each other"):
+        adapted(skill, (EXACT, msgspec.structs.replace(apart, radius=0.025)), tolerance=0.05)
+
+
+def test_places_that_are_met_and_move_none_give_no_misgivings(learned: Skill, aimed: Skill) -> None:
+    assert misgivings(learned, aimed) == ()
+    assert misgivings(aimed, aimed) == ()
+
+
+def test_a_place_that_is_missed_and_one_that_is_moved_are_told_of_by_name(aimed: Skill) -> None:
+    loose = moved(HANDOVER, "loose", hands=0.06, tool=0.2, radius=0.0, std=0.05)
+    after = adapted(aimed, (*PLACES, loose), tolerance=0.05)
+    missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")
+    assert missed > 0.005
+    assert f"via-point 'loose' is missed by {1000 * missed:.0f} mm" in misgivings(aimed, after)[0]
+
+    soft = moved(HANDOVER, "soft", hands=0.0, tool=0.0, radius=0.0, std=0.02)
+    first = adapted(aimed, (soft,), tolerance=0.05)
+    then = adapted(aimed, (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)), tolerance=0.05)
+    assert any("via-point 'soft' is moved by" in text for text in misgivings(first, then))
