@@ -96,7 +96,7 @@ class Limiter:
         state = np.stack((q, dq, ddq))
         if not is_usable(state):
             return _stuck(q)
-        moved = stop_together(dq, ddq, self._limits[1], self._limits[2], self._period)
+        moved = stop_together(state[1], state[2], self._limits[1], self._limits[2], self._period)
         moved[0] += q
         _make_safe(state, moved, self._within, self._limits, self._period)
         return _frozen(moved, limited=bool(moved[1].any()))
