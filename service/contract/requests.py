@@ -30,7 +30,7 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     left: Point
     right: Point
     tool: Point
-    std: Annotated[float, msgspec.Meta(ge=1e-6, le=1)] = 0.0001
+    std: Annotated[float, msgspec.Meta(ge=1e-5, le=1)] = 0.0001
     radius: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = 0.0
     follow: Literal["none", "left", "right"] = "none"
 

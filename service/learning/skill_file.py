@@ -49,6 +49,7 @@ RANGES = {  # of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
+KNOWN = {*RANGES, "format", "units", "name", "learned_from", "places", "replaced", "figures", "checksum"}
 MARGIN_M = 0.25  # by which a skill may leave its box where it was learned: targets are held in it
 STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'
 
@@ -127,6 +128,8 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
 
 def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[str]:
     """What in the arrays is not what was written, or not what any skill has."""
+    for name in sorted(set(arrays) - KNOWN):  # what kmp can hold besides, and the loop was never tried with
+        yield f"an array {name!r}, which no skill has"
     for name, (low, high, unit) in RANGES.items():
         array = arrays[name]
         if array.dtype.kind not in "iuf":

@@ -214,7 +214,7 @@ def test_a_request_is_read_with_its_defaults() -> None:
         (_add(left=[1, 2]), requests.ViaPointsRequest, "$.points[0].left: 2 numbers, 3 needed"),
         (_add(tool=[1, 2, 3, 4]), requests.ViaPointsRequest, "$.points[0].tool: 4 numbers, 3 needed"),
         (_add(right=[1, 2, 30]), requests.ViaPointsRequest, "$.points[0].right[2]: 30 given; -10 to 10 m accepted"),
-        (_add(std=0), requests.ViaPointsRequest, "$.points[0].std: 0 given; a number from 1e-06 to 1 accepted"),
+        (_add(std=0), requests.ViaPointsRequest, "$.points[0].std: 0 given; a number from 1e-05 to 1 accepted"),
         (_add(name=""), requests.ViaPointsRequest, "$.points[0].name: '' given; 1 to 64 letters"),
         (_add(colour="red"), requests.ViaPointsRequest, "$.points[0]: unknown field 'colour'; known are"),
         (_add().replace(b"0.6", b"NaN"), requests.ViaPointsRequest, "malformed"),

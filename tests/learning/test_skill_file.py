@@ -129,6 +129,7 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill)
     [
         ({"format": np.array(3)}, "skill of format 3, 1 or 2 needed"),
         ({"format": np.array(2)}, "'figures' is missing"),
+        ({"via_directions": np.zeros((0, 6))}, "an array 'via_directions', which no skill has"),
         ({"format": np.array(2), "figures": np.array("{")}, "figures is no JSON"),
         ({"format": np.array([1, 2])}, "x.npz"),
         ({"format": np.array("new")}, "x.npz"),

@@ -348,7 +348,7 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
         (add(point(name="a/b")), "$.points[0].name: "),
         (add(point(name="x" * 65)), "$.points[0].name: '"),
-        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-06 to 1 accepted"),
+        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
         (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
         (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
         (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
