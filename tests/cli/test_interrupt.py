@@ -16,7 +16,8 @@ from tests_paths import RECORDINGS, ROOT
 
 SAID = "thirdhand: interrupted"
 DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts
-GOLDEN, DEMONSTRATION = str(RECORDINGS / "golden.mcap"), str(RECORDINGS / "demonstration-1.mcap")
+GOLDEN = str(RECORDINGS / "golden.mcap")
+DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in range(1, 6)]
 PUT_AWAY_SLOWLY = """
 import time
 from service import interrupt
@@ -64,7 +65,7 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
         "serve": ["--config", str(tmp_path / "cell.toml"), "--connect", nobody],
         "demo": ["--out", str(tmp_path / "demo")],
         "replay": [GOLDEN],
-        "learn": [DEMONSTRATION, "--output", str(tmp_path / "skill.npz")],
+        "learn": [*DEMONSTRATIONS, "--output", str(tmp_path / "skill.npz")],
         "status": ["--connect", nobody],
         "play": [GOLDEN, "--connect", nobody],
     }[name]
