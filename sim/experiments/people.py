@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sim.experiments.between_places import BetweenPlaces
 from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
 from sim.experiments.recorded_people import recorded_people
 from sim.experiments.results import SERIES, Array, Options, Results, pyplot
@@ -58,7 +59,14 @@ class Entry(NamedTuple):
 
 
 METHODS = {
-    "ours": Entry("ours, as the service\nlearns and adapts", (Service(),)),
+    "ours": Entry("ours, as the service\nlearns and adapts", (Service(), Service(None, None, components=None))),
+    "between_places": Entry(
+        "KMP between the places,\nnot yet the service's",
+        tuple(
+            BetweenPlaces(sharpness, rest)
+            for sharpness, rest in ((4.0, 0.12), (5.0, 0.12), (4.0, 0.2), (5.0, 0.15), (6.0, 0.12), (3.0, 0.12))
+        ),
+    ),
     "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0))),
     "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0))),
     "gaussian_process": Entry(
@@ -303,9 +311,9 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     found = numbers["methods"]
     plt = pyplot()
-    figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.4), width_ratios=(1.1, 1, 1, 1.3))
+    figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
     labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
-    colours = dict(zip([*METHODS, TEACHER], [*SERIES, "#444444"], strict=False))
+    colours = {**dict(zip(METHODS, SERIES, strict=False)), TEACHER: "#444444"}
     bars = (
         ("success", 100.0, "success [%]"),
         ("path_rms_mm", 1.0, "target off the teacher's tool,\nrms [mm]"),

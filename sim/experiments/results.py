@@ -33,7 +33,7 @@ LEFT, RIGHT, TOOL = (
     "#009E73",
 )  # as in the paper: the left hand red, the right one blue, the robot green
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#882255")
 DPI, COLOURS = 110, 256
 
 

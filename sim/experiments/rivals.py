@@ -148,7 +148,7 @@ def of_model(skill: Skill, model: Model) -> Adapt:
         s = scene
         points = (s.left_start, s.right_start, s.handover, s.glass, s.soldering, s.iron, s.robot_start)
         placed = model.place(Places._make([*(np.array(point) for point in points), 0.0]))
-        return lambda bench: _rival(skill, placed.mean)
+        return lambda bench: _rival(skill, lambda hands: placed.mean(hands, np.zeros_like(hands)))
 
     return adapt
 

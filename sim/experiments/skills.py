@@ -59,13 +59,13 @@ def via_points(places: Places, *, start: bool = False) -> tuple[ViaPoint, ...]:
 class Service:
     """Ours: `service.learning` with its parameters, adapted to the places as the service does."""
 
-    ell: float = 5.0
-    penalty: float = 2.0
+    ell: float | None = 5.0
+    penalty: float | None = 2.0
     spread_m: float = 0.01
-    components: int = 10
+    components: int | None = 10
 
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
-        """The skill that the service learns."""
+        """The skill that the service learns; without ell, penalty and components it chooses."""
         taken = [recorded(one) for one in demonstrations]
         skill = learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
         return LearnedByService(skill)
@@ -101,16 +101,16 @@ class PlacedSkill:
     skill: Skill
     memoryless = True
 
-    def mean(self, hands: Array) -> Array:
+    def mean(self, hands: Array, velocities: Array) -> Array:
         """As `trials.Placed`."""
         return self.skill.primitive.mean(hands)
 
-    def predict(self, hands: Array) -> Predicted:
+    def predict(self, hands: Array, velocities: Array) -> Predicted:
         """As `trials.Placed`; far is what the service's gate says."""
         some = self.skill.primitive.predict(hands[::COVARIANCE_EVERY]).covariance
         covariance = np.repeat(some, COVARIANCE_EVERY, axis=0)[: len(hands)] + 1e-12 * np.eye(3)
         deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3.0)
-        return Predicted(self.mean(hands), covariance, deviation > self.skill.threshold)
+        return Predicted(self.mean(hands, velocities), covariance, deviation > self.skill.threshold)
 
 
 @dataclass(frozen=True)
@@ -157,11 +157,11 @@ class PlacedLookUp:
     method: LookUp
     memoryless = True
 
-    def mean(self, hands: Array) -> Array:
+    def mean(self, hands: Array, velocities: Array) -> Array:
         """As `trials.Placed`."""
         return self._weighed(hands)[0]
 
-    def predict(self, hands: Array) -> Predicted:
+    def predict(self, hands: Array, velocities: Array) -> Predicted:
         """As `trials.Placed`; the covariance is that of the weighted tools, and a constant."""
         mean, weights, tools = self._weighed(hands)
         off = tools - mean[:, None]
@@ -238,7 +238,9 @@ class GaussianProcess:
         found = np.exp(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 100}).x)
         kernels = [Kernel(found[i] ** 2, np.repeat(found[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)]
         base = LearnedProcess(kernels[0], kernels[1], float(found[6]), inputs, outputs, owner, centre, np.inf)
-        held_out = [base.without(i).place(None).predict(one.hands).deviation for i, one in enumerate(demonstrations)]
+        held_out = [
+            base.without(i).place(None).predict(one.hands, one.hands).deviation for i, one in enumerate(demonstrations)
+        ]
         return base.gated(self.gate * max(float(one.max()) for one in held_out))
 
 
@@ -327,11 +329,11 @@ class PlacedProcess:
             rows[:, self.scene] += kernel(hands, self.inputs[self.scene])
         return rows
 
-    def mean(self, hands: Array) -> Array:
+    def mean(self, hands: Array, velocities: Array) -> Array:
         """As `trials.Placed`."""
         return np.asarray(self._rows(hands) @ self.weights + self.centre)
 
-    def predict(self, hands: Array) -> PredictedWithDeviation:
+    def predict(self, hands: Array, velocities: Array) -> PredictedWithDeviation:
         """As `trials.Placed`."""
         rows = self._rows(hands)
         white = solve_triangular(self.root[0], rows[::COVARIANCE_EVERY].T, lower=True)

@@ -33,7 +33,8 @@ RATE_HZ = 125
 WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # of an event
 NEAR_M, FAST_MPS = 0.05, 0.25  # faster than this nearer than that to a hand is a failure
 WRONG_M = 0.10  # a target so far from the teacher's is followed falsely
-STEP_S = 1e-3  # of differences along the hands' motion
+STEP_S = 0.02  # of differences along the hands' motion
+CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
 SMOOTHED = 5  # ticks over which a target's velocity is taken where the skill has a memory
 RESUMED_S = 0.1  # hands must be near the data for so long after they were far
 LONGEST_DELAY_S = 0.6
@@ -56,12 +57,14 @@ class Placed(Protocol):
 
     @property
     def memoryless(self) -> bool:
-        """Whether a prediction depends on the hands of its moment alone."""
+        """Whether a prediction depends on the hands of its moment and their velocity alone."""
 
-    def predict(self, hands: Array) -> Predicted:
-        """The tool for both hands (T, 6) [m], one row a tick, in the order of time."""
+    def predict(self, hands: Array, velocities: Array) -> Predicted:
+        """The tool for both hands (T, 6) [m] and velocities (T, 6) [m/s], one row a tick, in the
+        order of time.
+        """
 
-    def mean(self, hands: Array) -> Array:
+    def mean(self, hands: Array, velocities: Array) -> Array:
         """The means alone (T, 3) [m]; asked of what is memoryless."""
 
 
@@ -223,8 +226,10 @@ def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]
     """The predictions of all ticks, and how the target moves: velocities and accelerations (T, 3).
 
     Of a memoryless skill by differences along the hands' motion, as the service's own derivatives
-    say; of another by differences in time of what it has said.
+    say, and none along that of a hand which only trembles; of another by differences in time of
+    what it has said.
     """
+    s, v, a = one.estimates.transpose(1, 0, 2)
     if placed is None or not placed.memoryless:
         if placed is None:
             count, as_told = len(one.times), replace(one.session, places=one.session.told)
@@ -232,15 +237,18 @@ def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]
                 as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool)
             )
         else:
-            predicted = placed.predict(one.estimates[:, 0])
+            predicted = placed.predict(s, v)
         before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
         velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
         return predicted, velocity, np.zeros_like(velocity)
-    s, v, a = one.estimates.transpose(1, 0, 2)
-    predicted = placed.predict(s)
-    curve = STEP_S**2 / 2 * a
-    behind, ahead = placed.mean(s - STEP_S * v + curve), placed.mean(s + STEP_S * v + curve)
-    return predicted, (ahead - behind) / (2 * STEP_S), (ahead - 2 * predicted.mean + behind) / STEP_S**2
+    predicted = placed.predict(s, v)
+    speed = np.repeat(np.linalg.norm(v.reshape(-1, 2, 3), axis=2), 3, axis=1)
+    goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
+    step, curve = STEP_S * goes * v, STEP_S**2 / 2 * goes * a
+    behind, ahead = (placed.mean(s + way * step + curve, v + way * STEP_S * a) for way in (-1, 1))
+    most = settings().tool.max_acceleration
+    acceleration = np.clip((ahead - 2 * predicted.mean + behind) / STEP_S**2, -most, most)
+    return predicted, (ahead - behind) / (2 * STEP_S), acceleration
 
 
 def _held(far: Mask) -> Mask:

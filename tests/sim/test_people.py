@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim.experiments.between_places import BetweenPlaces, barycentric
 from sim.experiments.mixtures import frames
 from sim.experiments.people import METHODS, Task, chosen, outcomes, run
 from sim.experiments.recorded_people import recorded_people
@@ -122,11 +123,13 @@ class Still:
     def __init__(self, at: np.ndarray, *, far: bool) -> None:
         self.at, self.far = at, far
 
-    def mean(self, hands: np.ndarray) -> np.ndarray:
+    def mean(self, hands: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         return np.tile(self.at, (len(hands), 1))
 
-    def predict(self, hands: np.ndarray) -> Predicted:
-        return Predicted(self.mean(hands), np.tile(np.eye(3), (len(hands), 1, 1)), np.full(len(hands), self.far))
+    def predict(self, hands: np.ndarray, velocities: np.ndarray) -> Predicted:
+        return Predicted(
+            self.mean(hands, velocities), np.tile(np.eye(3), (len(hands), 1, 1)), np.full(len(hands), self.far)
+        )
 
 
 class TestJudging:
@@ -156,31 +159,61 @@ class TestJudging:
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
         class Onto(Still):
-            def mean(self, hands: np.ndarray) -> np.ndarray:
+            def mean(self, hands: np.ndarray, velocities: np.ndarray) -> np.ndarray:
                 return hands[:, :3] + 0.02 * np.sin(12 * np.arange(len(hands)) / RATE_HZ)[:, None]
 
         assert judge(Onto(np.zeros(3), far=False), as_seen, workspace(demonstrations(1))).too_near
 
 
-@pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12)])
-def test_rivals_go_to_the_places_they_are_told(
-    method: NoDemonstrations | LookUp | GaussianProcess, run_of_tuning: Session
+@pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), BetweenPlaces()])
+def test_skills_go_to_the_places_they_are_told(
+    method: NoDemonstrations | LookUp | GaussianProcess | BetweenPlaces, run_of_tuning: Session
 ) -> None:
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
     hands = frames(places)[1:, :6]
-    np.testing.assert_allclose(placed.mean(hands), frames(places)[1:, 6:], atol=0.008)
-    np.testing.assert_allclose(placed.predict(hands).mean, placed.mean(hands), atol=1e-9)
+    np.testing.assert_allclose(placed.mean(hands, 0 * hands), frames(places)[1:, 6:], atol=0.008)
+    np.testing.assert_allclose(placed.predict(hands, 0 * hands).mean, placed.mean(hands, 0 * hands), atol=1e-9)
     hands[:, 0] += 0.01  # only at the handover the tool goes with the left hand
-    moved = placed.mean(hands) - frames(places)[1:, 6:]
+    moved = placed.mean(hands, 0 * hands) - frames(places)[1:, 6:]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.0, 0.0], atol=0.003)
+
+
+def test_between_places_hands_that_rest_nearby_are_there_and_those_that_move_are_on_their_way(
+    run_of_tuning: Session,
+) -> None:
+    places = run_of_tuning.places
+    placed = BetweenPlaces().learn(demonstrations(3)).place(places)
+    at, goal = frames(places)[2, :6], places.glass
+    hands = at + 0.03 * np.array([[0.0] * 6, [-1.0, -1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    rest, moving = np.zeros((3, 6)), np.full((3, 6), 0.3)
+    assert np.linalg.norm(placed.mean(hands, rest) - goal, axis=1).max() < 0.01
+    assert np.linalg.norm(placed.mean(hands, moving)[1] - goal) > 0.02
+    said = placed.predict(np.vstack([hands, hands + 0.3]), np.zeros((6, 6)))
+    assert said.far.tolist() == [False] * 3 + [True] * 3
+    assert np.linalg.eigvalsh(said.covariance).min() > 0
+    elsewhere = goal + np.array([0.0, 0.1, 0.05])
+    moved = placed.learned.place(places._replace(glass=elsewhere))
+    np.testing.assert_allclose(moved.mean(at[None], rest[:1])[0], elsewhere, atol=0.008)
+
+
+def test_barycentric_coordinates_are_those_of_the_nearest_point_of_the_triangle() -> None:
+    random = np.random.default_rng(0)
+    share = random.dirichlet(np.ones(3), 20_000)
+    for _ in range(5):
+        corners, points = random.standard_normal((3, 3)), 2.0 * random.standard_normal((20, 3))
+        found = barycentric(points, corners)
+        assert found.min() >= 0.0
+        np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-9)
+        least = np.linalg.norm(points[:, None] - share @ corners, axis=2).min(axis=1)
+        assert (np.linalg.norm(points - found @ corners, axis=1) < least + 1e-4).all()
 
 
 def test_the_process_tells_the_demonstrations_apart() -> None:
     """Its likelihood's slopes, by differences, are those it is maximised with: it comes to rest."""
     model = GaussianProcess(each=10).learn(demonstrations(3))
     assert model.shared.variance > model.own.variance
-    known = model.without(0).place(None).predict(model.inputs[model.owner == 1])
+    known = model.without(0).place(None).predict(model.inputs[model.owner == 1], model.inputs[model.owner == 1])
     assert known.deviation.max() < np.sqrt(model.shared.variance + model.own.variance)
 
 
@@ -214,7 +247,7 @@ def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, mon
     for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
         monkeypatch.setattr(f"sim.experiments.people.{table}", {"tuning": value, "test": value})
     monkeypatch.setattr("sim.experiments.people.BREAKING", BREAKING[:1])
-    few = {name: METHODS[name] for name in ("none", "look_up", "gaussian_process", "gmr")}
+    few = {name: METHODS[name] for name in ("between_places", "none", "look_up", "gaussian_process", "gmr")}
     monkeypatch.setattr("sim.experiments.people.METHODS", {"ours": few.pop("gaussian_process"), **few})
     results = Results(tmp_path, "people", said=False)
     found = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
@@ -225,6 +258,8 @@ def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, mon
     # what demonstrations buy is the way between the places
     assert mean["ours"]["path_rms_mm"] < mean["none"]["path_rms_mm"] < mean["look_up"]["path_rms_mm"]
     assert mean["look_up"]["path_rms_mm"] < mean["gmr"]["path_rms_mm"]
+    assert mean["between_places"]["success"] >= mean["look_up"]["success"]
+    assert mean["between_places"]["path_rms_mm"] < mean["none"]["path_rms_mm"]
     assert (tmp_path / "people.png").read_bytes()[:4] == b"\x89PNG"
 
 
