@@ -13,6 +13,7 @@ import contextlib
 import importlib
 import os
 import sys
+from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
@@ -20,7 +21,7 @@ from service.cli.usage import UsageError
 from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
-from service.contract.requests import ViaPoint
+from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 
 RUN_BY = {
@@ -49,6 +50,7 @@ def parser() -> argparse.ArgumentParser:
         description="A robot arm as a third hand at the soldering bench.",
         epilog="example: thirdhand demo",
     )
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
@@ -215,7 +217,7 @@ def parser() -> argparse.ArgumentParser:
         "--tolerance",
         type=float,
         metavar="M",
-        help="points learned nearer than this give way (default: {TOLERANCE_M} m)",
+        help=f"points learned nearer than this give way (default: {TOLERANCE_M} m)",
     )
     a.add_argument("--file", metavar="FILE", help="a request as JSON instead; - is standard input")
     _reach(a)
@@ -262,6 +264,14 @@ def parser() -> argparse.ArgumentParser:
         "--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)"
     )
     return top
+
+
+class _Version(argparse.Action):
+    """Prints the version: of the installed distribution, whose metadata only this reads."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(f"thirdhand {metadata.version('thirdhand')}")
+        parser.exit()
 
 
 def _rate(given: str) -> int:

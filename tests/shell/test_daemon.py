@@ -210,6 +210,12 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
 
 
+def test_the_version_is_told() -> None:
+    done = thirdhand("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("thirdhand 0.")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
