@@ -96,7 +96,10 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     """
     if not folder:
         return {}
-    own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+    try:
+        own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+    except RuntimeError:
+        raise UnreachableError(f"certificate {folder}: there is no such user's folder") from None
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")

@@ -36,6 +36,7 @@ Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quat
 PerJoint = tuple[float, ...]
 
 
+PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), ("arm", "urdf"), ("network", "certificate"))
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
@@ -333,6 +334,20 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, value
 
 
+def _check_paths(given: Any) -> None:
+    """Raises SettingsError where a path can be none."""
+    for section, name in PATHS:
+        table = given.get(section) if isinstance(given, dict) else None
+        value = table.get(name) if isinstance(table, dict) else None
+        if isinstance(value, str):
+            if "\0" in value:
+                raise SettingsError(f"$.{section}.{name}: {value!r} given; a path holds no zero bytes")
+            try:
+                Path(value).expanduser()
+            except RuntimeError:
+                raise SettingsError(f"$.{section}.{name}: {value!r} given; there is no such user's folder") from None
+
+
 def converted(given: Any, *, origin: str) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
@@ -340,6 +355,7 @@ def converted(given: Any, *, origin: str) -> Settings:
     than the URDF's.
     """
     try:
+        _check_paths(given)
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
@@ -360,8 +376,11 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
     """
     try:
         given = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        _check_paths(given)
+    except (tomllib.TOMLDecodeError, SettingsError) as error:
         raise SettingsError(f"{origin}: {error}") from None
+    except RecursionError:
+        raise SettingsError(f"{origin}: tables or lists in each other, too deep to be meant") from None
     for section, name in (("arm", "urdf"), ("network", "certificate")):
         table = given.get(section)
         if folder is not None and isinstance(table, dict) and isinstance(table.get(name), str) and table[name]:

@@ -98,6 +98,8 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[arm]\nsource = 'guess'", "$.arm.source", "assumed"),
         ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "`array`"),
         ("[files]\nrecord = 3", "$.files.record", "a text needed"),
+        ("[files]\nstate = '~nobody-of-this-name/x'", "$.files.state", "no such user's folder"),
+        ('[network]\ncertificate = "a\\u0000b"', "$.network.certificate", "no zero bytes"),
         ("[network]\nlisten = ['tcp/0.0.0.0:7447']", "$.network.listen[0]", "or else allow_insecure = true needed"),
         ("[network]\nlisten = ['tcp/127.0.0.1:1', 'udp/[::]:1']", "$.network.listen[1]", "or else allow_insecure"),
         ("[network]\nlisten = ['tls/127.0.0.1:1']", "$.network.certificate", "the folder of one needed"),

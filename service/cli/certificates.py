@@ -23,6 +23,7 @@ from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, names
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"
+GIVEN = "given.txt"  # the names of all certificates that were made
 CLOCKS_DIFFER = datetime.timedelta(days=1)
 
 
@@ -34,6 +35,11 @@ def certificates(args: argparse.Namespace) -> int:
         raise UsageError(f"--name {args.name}: the --role that it is to have needed too")
     folder: Path = args.folder
     hosts = list(dict.fromkeys(["localhost", "127.0.0.1", "::1", socket.gethostname(), *(args.host or [])]))
+    for host in hosts:
+        try:
+            _host(host or " ")
+        except ValueError:
+            raise UsageError(f"--host {host!r}: a name in plain letters, or an address, needed") from None
     if args.role:
         authority, key = _authority_in(folder)
         made = [_free_name(folder, args.role, args.name)]
@@ -91,6 +97,8 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
 def _free_name(folder: Path, role: str, wanted: str | None) -> str:
     """A name that no certificate of the role had: who is revoked by name stays so."""
     taken = {path.name for path in folder.iterdir()}
+    if role != DAEMON and (folder / GIVEN).exists():  # also those that were moved to their machines
+        taken |= set((folder / GIVEN).read_text(encoding="utf-8").split())
     if wanted is not None and wanted not in names(role):
         raise UsageError(f"--name {wanted}: {role} with a number needed, {names(role)[1]} to {names(role)[-1]}")
     if wanted in taken:
@@ -107,6 +115,9 @@ def _write(
     """A folder, named as its holder, with certificate, key and the authority's certificate, all
     private to their user; until when it is valid. A daemon's is for what clients reach as `hosts`.
     """
+    record = os.open(folder.parent / GIVEN, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    with open(record, "a", encoding="utf-8") as given:
+        print(folder.name, file=given)
     own = ec.generate_private_key(ec.SECP256R1())
     is_daemon = folder.name in names(DAEMON)
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * is_daemon

@@ -10,10 +10,8 @@ from typing import Any
 
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
-from service.config import converted
 from service.contract import requests
 from service.contract.channels import ENDPOINT
-from service.described_arm import SettingsError
 
 
 def via_points(args: argparse.Namespace) -> int:
@@ -94,10 +92,6 @@ resume = reset = hold
 
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
-    try:
-        converted({"cell": args.cell}, origin="--cell")
-    except SettingsError as error:
-        raise UsageError(str(error)) from None
     with open_session(
         connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
     ) as session:

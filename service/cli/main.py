@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
-from service.cli.usage import UsageError
+from service.cli.usage import UsageError, check_cell
 from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
@@ -312,17 +312,19 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     module, function = args.run.split(".")
     try:
+        if "cell" in args and args.cell is not None:  # a wildcard would reach every cell
+            check_cell(args.cell)
         run = getattr(importlib.import_module(f"service.cli.{module}"), function)
         with interrupt.put_away_first() if args.command in PUT_AWAY_FIRST else contextlib.nullcontext():
             return int(run(args))
     except UsageError as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # whoever read has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 1
     except (ExplainedError, OSError) as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         interrupt.end_at_once()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 1

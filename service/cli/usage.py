@@ -20,6 +20,17 @@ class UsageError(ValueError):
     """A command line that cannot be meant."""
 
 
+def check_cell(name: str) -> None:
+    """Raises UsageError where a cell cannot be named so."""
+    from service.config import converted  # heavy
+    from service.described_arm import SettingsError
+
+    try:
+        converted({"cell": name}, origin="--cell")
+    except SettingsError as error:
+        raise UsageError(str(error)) from None
+
+
 def check_writable(path: Path) -> None:
     """Raises UsageError where no file can be written under this name: asked before long work."""
     folder = path.parent

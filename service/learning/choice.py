@@ -84,7 +84,7 @@ class Choice:
         if count < 2:
             raise SkillError(
                 f"{count} demonstration given: at least 2 needed, as what is learned from the others must predict "
-                "each; record another, or give --components, --ell and --penalty"
+                "each; record another"
             )
         tried = [
             (rms(self.residuals(one, noise)), one, noise)

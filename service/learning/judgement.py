@@ -169,7 +169,8 @@ def _verdicts(
         )
     if len(found.demonstrations) < 3:
         say(
-            f"{len(found.demonstrations)} demonstrations tell little of how sure the skill may be; 5 advised", bad=False
+            f"{len(found.demonstrations)} demonstration(s) tell little of how sure the skill may be; 5 advised",
+            bad=False,
         )
     if overall.error_mm > NOTED_MM:
         say(
@@ -213,7 +214,9 @@ def _verdicts(
 def table(found: Figures) -> str:
     """The figures as a short table for a terminal."""
     width = max(len(row.name) for row in (*found.demonstrations, found.all))
-    lines = [f"{'held out':<{width}}   error  predicted   worst   in 50 %  in 95 %   held"]
+    which = "held out" if len(found.demonstrations) > 1 else "learned from"
+    width = max(width, len(which))
+    lines = [f"{which:<{width}}   error  predicted   worst   in 50 %  in 95 %   held"]
     for row in (*found.demonstrations, found.all):
         lines.append(
             f"{row.name:<{width}}  {row.error_mm:4.0f} mm    {row.predicted_mm:4.0f} mm {row.worst_mm:4.0f} mm"
@@ -221,7 +224,7 @@ def table(found: Figures) -> str:
         )
     lines += [
         f"gate {found.gate_mm:.0f} mm: holds {found.swapped:.0f} % of hands swapped, {found.beside:.0f} % of both "
-        f"30 cm beside, {found.one_beside:.0f} % of one",
+        f"30 cm beside, {found.one_beside:.0f} % of one hand 30 cm beside",
         f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
         "out of reach",
         *(f"warning: {text}" for text in found.warnings),

@@ -79,6 +79,8 @@ def learn(
     kept = [i for i in range(len(pairs)) if i not in twins]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
+    if len(kept) == 1:
+        remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     try:
         if components is None:
             progress(f"choosing parameters over {len(paths)} demonstrations")

@@ -68,11 +68,13 @@ def draw(evidence: Evidence, path: Path) -> None:
     gate.set(xscale="log", ylim=(0, 100))
     gate.legend(frameon=False, fontsize=8)
 
-    overall = evidence.figures.all
-    figure.suptitle(
-        f"{skill.name}: {len(held_out)} demonstrations, each predicted by the others to {overall.error_mm:.0f} mm rms, "
-        f"{overall.predicted_mm:.0f} mm predicted"
+    overall, count = evidence.figures.all, len(held_out)
+    told = (
+        f"{count} demonstrations, each predicted by the others to {overall.error_mm:.0f} mm rms"
+        if count > 1
+        else f"one demonstration, none held out: {overall.error_mm:.0f} mm rms in what was learned"
     )
+    figure.suptitle(f"{skill.name}: {told}, {overall.predicted_mm:.0f} mm predicted")
     figure.savefig(path, format="png")
 
 

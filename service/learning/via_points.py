@@ -63,7 +63,8 @@ def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Ve
     for i, j in np.argwhere(tools > allowed)[:1].tolist():
         raise SkillError(
             f"via-points {owners[i]!r} and {owners[j]!r} contradict each other: their hands are {hands[i, j]:.4f} m "
-            f"apart and their tools {tools[i, j]:.4f} m; {STEEPEST:g} times as far, {allowed[i, j]:.4f} m, accepted"
+            f"apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, {STEEPEST:g} "
+            "times the hands' distance and what their std allow"
         )
 
 

@@ -230,9 +230,12 @@ class Daemon:
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + STOP_TIMEOUT_S
-                    inbox.append(order("hold"))
-                elif not self._frame["joint_velocities"].any() or time.monotonic() > stop_by:
+                elif not self._frame["joint_velocities"].any():
                     return
+                elif time.monotonic() > stop_by:
+                    log.error("the arm has not come to rest in %g s; it is commanded no more", STOP_TIMEOUT_S)
+                    return
+                inbox.append(order("hold"))  # behind whatever else is asked meanwhile
             yield Tick(index, tuple(inbox))
 
     def _warm_up(self) -> None:

@@ -5,11 +5,13 @@ cell.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import logging
 import os
 import resource
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,9 @@ BOUNDS: dict[str, Any] = {
 log = logging.getLogger("thirdhand")
 
 
+MOST_TOLD = 4096  # bytes that are read of what a lock's holder says
+
+
 class OccupiedError(ExplainedError, RuntimeError):
     """A cell that another daemon serves already."""
 
@@ -56,10 +61,13 @@ class Lock:
         self._descriptor: int | None = None
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+            self._descriptor = os.open(path, flags, 0o600)
+            if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+                raise OSError(errno.EINVAL, "no regular file")
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            which = _told(path)
+            which = _told(self._descriptor)
             self.close()
             raise OccupiedError(
                 f"cell {cell} is served already on this machine ({which}; {path} is locked): stop that daemon, or give "
@@ -86,10 +94,10 @@ class Lock:
             self._descriptor = None
 
 
-def _told(path: Path) -> str:
+def _told(descriptor: int | None) -> str:
     """What the holder of a lock says of itself."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        said = json.loads(path.read_bytes())
+        said = json.loads(os.pread(descriptor, MOST_TOLD, 0))  # type: ignore[arg-type]
         where = f"listening on {', '.join(said['endpoints'])}" if said["endpoints"] else "not listening, or not yet"
         return f"process {said['pid']}, {where}"
     return "a process that did not say which"

@@ -73,7 +73,7 @@ def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, han
     steep = 4.0 * hands + 0.001 + 0.0006
     with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
         adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
-    assert f"4 times as far, {steep:.4f} m, accepted" in str(caught.value)
+    assert f"at most {steep:.4f} m accepted, 4 times the hands' distance" in str(caught.value)
     allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
     here = np.array([*EXACT.left, *EXACT.right])
     assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 10.0

@@ -232,6 +232,9 @@ def test_the_version_is_told() -> None:
         (("view", "missing.rrd"), 1, "missing.rrd"),
         (("via-points", "add"), 2, "needed"),
         (("play", "missing.mcap"), 1, "missing.mcap"),
+        (("play", "missing.mcap", "--cell", "**"), 2, "--cell: $.cell"),
+        (("hold", "--cell", ""), 2, "--cell: $.cell"),
+        (("status", "--certificate", "~nobody-of-this-name/x"), 1, "no such user's folder"),
         ((), 2, "COMMAND"),
     ],
 )

@@ -195,6 +195,7 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
         (("--name", "tracker-2"), 2, "the --role that it is to have needed too"),
         (("--role", "tracker", "--name", "tracker"), 1, "a name that was not given before needed"),
         (("--role", "nobody"), 2, "invalid choice"),
+        (("--role", "tracker", "--host", "not plain \u00fc"), 2, "a name in plain letters, or an address, needed"),
         (("--role", "daemon", "--days", "0"), 2, "accepted"),
     ],
 )
@@ -207,6 +208,19 @@ def test_one_more_certificate_that_cannot_be_is_refused_in_words(
     nowhere = thirdhand("certificates", str(secrets / "none"), "--role", "tracker")
     assert nowhere.returncode == 1
     assert "no authority in" in nowhere.stderr
+
+
+def test_a_name_that_was_given_is_not_given_again_when_its_folder_went_to_its_machine(secrets: Path) -> None:
+    made = [thirdhand("certificates", str(secrets), "--role", "bench") for _ in range(2) if _moved(secrets / "bench-2")]
+    assert [done.returncode for done in made] == [0, 0]
+    assert (secrets / "bench-3").is_dir()
+    assert not (secrets / "bench-2").exists()
+
+
+def _moved(folder: Path) -> bool:
+    if folder.exists():
+        folder.rename(folder.parent.parent / folder.name)
+    return True
 
 
 def test_the_daemons_certificate_can_be_made_anew(secrets: Path) -> None:

@@ -21,6 +21,7 @@ from cell import Daemon, Tracker, serving, thirdhand
 from service.client import RefusedError, UnreachableError
 from service.learning.skill_file import SkillError
 from service.recorder.replay import replay
+from service.shell.door import Lock
 from service.shell.watch import watched
 from service.shell.workshop import Workshop
 
@@ -128,6 +129,44 @@ def test_watched_work_begins_again_until_it_ends_by_itself() -> None:
     watched("work", work, told.append, pause_s=0.0)
     assert len(runs) == 3
     assert told == ["the work failed: ValueError('run 1')", "the work failed: ValueError('run 2')"]
+
+
+def test_nobody_cancels_the_stop_of_a_daemon_that_ends(tmp_path: Path) -> None:
+    """`resume` is asked again and again while it stops: the last command has come to rest."""
+    with serving(tmp_path, "--arm", "assumed") as daemon, Tracker(daemon.session) as tracker:
+        daemon.until(lambda status: status["mode"] == "follow")
+        tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
+        ended = threading.Event()
+
+        def resume() -> None:
+            while not ended.is_set():
+                with contextlib.suppress(UnreachableError, RefusedError):
+                    daemon.client.ask("resume")
+
+        asking = threading.Thread(target=resume)
+        asking.start()
+        time.sleep(0.2)
+        begun = time.monotonic()
+        daemon.process.send_signal(signal.SIGTERM)
+        assert daemon.process.wait(20) == 0
+        assert time.monotonic() - begun < 2.5  # not the time-out of the stop
+        ended.set()
+        asking.join(20)
+        assert "has not come to rest" not in daemon.log.read_text()
+
+
+def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("untouched")
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "daemon.lock").symlink_to(victim)
+    (tmp_path / "pipe").mkdir()
+    os.mkfifo(tmp_path / "pipe" / "daemon.lock")
+    for name in ("link", "pipe"):
+        lock = Lock(tmp_path / name, "thirdhand")
+        lock.tell(["tcp/127.0.0.1:1"])
+        lock.close()
+    assert victim.read_text() == "untouched"
 
 
 @pytest.mark.parametrize("signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]])
