@@ -126,11 +126,8 @@ FAULTS = {
     "service asked to end": Fault(_end_the_service, FaultyCell.begin_service, network="router"),
 }
 SHORT = (
-    "tracker killed",
     "tracker frozen",
-    "network to the tracker silent",
     "network to the arm silent",
-    "network to the arm torn",
     "scribe killed",
     "service killed",
     "router killed",
