@@ -31,7 +31,7 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
     assert next(tmp_path.glob("*.rrd")).stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("what", ["scribe killed", "disk full", "taught each 100 ms"])
+@pytest.mark.parametrize("what", ["scribe killed", "taught each 100 ms"])
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == what))
     monkeypatch.setattr(loads, "_large", bytes)
