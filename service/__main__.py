@@ -17,7 +17,9 @@ def main() -> int:
     interrupt.watch()
     from service.cli.main import main as run  # takes a while, and may be interrupted
 
-    return run()
+    code = run()
+    interrupt.too_late()
+    return code
 
 
 if __name__ == "__main__":

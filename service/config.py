@@ -37,6 +37,7 @@ PerJoint = tuple[float, ...]
 
 
 PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), ("arm", "urdf"), ("network", "certificate"))
+BESIDE = PATHS[-2:]  # those that lie beside the configuration, where they are not absolute
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
@@ -334,28 +335,30 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, value
 
 
-def _check_paths(given: Any) -> None:
-    """Raises SettingsError where a path can be none."""
+def _resolve_paths(given: Any, folder: Path | None) -> None:
+    """Puts what lies beside the configuration into its folder. Raises SettingsError."""
     for section, name in PATHS:
         table = given.get(section) if isinstance(given, dict) else None
         value = table.get(name) if isinstance(table, dict) else None
-        if isinstance(value, str):
+        if isinstance(table, dict) and isinstance(value, str):
             if "\0" in value:
                 raise SettingsError(f"$.{section}.{name}: {value!r} given; a path holds no zero bytes")
             try:
-                Path(value).expanduser()
+                expanded = Path(value).expanduser()
             except RuntimeError:
                 raise SettingsError(f"$.{section}.{name}: {value!r} given; there is no such user's folder") from None
+            if value and folder is not None and (section, name) in BESIDE:
+                table[name] = str(folder / expanded)
 
 
-def converted(given: Any, *, origin: str) -> Settings:
+def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
-    What is not said of an arm with a URDF of its own is taken from there; no limit may be wider
-    than the URDF's.
+    Where URDF and certificate are not absolute paths they lie in `folder`. What is not said of an
+    arm with a URDF of its own is taken from there; no limit may be wider than the URDF's.
     """
     try:
-        _check_paths(given)
+        _resolve_paths(given, folder)
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
@@ -370,22 +373,14 @@ def converted(given: Any, *, origin: str) -> Settings:
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
-    """Settings from TOML text; `origin` names it in errors. Raises SettingsError.
-
-    Where URDF and certificate are not absolute paths they lie in `folder`.
-    """
+    """Settings from TOML text, as `converted` takes them. Raises SettingsError."""
     try:
         given = tomllib.loads(text)
-        _check_paths(given)
-    except (tomllib.TOMLDecodeError, SettingsError) as error:
+    except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{origin}: {error}") from None
     except RecursionError:
         raise SettingsError(f"{origin}: tables or lists in each other, too deep to be meant") from None
-    for section, name in (("arm", "urdf"), ("network", "certificate")):
-        table = given.get(section)
-        if folder is not None and isinstance(table, dict) and isinstance(table.get(name), str) and table[name]:
-            table[name] = str(folder / Path(table[name]).expanduser())
-    return converted(given, origin=origin)
+    return converted(given, origin=origin, folder=folder)
 
 
 def load(path: Path) -> Settings:

@@ -50,6 +50,12 @@ def put_away_first() -> Iterator[None]:
         _PUTS_AWAY.clear()
 
 
+def too_late() -> None:
+    """From here on SIGINT changes nothing: the command is done, and its exit code decided."""
+    if signal.getsignal(signal.SIGINT) is _raise_to_put_away:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _raise_to_put_away(number: int, frame: FrameType | None) -> None:
     """Python's handler; that of all other cases is `_serve`, which waits for no bytecode."""
     if _PUTS_AWAY.is_set() and not _RAISED.is_set():

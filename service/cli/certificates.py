@@ -102,7 +102,7 @@ def _free_name(folder: Path, role: str, wanted: str | None) -> str:
     if wanted is not None and wanted not in names(role):
         raise UsageError(f"--name {wanted}: {role} with a number needed, {names(role)[1]} to {names(role)[-1]}")
     if wanted in taken:
-        raise ExplainedError(f"{folder / str(wanted)} is there: a name that was not given before needed")
+        raise ExplainedError(f"{folder / str(wanted)} was made: a name that was not given before needed")
     free = wanted or next((name for name in names(role) if name not in taken), None)
     if free is None:
         raise ExplainedError(f"{folder} holds {MOST_OF_A_ROLE} certificates of role {role}, and no more are accepted")

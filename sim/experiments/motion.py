@@ -7,9 +7,8 @@ included.
 
 from __future__ import annotations
 
+import functools
 import math
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +25,7 @@ from sim.experiments.followers import Followed, Follower, chase, ours, servo, un
 from sim.experiments.linear_floor import Floor, best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
+from sim.experiments.workers import shared_out
 
 PEOPLE, SECONDS, STOPS, REACHES = 3, 15.0, 24, 1
 SETTLED_MM = 5.0
@@ -183,15 +183,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     tasks = [(name, SHIPPED, one) for name in by_name for one in hands]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
     tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
-    found: list[Figures] = []
-    if options.workers == 1:
-        found = [measure(task) for task in tasks]
-    else:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(
-            options.workers, mp_context=context, initializer=prepare, initargs=(options.share,)
-        ) as pool:
-            found = list(pool.map(measure, tasks, chunksize=8))
+    found = list(
+        shared_out(measure, tasks, options.workers, prepare=functools.partial(prepare, options.share), chunk=8)
+    )
     table = {name: _summary([one for one in found if one.follower == name]) for name in by_name}
     for name, groups in table.items():
         results.say(f"{name}: {_line(groups)}")

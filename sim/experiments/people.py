@@ -8,9 +8,7 @@ many candidates for each method; the figures are those of the test set, whom not
 from __future__ import annotations
 
 import functools
-import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +36,7 @@ from sim.experiments.trials import (
     seen,
     workspace,
 )
+from sim.experiments.workers import shared_out
 from sim.people import Group, person
 from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
 
@@ -152,14 +151,6 @@ def outcomes(task: Task) -> list[Outcome]:
     return [judge(model.place(one.session.told), one, _box()) for one in runs]
 
 
-def _all(tasks: list[Task], workers: int) -> Iterator[list[Outcome]]:
-    if workers == 1:
-        yield from map(outcomes, tasks)
-        return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(outcomes, tasks)
-
-
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
     group = options.group
@@ -171,7 +162,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         tasks += [Task(method, number, group, "", people, scenes, options.hands) for number in tried]
         tasks += [Task(method, 0, group, kind, 0, each, None) for kind in BREAKING]
     found: dict[Task, list[Outcome]] = {}
-    for task, rows in zip(tasks, _all(tasks, options.workers), strict=True):
+    for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
         found[task] = rows
         if task.kind:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")

@@ -6,9 +6,6 @@ joints as the simulation measures them, hands as they are.
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -29,6 +26,7 @@ from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
+from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
 SCENES, RATE_HZ = 100, 250  # half the rate, to save time
@@ -254,21 +252,12 @@ def _allow(distance: Array, coming: Array, brake: float, reaction: float, cleara
                 out[t, side, c] = allowed_speed(distance[t, side, c], coming[t, side, c], brake, reaction, clearance)
 
 
-def outcomes(tasks: list[tuple[str, int]], workers: int) -> Iterator[Outcome]:
-    """What became of them, in order."""
-    if workers == 1:
-        yield from map(run_one, tasks)
-        return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(run_one, tasks)
-
-
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     count = max(1, round(SCENES * options.share))
     found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
     tasks = [(kind, n) for n in range(count) for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
-    for one in outcomes(tasks, options.workers):
+    for one in shared_out(run_one, tasks, options.workers):
         found[one.kind].append(one)
         if len(found[one.kind]) % max(1, count // 5) == 0:
             results.say(f"{one.kind}: {_summary(found[one.kind])}")

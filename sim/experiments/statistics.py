@@ -7,9 +7,6 @@ few scenes in real time over Zenoh.
 from __future__ import annotations
 
 import math
-import multiprocessing
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +20,7 @@ from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import SERIES, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
 from sim.experiments.skills import LookUp, NoDemonstrations
+from sim.experiments.workers import shared_out
 from sim.scene import GRASP_DISTANCE
 
 SCENES, LIVE_SCENES = 100, 3
@@ -80,23 +78,15 @@ def outcome(task: tuple[str, int]) -> Outcome:
     return Outcome(method, number, done.errors_mm, done.events.success, done.held_s)
 
 
-def outcomes(tasks: list[tuple[str, int]], workers: int) -> Iterator[Outcome]:
-    """What became of them, in order."""
-    if workers == 1:
-        prepare()
-        yield from map(outcome, tasks)
-        return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=prepare) as pool:
-        yield from pool.map(outcome, tasks)
-
-
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     count = max(1, round(SCENES * options.share))
     live_count = LIVE_SCENES if options.share == 1 else 0
     tasks = [(method, number) for method in METHODS for number in range(count)]
     found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
-    for one in outcomes(tasks, options.workers):
+    if options.workers == 1:
+        prepare()
+    for one in shared_out(outcome, tasks, options.workers, prepare=prepare):
         found[one.method].append(one)
         done = found[one.method]
         if not one.success and one.method == "ours":

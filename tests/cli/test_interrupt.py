@@ -60,7 +60,7 @@ def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
 
 @pytest.mark.parametrize(
     ("name", "delay_s"),
-    [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5), ("learn", 1.5)],
+    [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],
 )
 def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
     (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
@@ -81,6 +81,27 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
     assert text.splitlines()[-1] == SAID
     assert text.count(SAID) == 1
     assert "Traceback" not in text
+
+
+def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
+    said, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
+    wait_for(lambda: "choosing parameters" in said.read_text())
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
+    assert said.read_text().splitlines()[-1] == SAID
+    assert not skill.exists()
+
+
+def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
+    said, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
+    wait_for(skill.exists)
+    while process.poll() is None:  # also while the interpreter takes itself down
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.001)
+    assert process.returncode in (0, 130)
+    assert "Traceback" not in said.read_text()
 
 
 def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
