@@ -209,6 +209,11 @@ class Predictor(Immutable):
         return self._solution.weights
 
     @property
+    def centres(self) -> Array:
+        """(N, I) what the weights belong to: reference points that stay, and via-points."""
+        return self._solution.centres
+
+    @property
     def error_bound(self) -> float:
         """How far the mean can be from equation (9)'s at the points [unit of the outputs].
 

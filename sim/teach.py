@@ -8,16 +8,22 @@ from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
+import math
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
+from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.recorder.demonstrations import write_demonstration
-from sim.scene import Scene, SceneError
+from sim import sessions
+from sim.people import Places
+from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
 from sim.script import HandScript, Teacher
 
+RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
 EXAMPLE = """example:
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
@@ -47,6 +53,52 @@ def demonstrations(scene: Scene, *, count: int, seed: int) -> list[Demonstration
     return [demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number) for number in range(1, count + 1)]
 
 
+def by_people(people: int) -> list[Demonstration]:
+    """Two demonstrations of each of so many modelled people, things in their usual places and
+    moved, which name the task's places.
+    """
+    return [recorded(one, begin_s=60 * number) for number, one in enumerate(sessions.demonstrations(people))]
+
+
+def recorded(shown: sessions.Shown, *, begin_s: int = 1) -> Demonstration:
+    """A demonstration of a session, as the service reads it from a recording."""
+    count = len(shown.times)
+    still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
+    return Demonstration(
+        np.round(1e9 * (shown.times + begin_s)).astype(np.int64),
+        np.hstack([shown.hands[:, :3], still]),
+        np.hstack([shown.hands[:, 3:], still]),
+        np.hstack([shown.tool, turned]),
+        places=places_of(shown.places),
+    )
+
+
+def places_of(places: Places) -> tuple[ViaPoint, ...]:
+    """The named places of the task, as the bench teaches them, in the order in which the tool comes
+    to them, with how sure they are.
+
+    A place's `std` is of each axis, its error 3-D rms.
+    """
+    p, std = places, max(places.std_m / math.sqrt(3.0), LEAST_STD_M)
+    named = (
+        ("start", p.left_start, p.right_start, p.robot_start),
+        ("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND),
+        ("glass", p.board, p.iron, p.glass),
+        ("soldering", p.board, p.right_final, p.carry),
+    )
+    rows = [
+        {
+            "name": name,
+            **{part: np.round(at, 6).tolist() for part, at in zip(("left", "right", "tool"), ends, strict=True)},
+            "std": std,
+            "radius": RADIUS_M,
+            "follow": "left" if name == "handover" else "none",
+        }
+        for name, *ends in named
+    ]
+    return msgspec.convert(rows, tuple[ViaPoint, ...])
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The exit code: 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
@@ -70,6 +122,11 @@ def main(arguments: list[str] | None = None) -> int:
         type=Path,
         help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
     )
+    p.add_argument(
+        "--people",
+        action="store_true",
+        help="by modelled people, two of each, with things moved and named: what is learned between places",
+    )
     p.add_argument("--cell", default="thirdhand", help="prefix of the topics (default: %(default)s)")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
@@ -80,7 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
         scene = Scene.load(args.scene) if args.scene else Scene()
         args.output.mkdir(parents=True, exist_ok=True)
         seed = scene.seed if args.seed is None else args.seed
-        for number, taught in enumerate(demonstrations(scene, count=args.count, seed=seed), start=1):
+        made = by_people(args.count) if args.people else demonstrations(scene, count=args.count, seed=seed)
+        for number, taught in enumerate(made, start=1):
             path = args.output / f"demonstration-{number}.mcap"
             write_demonstration(path, taught, cell=args.cell)
             print(path)

@@ -168,6 +168,13 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
     c.add_argument("--config", metavar="FILE", type=Path, help="settings of the cell, for the arm's reach")
+    c.add_argument(
+        "--places",
+        metavar="FILE",
+        type=Path,
+        help="where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
+        "do not tell: then it is learned between them, and holds wherever they are",
+    )
     c.add_argument("--points", metavar="N", type=_count, default=200, help="of the reference (default: %(default)s)")
     c.add_argument("--ell", metavar="L", type=_positive, help="of the kernel [1/m²] (default: chosen; mixture: 5)")
     c.add_argument(

@@ -9,7 +9,7 @@ import time
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
 from service.client import UnreachableError, open_session
 from service.config import load
-from service.contract import cdr, channels
+from service.contract import cdr, channels, requests
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.learning.judgement import table
@@ -79,13 +79,15 @@ def learn(args: argparse.Namespace) -> int:
     """Exit code 0 once the skill is written; 1, and nothing written, where it would be unsafe."""
     for path in filter(None, (args.output, args.plot)):
         check_writable(path)
+    told = requests.decode_request(args.places.read_bytes(), requests.Add) if args.places else None
+    places = told.points if told else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(path, say=lambda line: print(line, file=sys.stderr, flush=True))
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
-        demonstrations.append(demonstration)
+        demonstrations.append(demonstration if demonstration.places else demonstration._replace(places=places))
     evidence: list[Evidence] = []
     skill = learned(
         demonstrations,
@@ -108,7 +110,8 @@ def learn(args: argparse.Namespace) -> int:
         raise ExplainedError(f"{args.output} is not written: {'; '.join(figures.unsafe)}")
     args.output.write_bytes(skill.file)
     print(
-        f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where the "
-        f"prediction's standard deviation exceeds {1000 * skill.threshold:.0f} mm"
+        f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where "
+        f"{'a hand is farther off its places than' if skill.between else 'the prediction is less sure than'} "
+        f"{1000 * skill.threshold:.0f} mm"
     )
     return 0

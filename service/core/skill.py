@@ -14,10 +14,25 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
+from kmp.query import MotionPrediction
 from service.contract.requests import TOLERANCE_M, ViaPoint
+from service.core.between import Moving, Placed, Places, Task
 from service.core.frame import Vector
+from service.core.taught import bent
 
 MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded
+
+
+class LearnedBetween(NamedTuple):
+    """What a skill between places knows besides: its task, where its places were in the mean of the
+    demonstrations, and by how much (M, 3) [m] the tool was off at some inputs (M, F) when
+    demonstrations were left out.
+    """
+
+    task: Task
+    nominal: Places
+    seen: Vector
+    errors: Vector
 
 
 class Prediction(NamedTuple):
@@ -27,13 +42,13 @@ class Prediction(NamedTuple):
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
-    deviation: float  # root mean square over the axes [m]
+    deviation: float  # [m] what is compared with the skill's threshold, see `Skill.deviations`
 
 
 @dataclass(frozen=True, eq=False)
 class Skill:
     """Immutable: a KMP from both hands' positions (6 inputs [m]) to the tool's (3 outputs [m]), and
-    what belongs to it.
+    what belongs to it; or, with `between`, one from their shares of its places to the tool's.
 
     Made by `service.learning`, which learns, adapts and stores it.
     """
@@ -47,7 +62,8 @@ class Skill:
     components: int = 0  # of the mixture that it was learned with, 0 for none
     via_points: tuple[ViaPoint, ...] = ()
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
-    figures: str = ""  # JSON of what was found in learning; empty where it was not judged
+    between: LearnedBetween | None = None
+    figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
     file: bytes = field(default=b"", repr=False)  # all of the above, as it is stored and recorded
 
     def predict(
@@ -62,14 +78,57 @@ class Skill:
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
         """
-        found = self.primitive.predict_motion(
-            hands.reshape(6), velocities.reshape(6), accelerations.reshape(6), covariance=covariance is None
-        )
+        moving = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
+        found: MotionPrediction | Moving
+        if self.placed is None:
+            found = self.primitive.predict_motion(*moving, covariance=covariance is None)
+        else:
+            found = self.placed.moving(*moving, covariance=covariance is None)
         given = covariance if found.covariance is None else found.covariance
         assert given is not None
         motion, rounded = np.empty((3, 3)), np.empty((3, 3))
         deviation = _round(found.mean, found.velocity, found.acceleration, given, motion, rounded)
+        if isinstance(found, Moving):
+            deviation = round(found.off * MOTION_STEPS) / MOTION_STEPS
         return Prediction(motion[0], motion[1], motion[2], rounded, deviation)
+
+    def mean(self, hands: Vector, velocities: Vector | None = None) -> Vector:
+        """The tool (T, 3) [m] for hands (T, 6) [m] at rest, or that move so [m/s]."""
+        hands = np.asarray(hands, np.float64)
+        if self.placed is None:
+            return self.primitive.mean(hands)
+        return self.placed.at_rest(hands) if velocities is None else self.placed.mean(hands, velocities)
+
+    def covariances(self, hands: Vector, velocities: Vector | None = None) -> Vector:
+        """How sure `mean` is, (T, 3, 3) [m²]."""
+        if self.placed is None:
+            return self.primitive.predict(hands).covariance
+        inputs, _ = self.placed.inputs(hands, np.zeros_like(hands) if velocities is None else velocities)
+        return np.array([self.placed.covariance(row) for row in inputs])
+
+    def deviations(self, hands: Vector) -> Vector:
+        """What the threshold is for, (T,) [m], for hands (T, 6) [m]: the predicted standard
+        deviation, root mean square over the axes; between places, how far a hand is off them.
+        """
+        if self.placed is None:
+            return np.asarray(np.sqrt(np.trace(self.covariances(hands), axis1=1, axis2=2) / 3))
+        return np.asarray(self.placed.inputs(hands, np.zeros_like(hands))[1].max(axis=1))
+
+    @property
+    def hands(self) -> Vector:
+        """Hands (M, 6) [m] that it knows: of its reference points, or at its places."""
+        return self.primitive.inputs if self.placed is None else self.placed.corners_of_hands()
+
+    @cached_property
+    def placed(self) -> Placed | None:
+        """A skill between places, among those in force."""
+        if self.between is None:
+            return None
+        task, nominal, seen, errors = self.between
+        layout = task.layout(nominal.told(self.via_points))
+        plain = Placed.of(task, layout, self.primitive, seen, errors)
+        others = [point for point in self.via_points if point.name not in task.names]
+        return plain.through(*bent(plain.at_rest, plain.corners_of_hands(), others))
 
     @cached_property
     def digest(self) -> bytes:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.contract.messages import BASE
+from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
@@ -18,7 +19,8 @@ FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
 
 class Demonstration(NamedTuple):
     """Stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, each x y z [m] and
-    quaternion x y z w, in one frame.
+    quaternion x y z w, in one frame; and where the named places of its task were, in the order in
+    which the tool comes to them.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -26,6 +28,7 @@ class Demonstration(NamedTuple):
     right: Vector
     tool: Vector
     frame: str = BASE
+    places: tuple[ViaPoint, ...] = ()
 
     @property
     def hands(self) -> Vector:
@@ -39,9 +42,8 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
-        return Demonstration(
-            self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step], self.frame
-        )
+        stamps_ns, left, right, tool = self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step]
+        return self._replace(stamps_ns=stamps_ns, left=left, right=right, tool=tool)
 
 
 def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:

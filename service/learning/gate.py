@@ -5,6 +5,7 @@ Chosen between what held-out demonstrations reach and what planted nonsense reac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,16 +44,22 @@ def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float)
     `calibration`: by how much deviations are greater than errors; 1 where they were made alike. The
     ceiling holds for errors.
     """
-    swapped, beside, one_beside = (deviations(primitive.predict(x)) for x in nonsense(hands))
+    wrong = [deviations(primitive.predict(x)) for x in nonsense(hands)]
+    return between(held_out, wrong, ceiling=min(CEILING_M * calibration, HIGHEST_GATE_M))
+
+
+def between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float) -> Gate:
+    """The gate between what held-out demonstrations reach (T,) [m] and what each kind of planted
+    nonsense does.
+    """
     most = float(held_out.max())
-    least = min(float(np.quantile(x, MISSED)) for x in (swapped, beside, one_beside))
+    least = min(float(np.quantile(x, MISSED)) for x in wrong)
     if least > most:
         threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
     else:
         threshold = min(max(least, float(np.quantile(held_out, 1 - FALSE))), most)
-    ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
     threshold, capped = min(threshold, ceiling), threshold > ceiling
-    return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in (swapped, beside, one_beside))), capped)
+    return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in wrong)), capped)
 
 
 def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:

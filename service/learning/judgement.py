@@ -32,7 +32,7 @@ COVERAGE = ((30.0, 80.0), (88.0, 100.0))  # [%] beyond these a region is not wha
 
 class HeldOut(NamedTuple):
     """What the others' primitive predicts of a demonstration: errors (T, 3) [m], tool less mean,
-    covariances (T, 3, 3) [m²] and deviations (T,) [m].
+    covariances (T, 3, 3) [m²], and what the gate is for, `Skill.deviations` (T,) [m].
     """
 
     errors: Vector
@@ -142,7 +142,7 @@ def _row(name: str, one: HeldOut, threshold: float) -> Row:
         name=name,
         error_mm=1000 * rms(one.errors),
         worst_mm=1000 * float(lengths.max()),
-        predicted_mm=1000 * float(np.sqrt(3 * (one.deviations**2).mean())),
+        predicted_mm=1000 * float(np.sqrt(np.trace(one.covariance, axis1=1, axis2=2).mean())),
         within_50=100 * float((distances <= REGIONS[0]).mean()),
         within_95=100 * float((distances <= REGIONS[1]).mean()),
         held=100 * float((one.deviations > threshold).mean()),

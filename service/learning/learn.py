@@ -17,8 +17,10 @@ from numpy.typing import ArrayLike
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
+from service.core.between import Task
 from service.core.frame import Vector
-from service.core.skill import Skill
+from service.core.skill import LearnedBetween, Skill
+from service.learning.between import learned, task_of
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, in_phase
 from service.learning.gate import deviations, gate
@@ -81,33 +83,41 @@ def learn(
     paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
+    task = task_of(demonstrations) if components is None and ell is None else ""
+    if isinstance(task, str):
+        remarks += [task] if task else []
+    by_places: LearnedBetween | None = None
     try:
-        if components is None:
-            progress(f"choosing parameters over {len(paths)} demonstrations")
-            fit = _from_demonstrations(paths, points, ell)
+        if isinstance(task, Task):
+            progress(f"learning between the places {', '.join(task.names)}")
+            primitive, by_places, held_out, found = learned(task, demonstrations, paths, progress)
         else:
-            fit = _from_mixture(
-                paths,
-                components=components,
-                points=points,
-                ell=ell or ELL,
-                penalty=penalty or PENALTY,
-                spread_m=spread_m,
-                seed=seed,
+            if components is None:
+                progress(f"choosing parameters over {len(paths)} demonstrations")
+                fit = _from_demonstrations(paths, points, ell)
+            else:
+                fit = _from_mixture(
+                    paths,
+                    components=components,
+                    points=points,
+                    ell=ell or ELL,
+                    penalty=penalty or PENALTY,
+                    spread_m=spread_m,
+                    seed=seed,
+                )
+            progress(f"learning from all {len(paths)}")
+            primitive = fit(range(len(paths)))
+            held_out = list(_held_out(paths, fit, progress))
+            found = gate(
+                primitive,
+                np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in paths]),
+                np.concatenate([one.deviations for one in held_out]),
+                calibration=_calibration(held_out) if components else 1.0,
             )
-        progress(f"learning from all {len(paths)}")
-        primitive = fit(range(len(paths)))
-        held_out = list(_held_out(paths, fit, progress))
     except ValueError as error:
         if isinstance(error, SkillError):
             raise
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
-    found = gate(
-        primitive,
-        np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in paths]),
-        np.concatenate([one.deviations for one in held_out]),
-        calibration=_calibration(held_out) if components else 1.0,
-    )
     judged = figures(demonstrations, paths, names, held_out, found, reach=reach or Reach(), remarks=remarks)
     tools = np.concatenate([pairs[i][1] for i in kept])
     skill = Skill(
@@ -120,6 +130,7 @@ def learn(
             b"".join(d.hands.tobytes() + d.tool.tobytes() for d in demonstrations), digest_size=16
         ).hexdigest(),
         components=components or 0,
+        between=by_places,
         figures=msgspec.json.encode(judged).decode(),
     )
     skill = with_file(skill)

@@ -10,7 +10,7 @@ import numpy as np
 
 from service.core.frame import Vector
 from service.learning.choice import mahalanobis
-from service.learning.gate import deviations, nonsense
+from service.learning.gate import nonsense
 from service.learning.learn import Evidence
 
 SHARES = np.linspace(0.05, 0.95, 19)
@@ -60,7 +60,7 @@ def draw(evidence: Evidence, path: Path) -> None:
         nonsense(hands),
         strict=True,
     ):
-        shown[name] = deviations(skill.primitive.predict(wrong)), colour
+        shown[name] = skill.deviations(wrong), colour
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
     gate.axvline(1000 * skill.threshold, color="black", ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")

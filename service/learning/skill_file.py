@@ -22,12 +22,15 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
-from service.contract.requests import ViaPoint
-from service.core.skill import Skill
+from service.contract.requests import Name, ViaPoint
+from service.core.between import MOST_CORNERS, Places, Task
+from service.core.skill import LearnedBetween, Skill
 
-# The second holds what was found in learning; a skill of the first stays one, to the byte.
-PLAIN, JUDGED = FORMATS = (1, 2)
+# The second holds what was found in learning, the third is of a skill between places; a skill of
+# the first stays one, to the byte.
+PLAIN, JUDGED, BETWEEN = FORMATS = (1, 2, 3)
 INPUTS, OUTPUTS = 6, 3
+MOST_PLACES = 100
 LARGEST_FILE = 100_000_000  # bytes, unpacked
 MOST_POINTS = 2500  # of the reference: a tick takes as long
 FARTHEST_M = 10.0  # of anything from the base plate
@@ -49,7 +52,32 @@ RANGES = {  # of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-KNOWN = {*RANGES, "format", "units", "name", "learned_from", "places", "replaced", "figures", "checksum"}
+RANGES_BETWEEN = {  # of those that a skill between places has besides
+    "corners": (0, MOST_CORNERS - 1, ""),
+    "shares": (-1, MOST_CORNERS * 2 - 1, ""),
+    "follow": (-1, 1, ""),
+    "nominal": (-FARTHEST_M, FARTHEST_M, "m"),
+    "seen": (-0.001, 1.001, ""),
+    "errors": (-FARTHEST_M, FARTHEST_M, "m"),
+}
+KNOWN = {
+    *RANGES,
+    "format",
+    "units",
+    "name",
+    "learned_from",
+    "places",
+    "replaced",
+    "figures",
+    "checksum",
+    "names",
+    *RANGES_BETWEEN,
+}
+UNITS = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
+UNITS_BETWEEN = (
+    "inputs: shares of the left hand's places, of the right hand's; outputs: the tool's shares of all named places but "
+    "the first, deviation x y z [m]; frame base"
+)
 MARGIN_M = 0.25  # by which a skill may leave its box where it was learned: targets are held in it
 STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'
 
@@ -62,8 +90,8 @@ def with_file(skill: Skill) -> Skill:
     """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
-        format=np.array(JUDGED if skill.figures else PLAIN),
-        units=np.array("inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"),
+        format=np.array(BETWEEN if skill.between else JUDGED if skill.figures else PLAIN),
+        units=np.array(UNITS_BETWEEN if skill.between else UNITS),
         name=np.array(skill.name),
         orientation=skill.orientation,
         box=skill.workspace,
@@ -76,6 +104,17 @@ def with_file(skill: Skill) -> Skill:
     )
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
+    if skill.between:
+        task, nominal, seen, errors = skill.between
+        arrays |= {
+            "names": np.array(msgspec.json.encode(task.names).decode()),
+            "corners": task.corners,
+            "shares": task.inputs,
+            "follow": task.follow,
+            "nominal": nominal.at,
+            "seen": seen,
+            "errors": errors,
+        }
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue())
 
@@ -96,7 +135,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             arrays = dict(archive)
         if (kind := arrays["format"].item()) not in FORMATS:
             raise SkillError(
-                f"{origin}: skill of format {kind}, {PLAIN} or {JUDGED} needed: written by a later version?"
+                f"{origin}: skill of format {kind}, {PLAIN} to {BETWEEN} needed: written by a later version?"
             )
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
@@ -110,7 +149,8 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             components=int(arrays["components"]),
             via_points=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
             tolerance=float(arrays["tolerance"]),
-            figures=str(arrays["figures"]) if kind == JUDGED else "",
+            between=_between(arrays) if kind == BETWEEN else None,
+            figures=str(arrays["figures"]) if kind != PLAIN else "",
             file=bytes(data),
         )
         for fault in _faults(skill):
@@ -130,7 +170,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     """What in the arrays is not what was written, or not what any skill has."""
     for name in sorted(set(arrays) - KNOWN):  # what kmp can hold besides, and the loop was never tried with
         yield f"an array {name!r}, which no skill has"
-    for name, (low, high, unit) in RANGES.items():
+    is_between = arrays["format"].item() == BETWEEN
+    for name, (low, high, unit) in (RANGES | RANGES_BETWEEN if is_between else RANGES).items():
         array = arrays[name]
         if array.dtype.kind not in "iuf":
             yield f"{name} has numbers of type {array.dtype}, real ones needed"
@@ -159,11 +200,43 @@ def _is_json(array: NDArray[Any]) -> bool:
     return array.dtype.kind == "U" and len(str(array)) <= LONGEST_FIGURES
 
 
+def _between(arrays: Mapping[str, NDArray[Any]]) -> LearnedBetween:
+    """What belongs to a skill between places. Raises ValueError where its arrays do not fit."""
+    names = msgspec.json.decode(str(arrays["names"]), type=tuple[Name, ...])
+    count, width = len(names), int(arrays["shares"].max()) + 1
+    shapes = {
+        "corners": (count, 2),
+        "shares": (2, MOST_CORNERS),
+        "follow": (count,),
+        "nominal": (count, 9),
+        "seen": (len(arrays["errors"]), width),
+        "errors": (len(arrays["seen"]), 3),
+    }
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or not shape[0]:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, {shape} needed")
+    if not 2 <= count <= MOST_PLACES or len(set(names)) < count:
+        raise ValueError(f"places {', '.join(names)}: 2 to {MOST_PLACES} different names needed")
+    corners, shares = (np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "shares"))
+    for side in (0, 1):
+        has = int((shares[side] >= 0).sum())
+        if not has or (shares[side, :has] < 0).any() or not (np.unique(corners[:, side]) == np.arange(has)).all():
+            raise ValueError(f"the hands' places {corners.tolist()} and inputs {shares.tolist()} do not fit each other")
+    if not (np.unique(shares[shares >= 0]) == np.arange(width)).all():
+        raise ValueError(f"the inputs {shares.tolist()} are not numbered through")
+    task = Task(names, corners, shares, np.ascontiguousarray(arrays["follow"], np.int64))
+    return LearnedBetween(task, Places(names, arrays["nominal"]), arrays["seen"], arrays["errors"])
+
+
 def _faults(skill: Skill) -> Iterator[str]:
     """What in the file would harm the motion."""
     inputs, outputs = skill.primitive.inputs.shape[1], skill.primitive.outputs
-    if (inputs, outputs) != (INPUTS, OUTPUTS):
-        yield f"{inputs} inputs and {outputs} outputs, {INPUTS} and {OUTPUTS} needed"
+    needed = (INPUTS, OUTPUTS)
+    if skill.between:
+        needed = (skill.between.task.width, len(skill.between.task.names) + OUTPUTS - 1)
+    if (inputs, outputs) != needed:
+        yield f"{inputs} inputs and {outputs} outputs, {needed[0]} and {needed[1]} needed"
+        return
     corners = skill.workspace
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         yield f"box is {corners.tolist()}, lower and upper corner needed"
@@ -174,10 +247,11 @@ def _faults(skill: Skill) -> Iterator[str]:
 
 def _tried(skill: Skill) -> Iterator[str]:
     """What the skill does wrong where it was learned and taught: its weights are not its own."""
-    for primitive in dict.fromkeys((skill.primitive.base, skill.primitive)):
-        with np.errstate(all="ignore"):
-            found, where = primitive.mean(primitive.inputs), primitive.inputs
-        low, high = skill.workspace
+    both = dict.fromkeys((replace(skill, primitive=skill.primitive.base), skill)) if not skill.between else [skill]
+    with np.errstate(all="ignore"):
+        tried = [(one.hands, one.mean(one.hands)) for one in both]
+    low, high = skill.workspace
+    for where, found in tried:
         beyond = np.maximum(np.maximum(low - found, found - high), 0.0).max(axis=1)
         if not (np.isfinite(found).all() and beyond.max() <= MARGIN_M):
             worst = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))

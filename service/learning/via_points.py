@@ -16,12 +16,12 @@ from kmp import Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
 from service.core.skill import Skill
+from service.core.taught import NEIGHBOURS, neighbourhoods
 from service.learning.skill_file import SkillError, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
-NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 
 
 def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
@@ -31,12 +31,17 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
     tool would have to move more than `STEEPEST` times as far as the hands contradict each other:
     hands at rest tremble, and the tool would shake so many times as much.
     """
+    if not tolerance >= 0:
+        names = [point.name for point in via_points]
+        raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     inputs, outputs, deviations = neighbourhoods(via_points)
     _check_agreement(via_points, inputs, outputs, deviations)
+    if skill.between is not None:
+        return with_file(replace(skill, via_points=tuple(via_points), tolerance=tolerance))
     try:
-        desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
+            desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
             primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
@@ -73,7 +78,7 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
     return tuple(
         ViaPointInForce(
             **msgspec.structs.asdict(point),
-            missed_by_m=math.dist(point.tool, skill.primitive.mean([[*point.left, *point.right]])[0]),
+            missed_by_m=math.dist(point.tool, skill.mean(np.array([[*point.left, *point.right]]))[0]),
         )
         for point in skill.via_points
     )
@@ -90,8 +95,8 @@ def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
         if point.missed_by_m > NOTED_M
     ]
     for point in set(before.via_points) & set(after.via_points):
-        hands = [[*point.left, *point.right]]
-        moved_m = math.dist(before.primitive.mean(hands)[0], after.primitive.mean(hands)[0])
+        hands = np.array([[*point.left, *point.right]])
+        moved_m = math.dist(before.mean(hands)[0], after.mean(hands)[0])
         if moved_m > NOTED_M:
             out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
     return tuple(sorted(out))
@@ -100,20 +105,3 @@ def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:
     """How many points `neighbourhoods` makes of via-points."""
     return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)
-
-
-def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vector]:
-    """Inputs (V, 6), outputs (V, 3) and standard deviations (V,) of via-points: each alone, or with
-    its neighbours.
-    """
-    inputs: list[Vector] = []
-    outputs: list[Vector] = []
-    deviations: list[float] = []
-    follow = {"none": np.zeros((3, 6)), "left": np.eye(3, 6), "right": np.eye(3, 6, 3)}
-    here, around = np.zeros((1, 6)), np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
-    for point in via_points:
-        steps = point.radius * around if point.radius else here
-        inputs.extend(np.array([*point.left, *point.right]) + steps)
-        outputs.extend(np.array(point.tool) + steps @ follow[point.follow].T)
-        deviations.extend([point.std] * len(steps))
-    return np.array(inputs).reshape(-1, 6), np.array(outputs).reshape(-1, 3), np.array(deviations)

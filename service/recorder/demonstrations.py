@@ -13,13 +13,15 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from service.contract import cdr
-from service.contract.channels import POSE, key
+from service.contract.channels import POSE, STRING, key
 from service.contract.messages import BASE, PoseStamped, WireError, finite
+from service.contract.requests import RequestError, ViaPoint, decode_request, encode_json
 from service.learning.demonstration import Demonstration
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.recorder.mcap_reader import Messages, next_whole
 
 _STREAMS = ("hands/left", "hands/right", "tool/pose")
+_PLACES = "places"
 
 
 def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
@@ -42,6 +44,9 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             for name, row in zip(_STREAMS, rows, strict=True):
                 data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
                 file.put(key(cell, name), POSE.type, data, stamp, i)
+        if demonstration.places:
+            text = encode_json(demonstration.places).decode()
+            file.put(key(cell, _PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
     finally:
         file.close()
 
@@ -58,9 +63,12 @@ def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda 
     streams = PoseStreams(path, _STREAMS)
     rows: dict[str, list[PoseStamped]] = {name: [] for name in _STREAMS}
     messages = Messages(path)
+    places: tuple[ViaPoint, ...] = ()
     for schema, channel, message in messages:
         name = streams.name(schema, channel)
-        if name:
+        if f"/{channel.topic}".endswith(f"/{_PLACES}") and schema is not None and schema.name == STRING.type:
+            places = _places(path, message.data)
+        elif name:
             try:
                 pose = cdr.decode_pose(message.data)
             except WireError as error:
@@ -97,7 +105,15 @@ def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda 
         )
     left, right, tool = (_resampled(stamps, *track) for track in tracks)
     stamps.setflags(write=False)
-    return Demonstration(stamps, left, right, tool, next(iter(frames.values())))
+    return Demonstration(stamps, left, right, tool, next(iter(frames.values())), places)
+
+
+def _places(path: Path, data: bytes) -> tuple[ViaPoint, ...]:
+    try:
+        found: tuple[ViaPoint, ...] = decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])
+    except (WireError, RequestError) as error:
+        raise RecordingError(f"{path}: {_PLACES}: {error}") from None
+    return found
 
 
 def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:

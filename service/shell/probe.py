@@ -95,7 +95,7 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
 
 def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
     """Both hands [m] at a time [s], about the middle of what the skill has learned."""
-    middle = skill.primitive.inputs.mean(axis=0).tolist()
+    middle = skill.hands.mean(axis=0).tolist()
     x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 

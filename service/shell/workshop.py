@@ -116,8 +116,8 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
         skill = decoded(source, origin="the skill in force")
     if via_points is not None:
         skill = adapted(skill, via_points, tolerance=tolerance)
-    place = skill.primitive.inputs[0]
-    skill.primitive.predict_motion(place, 0 * place, 0 * place)  # what is computed once is computed here
+    place = skill.hands[0].reshape(2, 3)
+    skill.predict(place, 0 * place, 0 * place)  # what is computed once is computed here
     skill.digest  # noqa: B018
     return skill
 

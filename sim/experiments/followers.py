@@ -95,7 +95,7 @@ class _Chain:
 
     def targets(self, samples: Array) -> Array:
         """What the skill makes of samples (M, 6): (M, 3) [m], inside its workspace."""
-        return np.clip(self.skill.primitive.mean(samples), *self.skill.workspace)
+        return np.clip(self.skill.mean(samples), *self.skill.workspace)
 
     def start(self, position: Vector) -> tuple[Vector, Vector, Vector]:
         """The joints at rest with the tool at a position."""

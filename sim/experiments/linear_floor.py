@@ -40,8 +40,8 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     energy = wanted_jerk = wanted_push = 0.0
     count = 0
     for one in sequences:
-        truth = skill.primitive.mean(one.truth)
-        samples = skill.primitive.mean(one.samples)
+        truth = skill.mean(one.truth)
+        samples = skill.mean(one.samples)
         outputs = np.arange(size, up * len(samples))
         times = one.stamps[0] + outputs * step
         outputs, times = outputs[times < len(truth) * PERIOD_S - step], times[times < len(truth) * PERIOD_S - step]

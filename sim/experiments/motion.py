@@ -66,7 +66,7 @@ class Figures:
 
 def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
     """A skill learned from modelled people whose tool goes along with both hands."""
-    centre = shipped.primitive.mean(middle[None])[0]
+    centre = shipped.mean(middle[None])[0]
     demonstrations = []
     for seed in TEACHERS:
         hands = person(seed, middle, TAUGHT_S)[::TAUGHT_EVERY]
@@ -116,7 +116,7 @@ _known: dict[str, Any] = {}
 def prepare(share: float) -> None:
     """Loads the skills and what follows by them, once in a process."""
     skill = shipped()
-    other = skill_of_such_hands(skill, skill.primitive.inputs.mean(axis=0))
+    other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
     _known.update({which: (one, followers(one, share)) for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other))})
 
 
@@ -124,7 +124,7 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, which, hands = task
     skill, by_name = _known[which]
-    target = np.clip(skill.primitive.mean(hands.truth), *skill.workspace)
+    target = np.clip(skill.mean(hands.truth), *skill.workspace)
     return figures(name, replace(hands, group=hands.group + which), target, by_name[name](hands))
 
 
@@ -179,7 +179,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """Follows all hands with all followers; returns the numbers for its JSON."""
     prepare(options.share)
     skill, by_name = _known[SHIPPED]
-    hands = sequences(options, skill.primitive.inputs.mean(axis=0))
+    hands = sequences(options, skill.hands.mean(axis=0))
     tasks = [(name, SHIPPED, one) for name in by_name for one in hands]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
     tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]

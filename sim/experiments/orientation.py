@@ -20,8 +20,9 @@ from kmp.orientation import continuous, exp, log, multiplied
 from service.cli.usage import shipped
 from service.contract.requests import TOLERANCE_M
 from service.core.frame import Event, Frame
+from service.core.taught import neighbourhoods
 from service.learning.learn import mean_orientation
-from service.learning.via_points import adapted, neighbourhoods
+from service.learning.via_points import adapted
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw

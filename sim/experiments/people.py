@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim.experiments.between_places import BetweenPlaces
 from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
 from sim.experiments.recorded_people import recorded_people
 from sim.experiments.results import SERIES, Array, Options, Results, pyplot
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service
+from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
 from sim.experiments.trials import (
     FAST_MPS,
     FOR_S,
@@ -58,14 +57,8 @@ class Entry(NamedTuple):
 
 
 METHODS = {
-    "ours": Entry("ours, as the service\nlearns and adapts", (Service(), Service(None, None, components=None))),
-    "between_places": Entry(
-        "KMP between the places,\nnot yet the service's",
-        tuple(
-            BetweenPlaces(sharpness, rest)
-            for sharpness, rest in ((4.0, 0.12), (5.0, 0.12), (4.0, 0.2), (5.0, 0.15), (6.0, 0.12), (3.0, 0.12))
-        ),
-    ),
+    "ours": Entry("ours, between places", (Service(),)),
+    "as_paper": Entry("ours, the paper's way:\nplaces are via-points", (ServiceAsPaper(),)),
     "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0))),
     "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0))),
     "gaussian_process": Entry(
@@ -78,7 +71,7 @@ METHODS = {
     "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
     "paper": Entry(
         "KMP, the paper's numbers,\nour neighbourhoods",
-        tuple(Service(0.5, 2.0, spread) for spread in (0.01, 0.0001, 0.001, 0.003, 0.005, 0.02)),
+        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.01, 0.0001, 0.001, 0.003, 0.005, 0.02)),
     ),
     "promp": Entry(
         "Interaction ProMP",

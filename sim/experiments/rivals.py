@@ -21,8 +21,9 @@ from scipy.spatial.distance import cdist
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
 from service.core.skill import Prediction, Skill
+from service.core.taught import neighbourhoods
 from service.learning.demonstration import Demonstration
-from service.learning.via_points import adapted, neighbourhoods
+from service.learning.via_points import adapted
 from sim.bench import Bench
 from sim.experiments.results import Array, ExperimentError
 from sim.experiments.trials import Model

@@ -6,13 +6,11 @@ placed predicts. See `trials.Method`. To add one, add a class here or beside, an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import msgspec
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
@@ -20,67 +18,48 @@ from scipy.spatial.distance import cdist
 
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.skill import Skill
-from service.learning.demonstration import Demonstration
+from service.core.taught import neighbourhoods
 from service.learning.learn import learn
-from service.learning.via_points import adapted, neighbourhoods
+from service.learning.via_points import adapted
 from sim.experiments.results import Array
 from sim.experiments.trials import Predicted
 from sim.people import Places
-from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION
 from sim.sessions import Shown
+from sim.teach import places_of, recorded
 
-RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each taught place, as the bench teaches them
 COVARIANCE_EVERY = 4  # ticks: as often as a slow tracker speaks
 FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])  # how the tool goes with the hands at the handover
 
 
 def via_points(places: Places, *, start: bool = False) -> tuple[ViaPoint, ...]:
-    """The three places as the bench teaches them, with how sure they are; and the start, if asked.
-
-    A place's `std` is of each axis, its error 3-D rms.
-    """
-    std = max(places.std_m / math.sqrt(3.0), LEAST_STD_M)
-
-    def point(name: str, left: Array, right: Array, tool: Array, follow: str = "none") -> ViaPoint:
-        given = [np.round(p, 6).tolist() for p in (left, right, tool)]
-        fields = {"name": name, "left": given[0], "right": given[1], "tool": given[2], "follow": follow}
-        return msgspec.convert({**fields, "std": std, "radius": RADIUS_M}, ViaPoint)
-
-    p = places
-    taught = (
-        point("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND, "left"),
-        point("glass", p.board, p.iron, p.glass),
-        point("soldering", p.board, p.right_final, p.carry),
-    )
-    return (*taught, point("start", p.left_start, p.right_start, p.robot_start)) if start else taught
+    """The places as the bench teaches them; the start too, if asked."""
+    return places_of(places)[0 if start else 1 :]
 
 
 @dataclass(frozen=True)
 class Service:
-    """Ours: `service.learning` with its parameters, adapted to the places as the service does."""
-
-    ell: float | None = 5.0
-    penalty: float | None = 2.0
-    spread_m: float = 0.01
-    components: int | None = 10
+    """Ours: `service.learning`, told the places, as the service uses it."""
 
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
-        """The skill that the service learns; without ell, penalty and components it chooses."""
+        """The skill that the service learns by default."""
+        return LearnedByService(learn([recorded(one) for one in demonstrations]))
+
+
+@dataclass(frozen=True)
+class ServiceAsPaper:
+    """The paper's way in the service: a mixture makes the reference, places are its via-points."""
+
+    ell: float = 5.0
+    penalty: float = 2.0
+    spread_m: float = 0.01
+    components: int = 10
+
+    def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
+        """The skill with these parameters."""
         taken = [recorded(one) for one in demonstrations]
-        skill = learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
-        return LearnedByService(skill)
-
-
-def recorded(shown: Shown) -> Demonstration:
-    """A demonstration as the service reads it from a recording."""
-    count = len(shown.times)
-    still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
-    return Demonstration(
-        np.round(1e9 * (shown.times + 1.0)).astype(np.int64),
-        np.hstack([shown.hands[:, :3], still]),
-        np.hstack([shown.hands[:, 3:], still]),
-        np.hstack([shown.tool, turned]),
-    )
+        return LearnedByService(
+            learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +70,8 @@ class LearnedByService:
 
     def place(self, places: Places) -> PlacedSkill:
         """The skill adapted to the places."""
-        return PlacedSkill(adapted(self.skill, via_points(places), tolerance=TOLERANCE_M))
+        points = via_points(places, start=self.skill.between is not None)
+        return PlacedSkill(adapted(self.skill, points, tolerance=TOLERANCE_M))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +83,14 @@ class PlacedSkill:
 
     def mean(self, hands: Array, velocities: Array) -> Array:
         """As `trials.Placed`."""
-        return self.skill.primitive.mean(hands)
+        return self.skill.mean(hands, velocities)
 
     def predict(self, hands: Array, velocities: Array) -> Predicted:
         """As `trials.Placed`; far is what the service's gate says."""
-        some = self.skill.primitive.predict(hands[::COVARIANCE_EVERY]).covariance
+        some = self.skill.covariances(hands[::COVARIANCE_EVERY], velocities[::COVARIANCE_EVERY])
         covariance = np.repeat(some, COVARIANCE_EVERY, axis=0)[: len(hands)] + 1e-12 * np.eye(3)
-        deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3.0)
-        return Predicted(self.mean(hands, velocities), covariance, deviation > self.skill.threshold)
+        far = self.skill.deviations(hands) > self.skill.threshold
+        return Predicted(self.mean(hands, velocities), covariance, far)
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def test_the_tool_follows_the_demonstrated_relation_and_passes_on_little_tremor(
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
     time_s = np.arange(len(seen)) * PERIOD_S - 1.5
     hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
-    ideal = taught.primitive.mean(hands)
+    ideal = taught.mean(hands)
     inner = slice(750, -100)
     error = np.linalg.norm(seen["tool"][inner] - ideal[inner], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.014

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import pytest
 from taught_scene import PLACES, demonstrated, quickly
+from tests_paths import RECORDINGS
 
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
+from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
+
+
+@pytest.fixture(scope="session")
+def skill() -> Skill:
+    """A skill learned the paper's way, in the first format."""
+    path = RECORDINGS / "as-paper.npz"
+    return decoded(path.read_bytes(), origin=str(path))
 
 
 @pytest.fixture(scope="session")

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.experiments.between_places import BetweenPlaces, barycentric
 from sim.experiments.mixtures import frames
 from sim.experiments.people import METHODS, Task, chosen, outcomes, run
 from sim.experiments.recorded_people import recorded_people
 from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations
+from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service
 from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen, workspace
 from sim.people import Group, Person, person
 from sim.scene import TOOL_FROM_HAND
@@ -165,9 +164,9 @@ class TestJudging:
         assert judge(Onto(np.zeros(3), far=False), as_seen, workspace(demonstrations(1))).too_near
 
 
-@pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), BetweenPlaces()])
+@pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), Service()])
 def test_skills_go_to_the_places_they_are_told(
-    method: NoDemonstrations | LookUp | GaussianProcess | BetweenPlaces, run_of_tuning: Session
+    method: NoDemonstrations | LookUp | GaussianProcess | Service, run_of_tuning: Session
 ) -> None:
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
@@ -177,36 +176,6 @@ def test_skills_go_to_the_places_they_are_told(
     hands[:, 0] += 0.01  # only at the handover the tool goes with the left hand
     moved = placed.mean(hands, 0 * hands) - frames(places)[1:, 6:]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.0, 0.0], atol=0.003)
-
-
-def test_between_places_hands_that_rest_nearby_are_there_and_those_that_move_are_on_their_way(
-    run_of_tuning: Session,
-) -> None:
-    places = run_of_tuning.places
-    placed = BetweenPlaces().learn(demonstrations(3)).place(places)
-    at, goal = frames(places)[2, :6], places.glass
-    hands = at + 0.03 * np.array([[0.0] * 6, [-1.0, -1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    rest, moving = np.zeros((3, 6)), np.full((3, 6), 0.3)
-    assert np.linalg.norm(placed.mean(hands, rest) - goal, axis=1).max() < 0.01
-    assert np.linalg.norm(placed.mean(hands, moving)[1] - goal) > 0.02
-    said = placed.predict(np.vstack([hands, hands + 0.3]), np.zeros((6, 6)))
-    assert said.far.tolist() == [False] * 3 + [True] * 3
-    assert np.linalg.eigvalsh(said.covariance).min() > 0
-    elsewhere = goal + np.array([0.0, 0.1, 0.05])
-    moved = placed.learned.place(places._replace(glass=elsewhere))
-    np.testing.assert_allclose(moved.mean(at[None], rest[:1])[0], elsewhere, atol=0.008)
-
-
-def test_barycentric_coordinates_are_those_of_the_nearest_point_of_the_triangle() -> None:
-    random = np.random.default_rng(0)
-    share = random.dirichlet(np.ones(3), 20_000)
-    for _ in range(5):
-        corners, points = random.standard_normal((3, 3)), 2.0 * random.standard_normal((20, 3))
-        found = barycentric(points, corners)
-        assert found.min() >= 0.0
-        np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-9)
-        least = np.linalg.norm(points[:, None] - share @ corners, axis=2).min(axis=1)
-        assert (np.linalg.norm(points - found @ corners, axis=1) < least + 1e-4).all()
 
 
 def test_the_process_tells_the_demonstrations_apart() -> None:
@@ -224,7 +193,9 @@ def test_of_candidates_as_good_the_one_nearest_to_the_teacher_is_chosen(as_seen:
 
 
 def test_each_method_had_as_many_candidates() -> None:
-    assert {len(entry.candidates) for name, entry in METHODS.items() if name != "ours"} == {6}
+    assert {len(entry.candidates) for name, entry in METHODS.items() if not name.startswith(("ours", "as_paper"))} == {
+        6
+    }
 
 
 def test_recorded_hands_make_people_for_tuning(tmp_path: Path) -> None:

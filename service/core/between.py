@@ -1,0 +1,374 @@
+"""How far hands have come between the places of a task: the inputs of a skill that holds wherever
+the places are, and the way back from what it says to a tool.
+
+A hand becomes its shares of the places it goes between (barycentric coordinates of the point of
+their triangle that is nearest to it); so does the tool, with a deviation from them. A hand that
+rests belongs to the place it rests nearest to; one that moves is on its way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp import KMP
+from kmp.compiled import compiled
+from service.contract.requests import ViaPoint
+from service.core.frame import Vector
+from service.core.taught import NEAR as NEAR_TAUGHT
+
+MOST_CORNERS = 3  # places that a hand may go between
+SHARPNESS = 4.0  # power of a resting hand's shares
+REST_MPS = 0.12  # a hand this fast is on its way
+ALMOST = 1e-4  # share that every place has, so that none is of an undefined power
+FOLLOWED_M = 0.25  # within which of a place the tool goes with the hand
+FLAT = 1e-6  # [m²] what a triangle's edges are taken to be longer by, as it may be none
+NEAR = 0.25  # width, in shares, of what is near to a moment when scatter is looked up
+LEAST_STD_M = 0.003
+STEP_S = 0.02  # of differences along the hands' motion
+CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
+LARGEST_MPS2 = 3.0  # of a target's acceleration
+NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a place
+
+Indices = NDArray[np.int64]
+
+
+class Task(NamedTuple):
+    """How the places of a task belong together, wherever they are. N named places.
+
+    corners: (N, 2) which of its own places the left and the right hand is at. inputs: (2, 3) which
+    input of the skill the share of a hand's place adds to; -1 where it has no such place. follow:
+    (N,) the hand that the tool goes with there, NONE, LEFT or RIGHT.
+    """
+
+    names: tuple[str, ...]
+    corners: Indices
+    inputs: Indices
+    follow: Indices
+
+    @property
+    def width(self) -> int:
+        """The number of inputs."""
+        return int(self.inputs.max()) + 1
+
+    def layout(self, places: Places) -> Layout:
+        """Where this task's places are, those of a hand that are one at their mean."""
+        at = places.at[[places.names.index(name) for name in self.names]]
+        hands = np.zeros((2, MOST_CORNERS, 3))
+        for side in (0, 1):
+            for corner in range(int(self.corners[:, side].max()) + 1):
+                here = self.corners[:, side] == corner
+                hands[side, corner] = at[here, 3 * side : 3 * side + 3].mean(axis=0)
+        return Layout(hands, at[:, 6:].copy(), places.std)
+
+
+class Layout(NamedTuple):
+    """Where the places are [m]: those of both hands (2, 3, 3), the tool's (N, 3); and how sure that
+    is, of each axis [m].
+    """
+
+    hands: Vector
+    tool: Vector
+    std: float
+
+
+class Places(NamedTuple):
+    """Named places: hands and tool (N, 9) [m] at each, and how sure that is, of each axis [m]."""
+
+    names: tuple[str, ...]
+    at: Vector
+    std: float = 0.0
+
+    @staticmethod
+    def of(points: Sequence[ViaPoint]) -> Places:
+        """Those of via-points."""
+        at = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
+        return Places(tuple(point.name for point in points), at, max((point.std for point in points), default=0.0))
+
+    def told(self, points: Sequence[ViaPoint]) -> Places:
+        """These places, those at the via-points that have the name of one."""
+        other = Places.of([point for point in points if point.name in self.names])
+        at = self.at.copy()
+        at[[self.names.index(name) for name in other.names]] = other.at
+        return Places(self.names, at, other.std)
+
+
+class Moving(NamedTuple):
+    """What comes of one moment: tool (3,) [m], its velocity and acceleration, covariance (3, 3)
+    [m²], and how far hands are off their places [m], the farther one.
+    """
+
+    mean: Vector
+    velocity: Vector
+    acceleration: Vector
+    covariance: Vector | None
+    off: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A skill among places, as its compiled loops take it. R centres, F inputs, N places, M errors.
+
+    weights: (R, N + 2), of the tool's shares of all places but the first, then of its deviation.
+    seen, errors: (M, F), (M, 3) inputs at which the tool was off by so much [m]. taught, pulls:
+    (X, 6), (X, 3) [m] hands around which the tool is moved besides, see `taught.bent`.
+    """
+
+    task: Task
+    layout: Layout
+    scale: float  # of a kernel exp(-scale |difference|²)
+    centres: Vector
+    weights: Vector
+    prior: Vector
+    seen: Vector
+    errors: Vector
+    taught: Vector
+    pulls: Vector
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        layout: Layout,
+        primitive: KMP | None = None,
+        seen: Vector | None = None,
+        errors: Vector | None = None,
+    ) -> Placed:
+        """A KMP of shares among places, and its errors; without those it knows inputs alone."""
+        if primitive is None:
+            scale, centres, weights, prior = (
+                1.0,
+                np.empty((0, task.width)),
+                np.empty((0, len(task.names) + 2)),
+                np.zeros(len(task.names) + 2),
+            )
+        else:
+            scale = float(primitive.kernel.coordinates(1)[0])
+            centres = np.ascontiguousarray(primitive.centres)
+            weights = np.ascontiguousarray(primitive.weights.reshape(-1, primitive.outputs))
+            prior = primitive.prior_mean
+        return cls(
+            task,
+            layout,
+            scale,
+            centres,
+            weights,
+            prior,
+            np.empty((0, task.width)) if seen is None else seen,
+            np.empty((0, 3)) if errors is None else errors,
+            np.empty((0, 6)),
+            np.empty((0, 3)),
+        )
+
+    def through(self, taught: Vector, pulls: Vector) -> Placed:
+        """The same, that is moved around some hands."""
+        return replace(self, taught=np.ascontiguousarray(taught), pulls=np.ascontiguousarray(pulls))
+
+    def at_rest(self, hands: Vector) -> Vector:
+        """`mean` of hands (T, 6) that rest."""
+        return self.mean(hands, np.zeros_like(hands))
+
+    def inputs(self, hands: Vector, velocities: Vector) -> tuple[Vector, Vector]:
+        """Inputs (T, F) of hands and velocities (T, 6), and how far each hand (T, 2) is off its
+        places [m].
+        """
+        out, off = np.empty((len(hands), self.task.width)), np.empty((len(hands), 2))
+        for hand, velocity, row, away in zip(hands, velocities, out, off, strict=True):
+            _inputs(hand, velocity, self.layout.hands, self.task.inputs, row, away)
+        return out, off
+
+    def mean(self, hands: Vector, velocities: Vector) -> Vector:
+        """The tool (T, 3) [m] for hands and velocities (T, 6)."""
+        out = np.empty((len(hands), 3))
+        for hand, velocity, row in zip(hands, velocities, out, strict=True):
+            self._tool(hand, velocity, row, np.empty(2))
+        return out
+
+    def corners_of_hands(self) -> Vector:
+        """Hands (P, 6) [m] at every pair of their places."""
+        counts = (self.task.inputs >= 0).sum(axis=1)
+        left, right = self.layout.hands[0, : counts[0]], self.layout.hands[1, : counts[1]]
+        return np.array([[*one, *other] for one in left for other in right])
+
+    def covariance(self, inputs: Vector) -> Vector:
+        """(3, 3) [m²] at inputs (F,): the scatter of errors near there, and that of the places."""
+        out = np.empty((3, 3))
+        _scatter(inputs, self.seen, self.errors, self.layout.std, out)
+        return out
+
+    def moving(self, hands: Vector, velocities: Vector, accelerations: Vector, *, covariance: bool) -> Moving:
+        """The tool for hands (6,) that move so, by differences along their motion. One that only
+        trembles moves nothing.
+        """
+        speeds = np.sqrt((velocities.reshape(2, 3) ** 2).sum(axis=1))
+        goes = np.repeat(1.0 - np.exp(-((speeds / CALM_MPS) ** 4)), 3)
+        step, bend = STEP_S * goes * velocities, 0.5 * STEP_S**2 * goes * accelerations
+        tools, off = np.empty((3, 3)), np.empty(2)
+        self._tool(hands - step + bend, velocities - STEP_S * accelerations, tools[0], off)
+        self._tool(hands + step + bend, velocities + STEP_S * accelerations, tools[2], off)
+        self._tool(hands, velocities, tools[1], off)
+        pushed = (tools[2] - 2.0 * tools[1] + tools[0]) / STEP_S**2
+        return Moving(
+            tools[1],
+            (tools[2] - tools[0]) / (2.0 * STEP_S),
+            np.clip(pushed, -LARGEST_MPS2, LARGEST_MPS2),
+            self.covariance(self.inputs(hands[None], velocities[None])[0][0]) if covariance else None,
+            float(off.max()),
+        )
+
+    def _tool(self, hand: Vector, velocity: Vector, out: Vector, off: Vector) -> None:
+        task, layout = self.task, self.layout
+        _tool(
+            hand,
+            velocity,
+            layout.hands,
+            layout.tool,
+            task.inputs,
+            task.corners,
+            task.follow,
+            self.scale,
+            self.centres,
+            self.weights,
+            self.prior,
+            self.taught,
+            self.pulls,
+            out,
+            off,
+        )
+
+
+def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vector:
+    """By how much the tool goes with the hands (T, 6), (T, 3) [m], where it has these shares (T, N)
+    of its places.
+    """
+    out = np.zeros((len(hands), 3))
+    for hand, share, row in zip(hands, shares, out, strict=True):
+        _add_followed(hand, share, layout.hands, task.corners, task.follow, row)
+    return out
+
+
+@compiled
+def _nearest(point: Vector, corners: Vector, count: int, out: Vector) -> float:
+    """Barycentric coordinates (3,), at least 0 and 1 in sum, of the point between `count` corners
+    that is nearest to a point; its distance.
+    """
+    out[:] = 0.0
+    if count == 3:
+        ab, ac, ap = corners[1] - corners[0], corners[2] - corners[0], point - corners[0]
+        aa, bb, both = (ab * ab).sum() + FLAT, (ac * ac).sum() + FLAT, (ab * ac).sum()
+        one, other = (ab * ap).sum(), (ac * ap).sum()
+        determinant = aa * bb - both * both
+        second, third = (bb * one - both * other) / determinant, (aa * other - both * one) / determinant
+        if second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+            out[0], out[1], out[2] = 1.0 - second - third, second, third
+            return math.sqrt(((point - out[0] * corners[0] - second * corners[1] - third * corners[2]) ** 2).sum())
+    least = math.inf
+    for i in range(count):
+        for j in range(i + 1 if i + 1 < count else i, count):
+            way, off = corners[j] - corners[i], point - corners[i]
+            along = min(max((off * way).sum() / ((way * way).sum() + FLAT), 0.0), 1.0)
+            square = ((off - along * way) ** 2).sum()
+            if square < least and (count == 1 or i != j):
+                least = square
+                out[:] = 0.0
+                out[i] = 1.0 - along
+                out[j] += along
+    return math.sqrt(least)
+
+
+@compiled
+def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices, out: Vector, off: Vector) -> None:
+    """The shares of both hands (6,) into `out` (F,), how far each is off into `off` (2,)."""
+    out[:] = 0.0
+    share = np.empty(3)
+    for side in range(2):
+        count = 0
+        while count < 3 and inputs[side, count] >= 0:
+            count += 1
+        first = 3 * side
+        off[side] = _nearest(hands[first : first + 3], corners[side], count, share)
+        speed = math.sqrt((velocities[first : first + 3] ** 2).sum())
+        power = 1.0 + (SHARPNESS - 1.0) * math.exp(-((speed / REST_MPS) ** 4))
+        total = 0.0
+        for i in range(count):
+            share[i] = (share[i] + ALMOST) ** power
+            total += share[i]
+        for i in range(count):
+            out[inputs[side, i]] += share[i] / total
+
+
+@compiled
+def _add_followed(hands: Vector, shares: Vector, corners: Vector, at: Indices, follow: Indices, out: Vector) -> None:
+    """Adds to `out` (3,) by how much the tool goes with the hands, for its shares (N,)."""
+    for place in range(len(follow)):
+        side = follow[place]
+        if side >= 0:
+            off = hands[3 * side : 3 * side + 3] - corners[side, at[place, side]]
+            near = math.exp(-(((off * off).sum() / FOLLOWED_M**2) ** 2))
+            out += min(max(shares[place], 0.0), 1.0) * near * off
+
+
+@compiled
+def _tool(
+    hands: Vector,
+    velocities: Vector,
+    corners: Vector,
+    places: Vector,
+    inputs: Indices,
+    at: Indices,
+    follow: Indices,
+    scale: float,
+    centres: Vector,
+    weights: Vector,
+    prior: Vector,
+    taught: Vector,
+    pulls: Vector,
+    out: Vector,
+    off: Vector,
+) -> None:
+    """The tool into `out` (3,): equation (8) of Huang et al. 2019 of the shares, and back."""
+    width, count = centres.shape[1], len(places)
+    query, shares, found = np.empty(width), np.empty(count), prior.copy()
+    _inputs(hands, velocities, corners, inputs, query, off)
+    for r in range(len(centres)):
+        square = 0.0
+        for i in range(width):
+            square += (query[i] - centres[r, i]) ** 2
+        found += math.exp(-scale * square) * weights[r]
+    shares[0] = 1.0
+    for place in range(1, count):
+        shares[place] = found[place - 1]
+        shares[0] -= found[place - 1]
+    for i in range(3):
+        out[i] = found[count - 1 + i]
+        for place in range(count):
+            out[i] += shares[place] * places[place, i]
+    _add_followed(hands, shares, corners, at, follow, out)
+    for x in range(len(taught)):
+        out += math.exp(-NEAR_TAUGHT * ((hands - taught[x]) ** 2).sum()) * pulls[x]
+
+
+@compiled
+def _scatter(query: Vector, seen: Vector, errors: Vector, std: float, out: Vector) -> None:
+    """The mean square (3, 3) of errors (M, 3) at inputs (M, F), weighted by how near those are."""
+    squares, least = np.empty(len(seen)), math.inf
+    for m in range(len(seen)):
+        squares[m] = ((query - seen[m]) ** 2).sum()
+        least = min(least, squares[m])
+    out[:] = 0.0
+    total = 0.0
+    for m in range(len(seen)):
+        weight = math.exp(-0.5 * (squares[m] - least) / NEAR**2)
+        total += weight
+        for i in range(3):
+            for j in range(3):
+                out[i, j] += weight * errors[m, i] * errors[m, j]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] /= total
+        out[i, i] += std**2 + LEAST_STD_M**2

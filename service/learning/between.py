@@ -1,0 +1,279 @@
+"""Learning between places: what demonstrations tell of a task whose places they name.
+
+A KMP from the hands' shares of their places to the tool's, and how it errs in demonstrations that
+were left out.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
+from service.contract.requests import ViaPoint
+from service.core.between import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Placed, Places, Task, with_hands
+from service.core.frame import Vector
+from service.core.skill import LearnedBetween
+from service.learning.demonstration import Demonstration
+from service.learning.gate import CEILING_M, Gate, between, nonsense
+from service.learning.judgement import HeldOut
+
+ELL = 4.0  # of the kernel, whose inputs are shares
+DEVIATION = 0.05  # of a demonstration's sample, in shares and metres
+EACH = 30  # samples of a demonstration that are learned from, and
+ERRORS_OF_EACH = 60  # that its errors are kept of
+SMOOTHED_S = 0.28  # of the hands in demonstrations
+SAME_M = 0.05  # places of a hand that are no farther apart, in any demonstration, are one
+AT, ALIKE = 0.9, 0.85  # share from which on hands are at a place; and the tool, in the median
+LEAST_SAMPLES_S = 0.4  # there, for a pair of places to be known
+UNSEEN = (0.15, 0.3, 0.45)  # of the way to a pair that was not: the tool stays
+TAUGHT = 1e-4  # deviation of the share at a known pair
+FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A demonstration (T samples) in shares: inputs (T, F), the tool's shares (T, N), and what is
+    learned of them at some rows.
+    """
+
+    layout: Layout
+    hands: Vector
+    velocities: Vector
+    tool: Vector
+    inputs: Vector
+    off: Vector  # (T, 2) [m] of each hand from its places
+    shares: Vector
+    rows: Vector
+    wanted: Vector  # (T, N + 2)
+    period_s: float
+
+    @staticmethod
+    def of(task: Task, demonstration: Demonstration, hands: Vector, tool: Vector) -> Told:
+        """The demonstration whose hands (T, 6) and tool (T, 3) are in phase."""
+        period_s = demonstration.period_s
+        hands = _smoothed(hands, round(SMOOTHED_S / period_s))
+        velocities = np.gradient(hands, period_s, axis=0)
+        layout = task.layout(Places.of(demonstration.places))
+        inputs, off = Placed.of(task, layout).inputs(hands, velocities)
+        shares = _along(tool, layout.tool)
+        deviation = tool - shares @ layout.tool - with_hands(hands, shares, task, layout)
+        steps = np.linalg.norm(np.diff(np.hstack([inputs, 3.0 * tool]), axis=0), axis=1) + 0.05 * period_s
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        rows = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], EACH)).clip(0, len(way) - 1))
+        wanted = np.hstack([shares[:, 1:], deviation])
+        return Told(layout, hands, velocities, tool, inputs, off, shares, rows, wanted, period_s)
+
+
+def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
+    """The task of demonstrations that name its places; or why there is none, empty where no places
+    are named.
+    """
+    named = [tuple(point.name for point in one.places) for one in demonstrations]
+    if not any(named):
+        return ""
+    if len(set(map(frozenset, named))) > 1:
+        return "not all demonstrations name the same places, so it is learned where the hands are, not between places"
+    names = named[0]
+    if len(names) < 2:
+        return "two named places are the least to learn between"
+    at = np.array([[[*p.left, *p.right] for p in _ordered(one.places, names)] for one in demonstrations])
+    corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
+    for side, word in enumerate(("left", "right")):
+        if corners[:, side].max() >= MOST_CORNERS:
+            return (
+                f"the {word} hand has {corners[:, side].max() + 1} places, {MOST_CORNERS} at most are learned between, "
+                "so it is learned where the hands are"
+            )
+    inputs = np.full((2, MOST_CORNERS), -1)
+    left, right = (int(corners[:, side].max()) + 1 for side in (0, 1))
+    inputs[0, :left], inputs[1, :right] = np.arange(left), left + np.arange(right)
+    follow = np.array([FOLLOW[p.follow] for p in _ordered(demonstrations[0].places, names)])
+    return Task(names, corners, inputs, follow)
+
+
+def merged(task: Task, told: Sequence[Told]) -> Task:
+    """The task with places of a hand as one input that make no difference to the tool: wherever
+    the other hand was while it was at either, the tool was at the same place.
+    """
+    known = _known(told, task)
+    inputs = task.inputs.copy()
+    for side in (0, 1):
+        count = int((inputs[side] >= 0).sum())
+        for b in range(count):
+            for a in range(b):
+                at = [
+                    {pair[1 - side]: place for pair, place in known.items() if pair[side] == task.inputs[side, corner]}
+                    for corner in (a, b)
+                ]
+                both = at[0].keys() & at[1].keys()
+                if both and all(at[0][other] == at[1][other] for other in both):
+                    inputs[side, b] = inputs[side, a]
+                    break
+    _, renumbered = np.unique(inputs[inputs >= 0], return_inverse=True)
+    inputs[inputs >= 0] = renumbered
+    return task._replace(inputs=inputs)
+
+
+def fitted(task: Task, told: Sequence[Told]) -> KMP:
+    """The KMP, with the tool at its place wherever both hands were found to be at theirs."""
+    inputs = np.concatenate([one.inputs[one.rows] for one in told])
+    outputs = np.concatenate([one.wanted[one.rows] for one in told])
+    width = outputs.shape[1]
+    reference = Gaussians(outputs, np.tile(DEVIATION**2 * np.eye(width), (len(inputs), 1, 1)))
+    primitive = KMP.fit(
+        inputs,
+        reference,
+        kernel=GaussianKernel(ELL),
+        lambda_mean=1.0,
+        prior_mean=outputs.mean(axis=0),
+        representation="dense",
+    )
+    at, wanted = _pairs(task, _known(told, task))
+    if not len(at):
+        return primitive
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ViaPointMissed)
+        taught = Gaussians(wanted, np.tile(TAUGHT**2 * np.eye(width), (len(at), 1, 1)))
+        return primitive.adapt(at, taught, tolerance=0.05)
+
+
+def _smoothed(hands: Vector, samples: int) -> Vector:
+    window = np.hanning(samples + 2)[1:-1] if samples else np.ones(1)
+    before = len(window) // 2
+    padded = [np.pad(column, (before, len(window) - 1 - before), mode="edge") for column in hands.T]
+    return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)
+
+
+def _ordered(places: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
+    by_name = {place.name: place for place in places}
+    return (by_name[name] for name in names)
+
+
+def _corners(at: Vector) -> Indices:
+    """Which of its own places a hand is at, (N,), for positions (D, N, 3) in D demonstrations."""
+    out: list[int] = []
+    for i in range(at.shape[1]):
+        alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
+        out.append(alike[0] if alike else max(out, default=-1) + 1)
+    return np.array(out, np.int64)
+
+
+def _along(tool: Vector, places: Vector) -> Vector:
+    """Shares (T, N) of the point nearest to the tool (T, 3) on the way from place to place."""
+    out, least = np.zeros((len(tool), len(places))), np.full(len(tool), np.inf)
+    for i in range(len(places) - 1):
+        way = places[i + 1] - places[i]
+        along = np.clip((tool - places[i]) @ way / max(float(way @ way), 1e-9), 0.0, 1.0)
+        off = np.sum((tool - places[i] - along[:, None] * way) ** 2, axis=1)
+        nearer = off < least
+        least[nearer] = off[nearer]
+        out[nearer] = 0.0
+        out[nearer, i], out[nearer, i + 1] = 1.0 - along[nearer], along[nearer]
+    return out
+
+
+def _known(told: Sequence[Told], task: Task) -> dict[tuple[int, int], int]:
+    """At which place the tool always was while both hands were at these of theirs: inputs of the
+    left and the right hand.
+    """
+    inputs = np.concatenate([one.inputs for one in told])
+    shares = np.concatenate([one.shares for one in told])
+    periods = np.concatenate([np.full(len(one.inputs), one.period_s) for one in told])
+    out: dict[tuple[int, int], int] = {}
+    for left in np.unique(task.inputs[0][task.inputs[0] >= 0]).tolist():
+        for right in np.unique(task.inputs[1][task.inputs[1] >= 0]).tolist():
+            there = (inputs[:, left] > AT) & (inputs[:, right] > AT)
+            if periods[there].sum() >= LEAST_SAMPLES_S:
+                usual = np.median(shares[there], axis=0)
+                if usual.max() > ALIKE:
+                    out[left, right] = int(np.argmax(usual))
+    return out
+
+
+def _pairs(task: Task, known: dict[tuple[int, int], int]) -> tuple[Vector, Vector]:
+    """Inputs (V, F) and outputs (V, N + 2) of the known pairs of places, and of some of the way
+    toward pairs at which nobody was: there the tool stays.
+    """
+    lefts, rights = (sorted({i for i in task.inputs[side].tolist() if i >= 0}) for side in (0, 1))
+    count, at, wanted = len(task.names), [], []
+    for (left, right), place in known.items():
+        here = _corner(task, left, right)
+        tool = np.append(np.eye(count)[place, 1:], np.zeros(3))
+        at.append(here)
+        wanted.append(tool)
+        beside = [(other, right) for other in lefts if other != left]
+        beside += [(left, other) for other in rights if other != right]
+        for pair in beside:
+            if pair not in known:
+                at += [(1.0 - share) * here + share * _corner(task, *pair) for share in UNSEEN]
+                wanted += [tool] * len(UNSEEN)
+    return np.array(at).reshape(-1, task.width), np.array(wanted).reshape(-1, count + 2)
+
+
+def _corner(task: Task, left: int, right: int) -> Vector:
+    out = np.zeros(task.width)
+    out[[left, right]] = 1.0
+    return out
+
+
+class Learned(NamedTuple):
+    """A task's KMP, what belongs to it, what was predicted of each demonstration when it was left
+    out, and the gate.
+    """
+
+    primitive: KMP
+    between: LearnedBetween
+    held_out: list[HeldOut]
+    gate: Gate
+
+
+def learned(
+    task: Task,
+    demonstrations: Sequence[Demonstration],
+    paths: Sequence[tuple[Vector, Vector]],
+    progress: Callable[[str], None],
+) -> Learned:
+    """What demonstrations, whose hands (T, 6) and tool (T, 3) are in phase, tell of their task."""
+    pairs = list(zip(demonstrations, paths, strict=True))
+    task = merged(task, [Told.of(task, one, *path) for one, path in pairs])
+    told = [Told.of(task, one, *path) for one, path in pairs]
+    progress(f"learning from all {len(told)}")
+    primitive = fitted(task, told)
+    errors: list[Vector] = []
+    for i, one in enumerate(told):
+        progress(f"holding out demonstration {i + 1} of {len(told)}")
+        without = fitted(task, told[:i] + told[i + 1 :] or told)
+        errors.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.velocities))
+    rows = [
+        np.linspace(0, len(one.inputs) - 1, min(ERRORS_OF_EACH, len(one.inputs))).round().astype(int) for one in told
+    ]
+    seen = [one.inputs[some] for one, some in zip(told, rows, strict=True)]
+    kept = [some_errors[some] for some_errors, some in zip(errors, rows, strict=True)]
+    held_out = []
+    for i, one in enumerate(told):
+        others = [j for j in range(len(told)) if j != i] or [0]
+        judge = Placed.of(
+            task, one.layout, None, np.concatenate([seen[j] for j in others]), np.concatenate([kept[j] for j in others])
+        )
+        covariance = np.array([judge.covariance(row) for row in one.inputs])
+        held_out.append(HeldOut(errors[i], covariance, one.off.max(axis=1)))
+    nominal = Places(
+        task.names, np.mean([Places.of(list(_ordered(d.places, task.names))).at for d in demonstrations], axis=0)
+    )
+    known = LearnedBetween(task, nominal, np.concatenate(seen), np.concatenate(kept))
+    return Learned(primitive, known, held_out, _gate(task, told))
+
+
+def _gate(task: Task, told: Sequence[Told]) -> Gate:
+    """The gate on how far a hand is off its places."""
+    wrong: list[list[Vector]] = [[], [], []]
+    for one in told:
+        for off, hands in zip(wrong, nonsense(one.hands[:: max(1, len(one.hands) // 50)]), strict=True):
+            off.append(Placed.of(task, one.layout).inputs(hands, np.zeros_like(hands))[1].max(axis=1))
+    held_out = np.concatenate([one.off.max(axis=1) for one in told])
+    return between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M)
