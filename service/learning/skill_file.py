@@ -220,9 +220,9 @@ def _between(arrays: Mapping[str, NDArray[Any]]) -> LearnedBetween:
     corners, shares = (np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "shares"))
     for side in (0, 1):
         has = int((shares[side] >= 0).sum())
-        if not has or (shares[side, :has] < 0).any() or not (np.unique(corners[:, side]) == np.arange(has)).all():
+        if not has or (shares[side, :has] < 0).any() or not np.array_equal(np.unique(corners[:, side]), np.arange(has)):
             raise ValueError(f"the hands' places {corners.tolist()} and inputs {shares.tolist()} do not fit each other")
-    if not (np.unique(shares[shares >= 0]) == np.arange(width)).all():
+    if not np.array_equal(np.unique(shares[shares >= 0]), np.arange(width)):
         raise ValueError(f"the inputs {shares.tolist()} are not numbered through")
     task = Task(names, corners, shares, np.ascontiguousarray(arrays["follow"], np.int64))
     return LearnedBetween(task, Places(names, arrays["nominal"]), arrays["seen"], arrays["errors"])

@@ -12,7 +12,7 @@ from cell import thirdhand
 from service.cli import loads, soak
 from service.recorder.replay import replay
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = [pytest.mark.timeout(180), pytest.mark.timed]
 QUIET = {"say": lambda line: None}
 
 
@@ -31,17 +31,15 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
     assert next(tmp_path.glob("*.rrd")).stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("what", ["scribe killed", "taught each 100 ms"])
-def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
-    monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == what))
+def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
     monkeypatch.setattr(loads, "_large", bytes)
     (row,) = loads.run(500, 1.0, **QUIET)
     assert row["mode"] == "follow"
     assert row["ticks"] == pytest.approx(500, abs=150)
     assert row["identical"] == row["recorded"] > 0
-    assert (row["scribe"]["restarts"] > 0) == (what == "scribe killed")
-    assert bool(row["scribe"]["errors"]) == (what != "taught each 100 ms")
-    assert ("here" in row["places"]) == (what == "taught each 100 ms")
+    assert row["scribe"]["restarts"] > 0
+    assert row["scribe"]["errors"]
 
 
 def test_a_leak_is_told_from_noise() -> None:
@@ -56,7 +54,7 @@ def test_a_leak_is_told_from_noise() -> None:
 
 
 def test_soak_reports_each_process() -> None:
-    report = soak.run(0.2, 500, **QUIET)
+    report = soak.run(0.12, 500, **QUIET)
     assert set(report["processes"]) == {"daemon", "scribe", "workshop"}
     assert report["lost"] == report["restarts"] == 0
     assert "MB/h" in soak.text(report)

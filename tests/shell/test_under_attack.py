@@ -26,6 +26,7 @@ from service.shell.clock import NETWORK_NICE
 from service.shell.daemon import MOST_NOTES
 from service.shell.door import MOST_SESSIONS
 
+pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
 SOON_S = 1.0
 

@@ -20,7 +20,7 @@ from sim.experiments.__main__ import main
 from sim.experiments.faults import SHORT
 from sim.parts import Part
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.timed]
 BRAKE_MM = 40.0  # of a tool at up to 0.8 m/s that brakes 20 ms after the last command
 
 
