@@ -9,20 +9,18 @@ rests belongs to the place it rests nearest to; one that moves is on its way.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.contract.requests import ViaPoint
 from service.core.frame import Vector
+from service.core.places import Indices, Layout, Task
 from service.core.taught import NEAR as NEAR_TAUGHT
 
-MOST_CORNERS = 3  # places that a hand may go between
 SHARPNESS = 4.0  # power of a resting hand's shares
 REST_MPS = 0.12  # a hand this fast is on its way
 ALMOST = 1e-4  # share that every place has, so that none is of an undefined power
@@ -33,69 +31,6 @@ LEAST_STD_M = 0.003
 STEP_S = 0.02  # of differences along the hands' motion
 CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
 LARGEST_MPS2 = 3.0  # of a target's acceleration
-NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a place
-
-Indices = NDArray[np.int64]
-
-
-class Task(NamedTuple):
-    """How the places of a task belong together, wherever they are. N named places.
-
-    corners: (N, 2) which of its own places the left and the right hand is at. inputs: (2, 3) which
-    input of the skill the share of a hand's place adds to; -1 where it has no such place. follow:
-    (N,) the hand that the tool goes with there, NONE, LEFT or RIGHT.
-    """
-
-    names: tuple[str, ...]
-    corners: Indices
-    inputs: Indices
-    follow: Indices
-
-    @property
-    def width(self) -> int:
-        """The number of inputs."""
-        return int(self.inputs.max()) + 1
-
-    def layout(self, places: Places) -> Layout:
-        """Where this task's places are, those of a hand that are one at their mean."""
-        at = places.at[[places.names.index(name) for name in self.names]]
-        hands = np.zeros((2, MOST_CORNERS, 3))
-        for side in (0, 1):
-            for corner in range(int(self.corners[:, side].max()) + 1):
-                here = self.corners[:, side] == corner
-                hands[side, corner] = at[here, 3 * side : 3 * side + 3].mean(axis=0)
-        return Layout(hands, at[:, 6:].copy(), places.std)
-
-
-class Layout(NamedTuple):
-    """Where the places are [m]: those of both hands (2, 3, 3), the tool's (N, 3); and how sure that
-    is, of each axis [m].
-    """
-
-    hands: Vector
-    tool: Vector
-    std: float
-
-
-class Places(NamedTuple):
-    """Named places: hands and tool (N, 9) [m] at each, and how sure that is, of each axis [m]."""
-
-    names: tuple[str, ...]
-    at: Vector
-    std: float = 0.0
-
-    @staticmethod
-    def of(points: Sequence[ViaPoint]) -> Places:
-        """Those of via-points."""
-        at = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
-        return Places(tuple(point.name for point in points), at, max((point.std for point in points), default=0.0))
-
-    def told(self, points: Sequence[ViaPoint]) -> Places:
-        """These places, those at the via-points that have the name of one."""
-        other = Places.of([point for point in points if point.name in self.names])
-        at = self.at.copy()
-        at[[self.names.index(name) for name in other.names]] = other.at
-        return Places(self.names, at, other.std)
 
 
 class Moving(NamedTuple):
@@ -186,7 +121,7 @@ class Placed:
         """The tool (T, 3) [m] for hands and velocities (T, 6)."""
         out = np.empty((len(hands), 3))
         for hand, velocity, row in zip(hands, velocities, out, strict=True):
-            self._tool(hand, velocity, row, np.empty(2))
+            _tool(*(hand, velocity, *self._arrays, row, np.empty(2)))
         return out
 
     def corners_of_hands(self) -> Vector:
@@ -205,41 +140,17 @@ class Placed:
         """The tool for hands (6,) that move so, by differences along their motion. One that only
         trembles moves nothing.
         """
-        speeds = np.sqrt((velocities.reshape(2, 3) ** 2).sum(axis=1))
-        goes = np.repeat(1.0 - np.exp(-((speeds / CALM_MPS) ** 4)), 3)
-        step, bend = STEP_S * goes * velocities, 0.5 * STEP_S**2 * goes * accelerations
-        tools, off = np.empty((3, 3)), np.empty(2)
-        self._tool(hands - step + bend, velocities - STEP_S * accelerations, tools[0], off)
-        self._tool(hands + step + bend, velocities + STEP_S * accelerations, tools[2], off)
-        self._tool(hands, velocities, tools[1], off)
-        pushed = (tools[2] - 2.0 * tools[1] + tools[0]) / STEP_S**2
-        return Moving(
-            tools[1],
-            (tools[2] - tools[0]) / (2.0 * STEP_S),
-            np.clip(pushed, -LARGEST_MPS2, LARGEST_MPS2),
-            self.covariance(self.inputs(hands[None], velocities[None])[0][0]) if covariance else None,
-            float(off.max()),
-        )
+        motion, scatter = np.empty((3, 3)), np.empty((3, 3))
+        known = (*self._arrays, self.seen, self.errors, self.layout.std)
+        off = _moving(*(hands, velocities, accelerations, *known, covariance, motion, scatter))
+        return Moving(motion[0], motion[1], motion[2], scatter if covariance else None, off)
 
-    def _tool(self, hand: Vector, velocity: Vector, out: Vector, off: Vector) -> None:
+    @cached_property
+    def _arrays(self) -> tuple[Any, ...]:
+        """What `_tool` needs besides hands."""
         task, layout = self.task, self.layout
-        _tool(
-            hand,
-            velocity,
-            layout.hands,
-            layout.tool,
-            task.inputs,
-            task.corners,
-            task.follow,
-            self.scale,
-            self.centres,
-            self.weights,
-            self.prior,
-            self.taught,
-            self.pulls,
-            out,
-            off,
-        )
+        at = (layout.hands, layout.tool, task.inputs, task.corners, task.follow)
+        return (*at, self.scale, self.centres, self.weights, self.prior, self.taught, self.pulls)
 
 
 def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vector:
@@ -339,7 +250,9 @@ def _tool(
         square = 0.0
         for i in range(width):
             square += (query[i] - centres[r, i]) ** 2
-        found += math.exp(-scale * square) * weights[r]
+        value = math.exp(-scale * square)
+        for i in range(len(found)):
+            found[i] += value * weights[r, i]
     shares[0] = 1.0
     for place in range(1, count):
         shares[place] = found[place - 1]
@@ -350,7 +263,65 @@ def _tool(
             out[i] += shares[place] * places[place, i]
     _add_followed(hands, shares, corners, at, follow, out)
     for x in range(len(taught)):
-        out += math.exp(-NEAR_TAUGHT * ((hands - taught[x]) ** 2).sum()) * pulls[x]
+        square = 0.0
+        for i in range(6):
+            square += (hands[i] - taught[x, i]) ** 2
+        value = math.exp(-NEAR_TAUGHT * square)
+        for i in range(3):
+            out[i] += value * pulls[x, i]
+
+
+@compiled
+def _moving(
+    hands: Vector,
+    velocities: Vector,
+    accelerations: Vector,
+    corners: Vector,
+    places: Vector,
+    inputs: Indices,
+    at: Indices,
+    follow: Indices,
+    scale: float,
+    centres: Vector,
+    weights: Vector,
+    prior: Vector,
+    taught: Vector,
+    pulls: Vector,
+    seen: Vector,
+    errors: Vector,
+    std: float,
+    wanted: bool,
+    motion: Vector,
+    scatter: Vector,
+) -> float:
+    """Tool, velocity and acceleration into `motion` (3, 3), the covariance, if it is wanted, into
+    `scatter` (3, 3); how far the farther hand is off its places [m].
+    """
+    step, bend, tools, off = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(2)
+    for side in range(2):
+        part = slice(3 * side, 3 * side + 3)
+        speed = math.sqrt((velocities[part] ** 2).sum())
+        goes = 1.0 - math.exp(-((speed / CALM_MPS) ** 4))
+        step[part] = STEP_S * goes * velocities[part]
+        bend[part] = 0.5 * STEP_S**2 * goes * accelerations[part]
+    for k in (0, 2, 1):
+        way = k - 1.0
+        where = hands + way * step + abs(way) * bend
+        faster = velocities + way * STEP_S * accelerations
+        _tool(
+            where, faster, corners, places, inputs, at, follow, scale, centres, weights, prior, taught, pulls,
+            tools[k], off,
+        )  # fmt: skip
+    for i in range(3):
+        bent = (tools[2, i] - 2.0 * tools[1, i] + tools[0, i]) / STEP_S**2
+        motion[0, i] = tools[1, i]
+        motion[1, i] = (tools[2, i] - tools[0, i]) / (2.0 * STEP_S)
+        motion[2, i] = min(max(bent, -LARGEST_MPS2), LARGEST_MPS2)
+    if wanted:
+        query = np.empty(centres.shape[1])
+        _inputs(hands, velocities, corners, inputs, query, off)
+        _scatter(query, seen, errors, std, scatter)
+    return float(max(off[0], off[1]))
 
 
 @compiled
@@ -358,7 +329,9 @@ def _scatter(query: Vector, seen: Vector, errors: Vector, std: float, out: Vecto
     """The mean square (3, 3) of errors (M, 3) at inputs (M, F), weighted by how near those are."""
     squares, least = np.empty(len(seen)), math.inf
     for m in range(len(seen)):
-        squares[m] = ((query - seen[m]) ** 2).sum()
+        squares[m] = 0.0
+        for i in range(len(query)):
+            squares[m] += (query[i] - seen[m, i]) ** 2
         least = min(least, squares[m])
     out[:] = 0.0
     total = 0.0

@@ -16,8 +16,9 @@ from kmp import KMP
 from kmp.compiled import compiled
 from kmp.query import MotionPrediction
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.between import Moving, Placed, Places, Task
+from service.core.between import Moving, Placed
 from service.core.frame import Vector
+from service.core.places import Places, Task
 from service.core.taught import bent
 
 MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded

@@ -15,8 +15,9 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint
-from service.core.between import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Placed, Places, Task, with_hands
+from service.core.between import Placed, with_hands
 from service.core.frame import Vector
+from service.core.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
 from service.core.skill import LearnedBetween
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, Gate, between, nonsense
@@ -25,7 +26,7 @@ from service.learning.judgement import HeldOut
 ELL = 4.0  # of the kernel, whose inputs are shares
 DEVIATION = 0.05  # of a demonstration's sample, in shares and metres
 EACH = 30  # samples of a demonstration that are learned from, and
-ERRORS_OF_EACH = 60  # that its errors are kept of
+ERRORS_OF_EACH = 40  # that its errors are kept of
 SMOOTHED_S = 0.28  # of the hands in demonstrations
 SAME_M = 0.05  # places of a hand that are no farther apart, in any demonstration, are one
 AT, ALIKE = 0.9, 0.85  # share from which on hands are at a place; and the tool, in the median

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
-from service.core.between import Task
 from service.core.frame import Vector
+from service.core.places import Task
 from service.core.skill import LearnedBetween, Skill
 from service.learning.between import learned, task_of
 from service.learning.choice import Choice

@@ -23,7 +23,7 @@ from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import Name, ViaPoint
-from service.core.between import MOST_CORNERS, Places, Task
+from service.core.places import MOST_CORNERS, Places, Task
 from service.core.skill import LearnedBetween, Skill
 
 # The second holds what was found in learning, the third is of a skill between places; a skill of

@@ -16,7 +16,7 @@ from service.learning.via_points import adapted
 @pytest.fixture(scope="session")
 def skill() -> Skill:
     """A skill learned the paper's way, in the first format."""
-    path = RECORDINGS / "as-paper.npz"
+    path = RECORDINGS / "experiments" / "as-paper.npz"
     return decoded(path.read_bytes(), origin=str(path))
 
 

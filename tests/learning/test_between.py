@@ -13,7 +13,8 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.between import MOST_CORNERS, _nearest
+from service.core.between import _nearest
+from service.core.places import MOST_CORNERS
 from service.core.skill import Skill
 from service.learning.between import task_of
 from service.learning.demonstration import Demonstration
