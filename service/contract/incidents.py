@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
+
 
 class Incident(NamedTuple):
     """One word of a status: what happened, and what to do."""
@@ -61,9 +63,7 @@ REASONS = {
         "the tool was measured faster than `[tool] fault_speed` for 30 ms",
         "the arm does not do what it is told: check the driver before `thirdhand reset`",
     ),
-    "setpoint": Incident(
-        "a bound of the setpoint was passed, which cannot happen", "keep the recording and report it"
-    ),
+    "setpoint": Incident("a bound of the setpoint was passed, which cannot happen", "keep the recording and report it"),
     "service": Incident(
         "a thread or the loop of the service failed; it is begun anew, and the log says which and why",
         "keep log and recording, report it, then `thirdhand reset`",
@@ -124,6 +124,16 @@ REJECTIONS = {
 }  # what came; under `malformed KEY` the last one in the status
 
 EVERY = MODES | REASONS | FLAGS | REJECTIONS
+
+
+def in_brief(mode: str, reason: str) -> str:
+    """Mode and reason as one term."""
+    return f"{mode} ({reason})" if reason else mode
+
+
+def in_full(because: str, remedy: str) -> str:
+    """What follows that term: the reason in words, and what to do; empty where there is none."""
+    return (f": {because}" if because else "") + (f". What to do: {remedy}" if remedy else "")
 
 
 def remedy(word: str) -> str:
