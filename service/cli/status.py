@@ -48,10 +48,10 @@ def _watch(args: argparse.Namespace) -> int:
         elif sys.stdout.isatty():
             _draw(told)
         else:
-            last = 0.0
+            last, said = 0.0, ("", "")
             for now in told:
-                if time.monotonic() - last >= LINE_S:
-                    last = time.monotonic()
+                if time.monotonic() - last >= LINE_S or (now.mode, now.reason) != said:
+                    last, said = time.monotonic(), (now.mode, now.reason)
                     print(line(now), flush=True)
     return 1
 

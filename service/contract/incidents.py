@@ -27,9 +27,9 @@ MODES = {
     "fault": Incident(
         "has come to rest; commands are no longer sent", "by `thirdhand reset`, once the cause is mended"
     ),
-}  # of the arm; and how they end
+}  # what the arm does; and how the mode ends
 
-REASONS = {
+HOLDS = {
     "no_hands": Incident(
         "a hand has not been seen since the start",
         "start the tracker; `hand_age_ms` in the status names the hands that are there",
@@ -51,6 +51,8 @@ REASONS = {
         "the arm has not told where it is",
         "start the arm's driver; `joints/state` must name the joints as `joints/command` does",
     ),
+}
+FAULTS = {
     "arm_error": Incident(
         "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`",
         "see what blocked or pushed it, then `thirdhand reset`",
@@ -69,6 +71,7 @@ REASONS = {
         "keep log and recording, report it, then `thirdhand reset`",
     ),
 }
+REASONS = HOLDS | FAULTS
 
 FLAGS = {
     "target_clamped": Incident(
