@@ -19,9 +19,10 @@ from service.contract.cdr import decode_joints, encode_joints
 from service.contract.messages import JointState, WireError, finite, in_order
 
 PERIOD_S = 0.002
-SILENCE_S = 0.020  # without a command for so long the arm brakes by itself
+BRAKE_S = 0.020  # without a command for so long the arm brakes by itself
+REJOIN_S = 0.1  # and after so long it follows again only what begins where it stands,
+NEAR_RAD = 0.05  # so nearly
 Joints = tuple[float, ...]
-NEAR_RAD = 0.05  # an arm that stands takes a command that begins this near, and no other
 
 
 class FakeArm:
@@ -29,17 +30,15 @@ class FakeArm:
 
     def __init__(self, names: tuple[str, ...], position: Joints) -> None:
         self.names, self.position, self.velocity = names, position, (0.0,) * len(names)  # [rad], [rad/s]
-        self.follows = False
 
     def move(self, position: Joints, velocity: Joints) -> None:
         """Follows one command [rad, rad/s]."""
-        self.position, self.velocity, self.follows = position, velocity, True
+        self.position, self.velocity = position, velocity
 
     def brake(self) -> None:
         """One period on its way to rest, within what its drives can do."""
         self.velocity = tuple(math.copysign(max(abs(v) - 10 * PERIOD_S, 0.0), v) for v in self.velocity)
         self.position = tuple(q + v * PERIOD_S for q, v in zip(self.position, self.velocity, strict=True))
-        self.follows = False
 
 
 def drive(arm: FakeArm, session: zenoh.Session, cell: str, stop: threading.Event) -> None:
@@ -52,10 +51,10 @@ def drive(arm: FakeArm, session: zenoh.Session, cell: str, stop: threading.Event
             state.put(encode_joints(JointState(time.time_ns(), arm.names, arm.position, arm.velocity)))
             if command := command_in(commands.try_recv(), arm.names):
                 off = max(abs(q - at) for q, at in zip(command[0], arm.position, strict=True))
-                if arm.follows or off < NEAR_RAD:
+                if time.monotonic() - heard < REJOIN_S or off < NEAR_RAD:
                     heard = time.monotonic()
                     arm.move(*command)
-            if time.monotonic() - heard > SILENCE_S:
+            if time.monotonic() - heard > BRAKE_S:
                 arm.brake()
     finally:
         while any(arm.velocity):

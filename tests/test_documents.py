@@ -8,11 +8,13 @@ import json
 import re
 from collections.abc import Iterable
 
+import numpy as np
 from tests_paths import ROOT
 
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract import incidents, requests
 from service.contract.records import Cause, Flag, Mode, Reason
+from service.core.arm import Arm
 from service.recorder.client import Scribe
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
@@ -55,6 +57,19 @@ def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
     words = "".join(told.about + told.remedy for told in incidents.EVERY.values())
     told += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
     assert {word for pair in told for word in pair if word} <= fields
+
+
+def test_the_table_of_signs_is_the_arms() -> None:
+    text = (ROOT / "docs" / "hardware.md").read_text(encoding="utf-8")
+    arm, names = Arm(Settings(), robot_description(Settings())), Settings().joints.names
+    begin = np.array([0.0, 0.5, 0.0, 1.5, 0.0, -1.0, 0.0])
+    told = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)
+    assert [row[0] for row in told] == list(names)
+    for i, (_, *said) in enumerate(told):
+        moved = arm.at(begin + 0.3 * (np.arange(7) == i)).position - arm.at(begin).position
+        np.testing.assert_allclose(1000 * moved, [float(v) for v in said], atol=0.51)
+    assert "({:.3f}, {:.3f}, {:.3f}) m".format(*arm.at(begin).position) in text
+    assert f"{arm.at(np.zeros(7)).position[2]:.3f} m above" in text
 
 
 def rows_of_faults() -> list[list[str]]:

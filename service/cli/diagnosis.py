@@ -101,7 +101,8 @@ def _source(before: Status, now: Status, name: str) -> Iterator[Finding]:
         way = "before it comes" if source.clock_ms > 0 else "after it comes: its clock is ahead"
         told = f"a sample is stamped {abs(source.clock_ms) / 1000:.3g} s {way}"
         advice = "synchronise its clock (chrony, PTP), or stamp as it is sent; no latency can be told until then"
-        yield wrong(f"{what}'s clock", told, f"less than {LATE_MS / 1000:g} s", advice)
+        level = "note" if name == "arm" else "wrong"  # of the arm's nothing is told
+        yield Finding(level, f"{what}'s clock", told, f"less than {LATE_MS / 1000:g} s", advice)
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:

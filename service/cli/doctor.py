@@ -5,6 +5,7 @@ wanted and what to do.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import socket
 import time
@@ -14,10 +15,10 @@ from importlib.metadata import version
 import msgspec
 
 from service.cli.diagnosis import Finding, findings, wrong
+from service.cli.status import heard
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
-from service.client import Client, RefusedError, UnreachableError, open_session
+from service.client import UnreachableError, open_session
 from service.contract.channels import ENDPOINT
-from service.contract.requests import Status
 
 PROBE_S = 1.0
 
@@ -47,19 +48,22 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
         yield from (unreachable(endpoint, str(error)) for endpoint in connect)
         return
     with session:
-        client = Client(session, args.cell, timeout_s=CONNECT_TIMEOUT_S)
         try:
-            before = msgspec.convert(client.ask("status"), Status)
-            time.sleep(args.seconds)
-            now = msgspec.convert(client.ask("status"), Status)
-        except (UnreachableError, RefusedError) as error:
+            with contextlib.closing(heard(session, args.cell)) as told:
+                before = now = next(told)
+                end = time.monotonic() + args.seconds
+                while time.monotonic() < end:
+                    now = next(told)
+        except UnreachableError as error:
             cells = {
                 str(reply.ok.key_expr).split("/daemon/")[0]
                 for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
                 if reply.ok is not None
             }
+            cells.discard(args.cell)
             there = f"give --cell: {', '.join(sorted(cells))} can be reached here"
-            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", there if cells else "`thirdhand serve`")
+            start = "start `thirdhand serve`; with certificates use an operator's or an observer's"
+            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", there if cells else start)
             return
         except msgspec.ValidationError as error:
             yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")

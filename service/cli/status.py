@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import msgspec
 import zenoh
@@ -41,7 +41,7 @@ def _watch(args: argparse.Namespace) -> int:
     with open_session(
         connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
     ) as session:
-        told = _heard(session, args.cell)
+        told = heard(session, args.cell)
         if args.json:
             for now in told:
                 print(msgspec.json.encode(now).decode(), flush=True)
@@ -56,7 +56,7 @@ def _watch(args: argparse.Namespace) -> int:
     return 1
 
 
-def _heard(session: zenoh.Session, cell: str) -> Iterator[Status]:
+def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
     """Each status as it comes. Raises UnreachableError once none does."""
     key = channels.key(cell, "status")
     with session.declare_subscriber(key, RingChannel(1)) as subscriber:

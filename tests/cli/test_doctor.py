@@ -17,15 +17,27 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from cell import LEFT, Daemon, Tracker, serving
+from cell import LEFT, Daemon, Tracker
 from tests_paths import ROOT
 
 from service.cli.main import main
 from service.client import endpoints, open_session
 from service.config import Settings
 from service.contract import cdr, messages
+from service.launch import launched
 
-NOT_OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
+NEAR_LEFT = (0.95, -0.30, 0.08)  # a hand that moves a little: an arm that is late is not far off
+PATIENT = """# Threads of a busy test may be late.
+[network]
+listen = ["tcp/127.0.0.1:0"]
+[arm]
+silent_ms = 1000
+fault_error_rad = 0.5
+[hands]
+frame = "optitrack"
+stale_ms = 500
+"""
+OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
 
 
 def template() -> ModuleType:
@@ -58,12 +70,16 @@ def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> 
     capsys.readouterr()
     code = main(["doctor", "--json", "--seconds", "0.5", "--connect", daemon.endpoint, *more])
     told = json.loads(capsys.readouterr().out)
-    return code, [finding for finding in told if finding["what"] not in NOT_OF_THE_MACHINE]
+    return code, [finding for finding in told if finding["what"] not in OF_THE_MACHINE]
 
 
 def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own_arm = template()
-    with serving(tmp_path, "--record", str(tmp_path / "records")) as daemon:
+    with (
+        launched(tmp_path, record=tmp_path / "records", network=PATIENT) as service,
+        open_session(connect=[service.endpoint]) as session,
+    ):
+        daemon = Daemon(service, session)
         code, found = findings(daemon, capsys)
         wrong = {finding["what"]: finding for finding in found if finding["level"] == "wrong"}
         assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
@@ -76,7 +92,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             assert {finding["level"] for finding in found} == {"ok"}, found
             assert {"left hand", "right hand", "arm", "recording"} <= {finding["what"] for finding in found}
 
-            tracker.left = (0.80, -0.25, 0.25)
+            tracker.left = NEAR_LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
             assert main(["hold", "--connect", daemon.endpoint]) == 0
             assert ": hold (operator)" in capsys.readouterr().out
@@ -99,7 +115,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             assert all(f" | {name} (" in line for name in ("left", "right", "tool", "target"))
 
             tracker.left = None
-            foreign = messages.PoseStamped(0, "optitrack", (0.8, -0.25, 0.25), (0.0, 0.0, 0.0, 1.0))
+            foreign = messages.PoseStamped(0, "camera", NEAR_LEFT, (0.0, 0.0, 0.0, 1.0))
 
             def refused(status: dict[str, object]) -> bool:
                 payload = cdr.encode_pose(foreign._replace(stamp_ns=time.time_ns()))
@@ -108,7 +124,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
 
             told = daemon.until(refused)
             assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "set [hands] frame a")
-            assert "frame 'optitrack'; 'base' or none accepted" in told["because"]
+            assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
             assert set(told["hands_m"]) == {"left", "right"}
             tracker.left = LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
@@ -118,7 +134,6 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             while any(arm.velocity):  # type: ignore[attr-defined]
                 assert time.monotonic() < end
                 time.sleep(0.01)
-            assert not arm.follows  # type: ignore[attr-defined]
         assert watch.stderr is not None
         said, ended = watch.stdout.read(), watch.stderr.read()
         watch.wait(20)
@@ -128,7 +143,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         assert "left not seen for" in said
         assert (watch.returncode, "nothing comes on thirdhand/status" in ended) == (1, True)
         log = daemon.log.read_text()
-        assert log.count("left hand: rejected as wrong_frame: frame 'optitrack'") == 1
+        assert log.count("left hand: rejected as wrong_frame: frame 'camera'") == 1
         assert main(["doctor", "--connect", daemon.endpoint]) == 1
         assert "nothing listens on 127.0.0.1 port" in capsys.readouterr().out
 
@@ -149,7 +164,7 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
         assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
         token.undeclare()  # type: ignore[no-untyped-call]
     said = capsys.readouterr().out
-    assert "nobody answers on lab/status" in said
+    assert "nothing comes on lab/status" in said
     assert "give --cell: lab/bench2 can be reached here" in said
 
 
