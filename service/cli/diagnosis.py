@@ -140,13 +140,13 @@ def _hands_and_skill(now: Status) -> Iterator[Finding]:
         else "bring it there, or demonstrate this too; see that [hands] unit and base_from_tracker are right"
     )
     for side, at in there.items():
-        told = f"at {_point(at)} m, {off[side]:.2f} m from where it was demonstrated"
+        told = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
         wanted = " to ".join(map(_point, boxes[side])) + " m"
         yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", told, wanted, advice)
     if now.deviation_m is not None:
-        told = f"known within {100 * now.deviation_m:.1f} cm (one standard deviation)"
+        told = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
         wanted = f"up to {100 * now.threshold_m:.1f} cm"
-        yield judged(now.deviation_m <= now.threshold_m, "target", told, wanted, remedy("far_from_demonstrations"))
+        yield judged(now.deviation_m <= now.threshold_m, "skill", told, wanted, remedy("far_from_demonstrations"))
 
 
 def _machine(before: Status, now: Status) -> Iterator[Finding]:

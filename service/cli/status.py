@@ -20,7 +20,7 @@ from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
 from service.contract.requests import Source, Status
 
-LOOK_S, LINE_S, SILENT_S = 0.02, 0.5, 3.0
+LOOK_S, LINE_S, SILENT_S = 0.02, 0.5, 2.0
 LATE_MS, AHEAD_MS = 1000.0, -5.0  # beyond these a sample's stamp tells of clocks
 
 
@@ -93,7 +93,7 @@ def line(now: Status) -> str:
     parts += [f"{side} {_where(now, side)}" for side in SIDES]
     parts.append(f"tool {_at(now.tool_m)}")
     if now.target_m is not None:
-        parts.append(f"target {_at(now.target_m)} ± {1000 * (now.deviation_m or 0.0):.1f} mm")
+        parts.append(f"target {_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm")
     parts.append(_nearest(now))
     return " | ".join(parts)
 
@@ -122,7 +122,7 @@ def rows(now: Status) -> dict[str, str]:
         "nearest": _nearest(now),
         "arm": _arm(now),
         "tool": _at(now.tool_m),
-        "target": f"{_at(now.target_m)} ± {1000 * (now.deviation_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
+        "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
         if now.target_m is not None
         else "none: it needs both hands",
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)

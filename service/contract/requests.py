@@ -176,10 +176,11 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     frames: tuple[str, ...] = ()  # in which a hand's pose may be; empty: as the tracker's
     joints: tuple[str, ...] = ()  # their names, in order
     hands_m: dict[str, Vector3] = {}  # as estimated at this tick, frame `base`; those that are seen
-    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of where each hand was shown
+    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of where each is known
     tool_m: Vector3 | None = None  # as commanded; None before the first tick
     target_m: Vector3 | None = None  # None where a hand is not seen
     setpoint_m: Vector3 | None = None
-    deviation_m: float | None = None  # how unsure the target is, one standard deviation
-    threshold_m: float = 0.0  # beyond it the hands are far from the demonstrations
+    std_m: float | None = None  # of the target, root mean square over the axes
+    deviation_m: float | None = None  # of the hands from what the skill knows
+    threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`

@@ -132,10 +132,8 @@ class Skill:
 
     @cached_property
     def demonstrated(self) -> Vector:
-        """Least and greatest corner (2, 2, 3) of where the left and the right hand were in what it
-        was learned from [m].
-        """
-        hands = self.primitive.inputs.reshape(-1, 2, 3)
+        """Least and greatest corner (2, 2, 3) of where it knows the left and the right hand [m]."""
+        hands = self.hands.reshape(-1, 2, 3)
         return np.stack([hands.min(axis=0), hands.max(axis=0)])
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from service.config import Settings
@@ -55,6 +56,7 @@ class Survey(NamedTuple):
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
+            std_m=round(math.sqrt(max(frame["covariance"].trace() / 3, 0.0)), 5) if aimed else None,
             deviation_m=round(float(frame["deviation"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,
@@ -74,8 +76,9 @@ class Survey(NamedTuple):
             case Reason.NO_HANDS | Reason.STALE_HAND:
                 return "; ".join(_silence(side, sources[side]) for side in SIDES if not sources[side].fresh)
             case Reason.FAR_FROM_DEMONSTRATIONS:
-                deviation, threshold = 100 * float(frame["deviation"]), 100 * self.controller.skill.threshold
-                return f"the target's standard deviation is {deviation:.1f} cm, {threshold:.1f} accepted"
+                skill = self.controller.skill
+                what = "the target's standard deviation is" if skill.between is None else "a hand is off its places by"
+                return f"{what} {100 * float(frame['deviation']):.1f} cm, {100 * skill.threshold:.1f} accepted"
             case Reason.TWO_SOURCES:
                 side, source = max(sources.items(), key=lambda item: item[1].contested)
                 when = "in the last second" if source.rate_hz else "before it ended"

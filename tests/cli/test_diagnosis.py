@@ -120,7 +120,7 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
             {"hands_m": {"left": (0.8, -0.2, 0.9), "right": (0.9, 0.3, 0.1)}},
             "left hand's place",
             (
-                "0.60 m from where it was demonstrated",
+                "0.60 m from where the skill knows it",
                 "(0.60, -0.30, 0.00) to (1.00, 0.00, 0.30) m",
                 "base_from_tracker",
             ),
@@ -130,7 +130,7 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
             "right hand's place",
             ("left and right look swapped",),
         ),
-        ({"deviation_m": 0.9}, "target", ("known within 90.0 cm", "up to 70.0 cm", "demonstrate this too")),
+        ({"deviation_m": 0.9}, "skill", ("deviate by 90.0 cm", "up to 70.0 cm", "demonstrate this too")),
         ({"missed": 100}, "loop", ("97 of 1000 deadlines missed", "less than 1% missed", "bench")),
         ({"lateness_us": Percentiles(1, 3000, 9000)}, "loop", ("late by 3000 µs", "what else runs")),
         ({"realtime": False}, "real time", ("not granted", "SCHED_FIFO", "docs/hardware.md")),
