@@ -5,6 +5,7 @@ the tick.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,11 +43,19 @@ def rest_ticks(settings: Settings) -> int:
     return math.ceil(round(REST_S / settings.period_s, 6))
 
 
+class Refused(NamedTuple):
+    """A sample that was rejected, and the stamp [ns] of the newest one accepted before."""
+
+    cause: Cause
+    sample: PoseStamped | JointState
+    newest_ns: int
+
+
 class Intake:
     """Hand and arm samples into the state: each hand's estimate, the arm's newest sample.
 
     For people only, no part of the state: `rejected` counts (sources, causes) what this intake
-    rejected, and `refused` has the newest of it, by source.
+    rejected, and `refused` has the newest of it, by source and cause.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -64,7 +73,7 @@ class Intake:
         # a tracker with a frame of its own: what says that it is in base has been mapped already
         self._maps_base = hands.frame in ("", BASE)
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
-        self.refused: dict[str, tuple[Cause, PoseStamped | JointState]] = {}
+        self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
     def begin(self, state: Record) -> None:
@@ -103,7 +112,7 @@ class Intake:
         """One hand's sample filtered in, or counted as rejected."""
         if sample.frame_id not in self._frames:
             state["rejected"][Cause.WRONG_FRAME] += 1
-            self._note(side, Cause.WRONG_FRAME, sample)
+            self._note(state, side, Cause.WRONG_FRAME, sample)
             return
         cause = _take_hand(
             as_array(state),
@@ -116,7 +125,7 @@ class Intake:
             self._period_s,
         )
         if cause >= 0:
-            self._note(side, cause, sample)
+            self._note(state, side, cause, sample)
 
     def take_arm(self, state: Record, sample: JointState) -> None:
         """The arm's sample into the state, or counted as rejected."""
@@ -124,7 +133,7 @@ class Intake:
             position, velocity = in_order(sample, self._names)
         except WireError:
             state["rejected"][Cause.INCOMPLETE] += 1
-            self._note(ARM, Cause.INCOMPLETE, sample)
+            self._note(state, ARM, Cause.INCOMPLETE, sample)
             return
         cause = _take_arm(
             as_array(state),
@@ -136,11 +145,12 @@ class Intake:
             self._period_s,
         )
         if cause >= 0:
-            self._note(ARM, cause, sample)
+            self._note(state, ARM, cause, sample)
 
-    def _note(self, source: int, cause: int, sample: PoseStamped | JointState) -> None:
-        self.rejected[source, cause] += 1
-        self.refused[SOURCES[source]] = Cause(cause), sample
+    def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+        newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns)
+        self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other
 
 
 @compiled

@@ -13,11 +13,11 @@ from statistics import median
 from service.config import Settings
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, remedy
 from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
-from service.contract.records import SIDES, SOURCES, Cause
+from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
 from service.core.frame import Record
-from service.core.intake import FARTHEST_M, FASTEST_JOINT, UNIT_M
+from service.core.intake import FARTHEST_M, FASTEST_JOINT, UNIT_M, Refused
 
 WINDOW_S = 1.0  # over which rates and clocks are told
 TELL_EVERY_S = 10.0  # counts of what goes on being rejected
@@ -57,6 +57,7 @@ class _History:
         self.clocks: deque[tuple[float, float]] = deque()
         self.seen: dict[str, int] = {}
         self.told: dict[str, int] = {}
+        self.words: dict[str, str] = {}  # of the newest rejected, by cause
         self.cause = ""
 
 
@@ -86,17 +87,15 @@ class Sources:
         (since_s, before), intake = history.counts[0], controller.intake
         rejected = {cause.name.lower(): int(n) for cause, n in zip(Cause, intake.rejected[index], strict=True) if n}
         rejected |= {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
-        history.cause = next((c for c, n in rejected.items() if n != history.seen.get(c)), history.cause)
+        for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
+            refused = intake.refused.get((source, Cause[cause.upper()])) if cause != MALFORMED else None
+            history.words[cause] = arrivals.why if refused is None else in_words(refused, self._settings)
+            history.cause = cause
         history.seen = rejected
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
         silent_ms = settings.arm.silent_ms if source == "arm" else settings.hands.stale_ms
-        refused = ""
-        if history.cause == MALFORMED:
-            refused = arrivals.why
-        elif source in intake.refused:
-            refused = in_words(source, *intake.refused[source], settings, state)
         return Source(
             rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,
             age_ms=age_ms,
@@ -105,7 +104,7 @@ class Sources:
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
             cause=history.cause,
-            refused=refused,
+            refused=history.words.get(history.cause, ""),
             contested=round(float(state["contested"][index]), 3),
         )
 
@@ -113,12 +112,10 @@ class Sources:
         """Lines for the log: the first rejection of each kind at once, then counts."""
         counts = now_s - self._told_at >= TELL_EVERY_S
         for source, now in sources.items():
-            told, name = self._histories[source].told, SOURCE_NAMES[source]
+            told, words, name = self._histories[source].told, self._histories[source].words, SOURCE_NAMES[source]
             for cause in now.rejected.keys() - told.keys():
-                words = self.arrivals[KEYS[source]].why if cause == MALFORMED else now.refused
-                why = f": {words}" if words and cause in (now.cause, MALFORMED) else ""
                 told[cause] = now.rejected[cause]
-                yield f"{name}: rejected as {cause}{why}. What to do: {remedy(cause)}"
+                yield f"{name}: rejected as {cause}: {words[cause]}. What to do: {remedy(cause)}"
             more = {cause: n - told[cause] for cause, n in now.rejected.items() if n > told[cause]}
             if counts and more:
                 told |= now.rejected
@@ -134,10 +131,9 @@ def frames(settings: Settings) -> tuple[str, ...]:
     return (BASE, "") if own in ("", BASE) else (BASE, own, "")
 
 
-def in_words(source: str, cause: Cause, sample: PoseStamped | JointState, settings: Settings, state: Record) -> str:
+def in_words(refused: Refused, settings: Settings) -> str:
     """What was wrong with a sample that was rejected, and what is accepted."""
-    stamps = state["arm_stamp_ns"] if source == "arm" else state["hand_stamps_ns"][SIDES.index(source)]
-    apart_s = (sample.stamp_ns - int(stamps)) * 1e-9
+    cause, sample, newest_ns = refused
     match cause:
         case Cause.WRONG_FRAME:
             accepted = ", ".join(repr(frame) for frame in frames(settings) if frame)
@@ -145,8 +141,8 @@ def in_words(source: str, cause: Cause, sample: PoseStamped | JointState, settin
         case Cause.REPEATED:
             return f"stamp {sample.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
         case Cause.OLDER | Cause.AHEAD:
-            way = "before" if apart_s < 0 else "after"
-            return f"stamped {abs(apart_s):.3g} s {way} the newest accepted one"
+            apart_s = (sample.stamp_ns - newest_ns) * 1e-9
+            return f"stamped {abs(apart_s):.3g} s {'before' if apart_s < 0 else 'after'} the newest accepted one"
     return _of_pose(cause, sample, settings) if isinstance(sample, PoseStamped) else _of_joints(cause, sample, settings)
 
 

@@ -82,9 +82,10 @@ def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: A
     cell = Cell(skill)
     cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)))
     cell.tell((source, message))
-    found, sample = cell.controller.intake.refused[source]
-    assert (found, sample) == (cause, message)
-    assert words in in_words(source, cause, sample, cell.settings, cell.controller.state)
+    refused = cell.controller.intake.refused[source, cause]
+    assert refused[:2] == (cause, message)
+    cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
+    assert words in in_words(refused, cell.settings)
 
 
 def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:
@@ -103,6 +104,18 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
     assert "left hand: rejected in the last 11 s: 29 wrong_frame (30 in all)" in cell.log[2]
     cell.status(122.0)
     assert len(cell.log) == 3
+
+
+def test_of_two_kinds_at_once_each_is_said_in_its_own_words(skill: Skill) -> None:
+    cell = Cell(skill)
+    cell.tell(("left", pose(S, LEFT)))
+    cell.status(1.0)
+    cell.tell(("left", pose(S // 2, LEFT)))
+    cell.tell(("left", pose(S + 1, (0.5, 0.0, 0.3))))
+    cell.status(1.1)
+    older, jumped = sorted(cell.log, key=lambda line: "jumped" in line)
+    assert "rejected as older: stamped 0.5 s before" in older
+    assert "rejected as jumped: at (0.5, 0, 0.3)" in jumped
 
 
 def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
