@@ -6,6 +6,7 @@ place; what else a driver owes is in docs/hardware.md.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import threading
@@ -73,11 +74,13 @@ def command_in(sample: zenoh.Sample | None, names: tuple[str, ...]) -> tuple[Joi
 
 def main() -> None:
     """Drives a fake arm until Ctrl-C."""
-    with open_session(connect=sys.argv[1:2] or ["tcp/127.0.0.1:7447"]) as session:
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        open_session(connect=sys.argv[1:2] or ["tcp/127.0.0.1:7447"]) as session,
+    ):
         names = tuple(Client(session).ask("status")["joints"])
-        drive(
-            FakeArm(names, (0.0, 0.8, 0.0, 2.2, 0.0, -1.0, 0.0)[: len(names)]), session, "thirdhand", threading.Event()
-        )
+        arm = FakeArm(names, (0.0, 0.8, 0.0, 2.2, 0.0, -1.0, 0.0)[: len(names)])
+        drive(arm, session, "thirdhand", threading.Event())
 
 
 if __name__ == "__main__":
