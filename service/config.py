@@ -48,7 +48,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class HandSettings(Section, frozen=True):
     """How a tracker's poses become hand positions in frame `base`."""
 
-    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` and none at all are taken too
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` is taken too, as it is
     unit: Literal["m", "cm", "mm"] = "m"
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.05)] = 0.002  # each axis; a start, it is estimated

@@ -6,31 +6,70 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 
-import pytest
+import numpy as np
 from tests_paths import ROOT
 
+from service.config import Settings, robot_description
+from service.contract import incidents, requests
 from service.contract.records import Cause, Flag, Mode, Reason
+from service.core.arm import Arm
+from service.recorder.client import Scribe
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]
 MANUAL = (ROOT / "docs" / "incidents.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "word",
-    [str(member.name).lower() for kind in (Mode, Reason, Flag, Cause) for member in kind if member.name != "NONE"],
-)
-def test_each_word_of_a_status_has_its_row(word: str) -> None:
-    rows = [line for line in MANUAL.splitlines() if line.startswith(f"| `{word}` |")]
-    assert len(rows) == 1
-    assert all(len(cell.strip()) > 3 for cell in rows[0].strip("|").split("|"))
+def table(head: str) -> list[list[str]]:
+    """The cells of each row of the manual's table with this head."""
+    lines = MANUAL[MANUAL.index(f"\n| {head} |") :].lstrip().split("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_no_row_tells_of_what_is_not_there() -> None:
-    known = {str(member.name).lower() for kind in (Mode, Reason, Flag, Cause) for member in kind}
-    named = {line.split("`")[1] for line in MANUAL.splitlines() if line.startswith("| `")}
-    assert named <= known | {"malformed KEY"}
+def test_the_manual_says_of_each_word_what_the_service_says() -> None:
+    def rows(words: dict[str, incidents.Incident], *more: str) -> list[list[str]]:
+        return [[f"`{word}`", *more, told.about, told.remedy] for word, told in words.items()]
+
+    assert table("mode") == rows(incidents.MODES)
+    assert table("reason") == rows(incidents.HOLDS, "hold") + rows(incidents.FAULTS, "fault")
+    assert table("flag") == rows(incidents.FLAGS)
+    assert [[row[0].replace(" KEY", ""), *row[1:]] for row in table("counter")] == rows(incidents.REJECTIONS)
+
+
+def test_each_word_of_a_status_is_told_of_and_no_other() -> None:
+    for kind, words in ((Mode, incidents.MODES), (Reason, incidents.REASONS), (Flag, incidents.FLAGS)):
+        assert words.keys() == {str(member.name).lower() for member in kind if member.name != "NONE"}
+    assert incidents.REJECTIONS.keys() == {str(cause.name).lower() for cause in Cause} | {incidents.MALFORMED}
+
+
+def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
+    def named(cells: Iterable[str]) -> list[str]:
+        return sorted(word for cell in cells for word in re.findall(r"`(\w+)`", cell))
+
+    assert named(row[0] for row in table("field")) == sorted(requests.Status.__struct_fields__)
+    assert named(row[0] for row in table("of a source")) == sorted(requests.Source.__struct_fields__)
+    scribe = next(row[1] for row in table("field") if row[0] == "`scribe`")
+    assert named([scribe]) == sorted(Scribe(Settings()).status())
+    fields = {*requests.Status.__struct_fields__, *requests.Source.__struct_fields__, *named([scribe])}
+    told = re.findall(r"`(\w+)`(?:, (?:under|in) `(\w+)`| in the status|, under `rejected`)", MANUAL)
+    words = "".join(told.about + told.remedy for told in incidents.EVERY.values())
+    told += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
+    assert {word for pair in told for word in pair if word} <= fields
+
+
+def test_the_table_of_signs_is_the_arms() -> None:
+    text = (ROOT / "docs" / "hardware.md").read_text(encoding="utf-8")
+    arm, names = Arm(Settings(), robot_description(Settings())), Settings().joints.names
+    begin = np.array([0.0, 0.5, 0.0, 1.5, 0.0, -1.0, 0.0])
+    told = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)
+    assert [row[0] for row in told] == list(names)
+    for i, (_, *said) in enumerate(told):
+        moved = arm.at(begin + 0.3 * (np.arange(7) == i)).position - arm.at(begin).position
+        np.testing.assert_allclose(1000 * moved, [float(v) for v in said], atol=0.51)
+    assert "({:.3f}, {:.3f}, {:.3f}) m".format(*arm.at(begin).position) in text
+    assert f"{arm.at(np.zeros(7)).position[2]:.3f} m above" in text
 
 
 def rows_of_faults() -> list[list[str]]:

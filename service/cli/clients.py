@@ -1,9 +1,8 @@
-"""`thirdhand via-points`, `status`, `hold`, `resume` and `reset`: requests to a running daemon."""
+"""`thirdhand via-points`, `hold`, `resume` and `reset`: requests to a running daemon."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.contract.incidents import in_brief, remedy
 
 
 def via_points(args: argparse.Namespace) -> int:
@@ -43,48 +43,13 @@ def _add(args: argparse.Namespace) -> Any:
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
 
 
-def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers."""
-    now = ask(args, "status")
-    if args.json:
-        print(json.dumps(now, indent=2))
-        return 0
-    begun = now["tick"] >= 0
-    granted = ("real time" if now["realtime"] else "ordinary: real time was not granted") + (
-        ", memory locked" if now["memory_locked"] else ", memory not locked"
-    )
-    near = f"{100 * now['hand_distance_m']:.1f} cm to a hand, toward which {now['hand_limit_m_s']:.2f} m/s are allowed"
-    rows = {
-        "mode": now["mode"]
-        + (f" ({now['reason']})" if now["reason"] else "")
-        + (f"  {', '.join(now['flags'])}" if now["flags"] else "")
-        + ("" if begun else "  it starts: nothing has been decided yet"),
-        "skill": f"{now['skill']}; via-points: {', '.join(now['places']) or 'none'}",
-        "loop": f"{now['rate_hz']:.2f} Hz, tick {now['tick']}, {now['missed']} missed" if begun else "no tick yet",
-        "scheduling": granted if begun else "not known yet",
-        "hands": ", ".join(f"{side} {age:.0f} ms old" for side, age in now["hand_age_ms"].items()) or "none seen",
-        "nearest": near if now["hand_age_ms"] else "no hand seen",
-        "rejected": ", ".join(f"{count} {cause}" for cause, count in now["rejected"].items()) or "none",
-        "recording": now["scribe"].get("recording") or f"none ({now['scribe'].get('state', 'off')})",
-        **({"lost": f"{now['scribe']['lost']} ticks are not recorded"} if now["scribe"].get("lost") else {}),
-        **({"trouble": "; ".join(now["scribe"]["errors"])} if now["scribe"].get("errors") else {}),
-    }
-    for name in ("lateness_us", "work_us", "latency_ms"):
-        label, unit = name.rsplit("_", 1)
-        values, digits, unit = now[name], 1 if unit == "us" else 2, unit.replace("us", "µs")
-        rows[label] = (
-            ", ".join(f"{key} {values[key]:.{digits}f}" for key in ("p50", "p99", "max")) + f" {unit}"
-            if values["max"]
-            else "none yet"
-        )
-    for name, text in rows.items():
-        print(f"{name:<10} {text}")
-    return 0
-
-
 def hold(args: argparse.Namespace) -> int:
-    """Exit code 0 once the arm is told to stop, resume or reset."""
-    print(f"{args.command} in force since tick {ask(args, args.command)['tick']}")
+    """Exit code 0 once the arm is told to stop, resume or reset; tells the mode that resulted."""
+    reply = ask(args, args.command)
+    mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
+    print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
+    if (mode == "fault" or (args.command == "resume" and mode == "hold")) and remedy(reason):
+        print(f"What to do: {remedy(reason)}")
     return 0
 
 

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
-from service.cli.usage import UsageError, check_cell
+from service.cli.usage import Parser, UsageError, check_cell
 from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
@@ -31,7 +31,8 @@ RUN_BY = {
     "replay": "recordings",
     "learn": "recordings",
     "via-points": "clients",
-    "status": "clients",
+    "status": "status",
+    "doctor": "doctor",
     "hold": "clients",
     "resume": "clients",
     "reset": "clients",
@@ -45,7 +46,7 @@ FORMATTER = argparse.RawDescriptionHelpFormatter
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    top = argparse.ArgumentParser(
+    top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
         epilog="example: thirdhand demo",
@@ -241,7 +242,13 @@ def parser() -> argparse.ArgumentParser:
     )
 
     c = client("status", "What a running daemon does.", "thirdhand status --json")
-    c.add_argument("--json", action="store_true", help="print what <cell>/status carries")
+    c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")
+    c.add_argument("--watch", action="store_true", help="hands, tool, target and distances as they change")
+    c = client(
+        "doctor", "Looks at a running cell, and says what is wrong and what to do. Then exit 1.", "thirdhand doctor"
+    )
+    c.add_argument("--json", action="store_true", help="print the findings as JSON")
+    c.add_argument("--seconds", metavar="S", type=float, default=2.0, help="to look for (default: %(default)g)")
     client("hold", "Stops the arm, which then stays.", "thirdhand hold")
     client("resume", "Ends an operator's hold.", "thirdhand resume")
     client("reset", "Ends a fault.", "thirdhand reset")

@@ -4,10 +4,13 @@ files are, and free ports.
 
 from __future__ import annotations
 
+import argparse
+import difflib
 import os
+import re
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from service.core.skill import Skill
@@ -18,6 +21,17 @@ SHIPPED_SKILL = "soldering.npz"
 
 class UsageError(ValueError):
     """A command line that cannot be meant."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that suggests the nearest word where one is not known."""
+
+    def error(self, message: str) -> NoReturn:
+        """Prints usage and message, and exits with code 2."""
+        found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        words = re.findall(r"[\w-]+", found[2]) if found else []
+        near = difflib.get_close_matches(found[1], words, n=1, cutoff=0.5) if found else []
+        super().error(message + (f"; did you mean {near[0]}?" if near else ""))
 
 
 def check_cell(name: str) -> None:

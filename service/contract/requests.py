@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 
 from service.contract.explain import ExplainedError, explained
+from service.contract.messages import Vector3
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 TOLERANCE_M = 0.05  # a reference point nearer to a via-point gives way, unless said otherwise
@@ -86,11 +87,16 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     """The answer to a request: the tick from which it holds, and the via-points in force.
 
     `warnings` say which of them are missed by more than 5 mm, and which others were moved by more.
+    Of hold, resume and reset: the mode that resulted, its reason, and a note where there was
+    nothing to do.
     """
 
     tick: int
     points: tuple[ViaPointInForce, ...] | None = None
     warnings: tuple[str, ...] = ()
+    mode: str = ""
+    reason: str = ""
+    note: str = ""
 
 
 class RequestError(ExplainedError, ValueError):
@@ -125,6 +131,20 @@ class Percentiles(msgspec.Struct, frozen=True):
     max: float = 0.0
 
 
+class Source(msgspec.Struct, frozen=True, kw_only=True):
+    """What comes in of one hand, or of the arm."""
+
+    rate_hz: float = 0.0  # messages in the last second, accepted or not; at most one a tick is taken
+    age_ms: float | None = None  # of the newest accepted sample; None: none yet
+    fresh: bool = False  # whether that is young enough to go by
+    clock_ms: float | None = None  # stamp to arrival, median of the last second; below 0: a clock that is ahead
+    frame: str = ""  # that the newest message names
+    rejected: dict[str, int] = {}  # samples by cause, `malformed` among them
+    cause: str = ""  # of the newest one rejected
+    refused: str = ""  # that one in words: what came, and what is accepted
+    contested: float = 0.0  # share of the last second's samples that contradict the rest
+
+
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """What `<cell>/status` carries."""
 
@@ -149,3 +169,18 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     scribe: dict[str, Any]
     endpoints: tuple[str, ...]
     version: str
+    because: str = ""  # the reason in words, with its figures
+    remedy: str = ""  # what to do about it
+    time_ns: int = 0  # when it was made, by the daemon's clock
+    sources: dict[str, Source] = {}  # by `left`, `right` and, where it is measured, `arm`
+    frames: tuple[str, ...] = ()  # in which a hand's pose may be; empty: as the tracker's
+    joints: tuple[str, ...] = ()  # their names, in order
+    hands_m: dict[str, Vector3] = {}  # as estimated at this tick, frame `base`; those that are seen
+    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of where each is known
+    tool_m: Vector3 | None = None  # as commanded; None before the first tick
+    target_m: Vector3 | None = None  # None where a hand is not seen
+    setpoint_m: Vector3 | None = None
+    std_m: float | None = None  # of the target, root mean square over the axes
+    deviation_m: float | None = None  # of the hands from what the skill knows
+    threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
+    command_heard: bool = True  # whether anybody listens to `joints/command`

@@ -83,7 +83,7 @@ class Controller:
         self._state = copied(start_state(settings, skill) if state is None else state)
         self._memory = as_array(self._state)
         self._layout = frame_layout(len(settings.joints.names))
-        self._intake = Intake(settings)
+        self.intake = self._intake = Intake(settings)
         self._setpoint = SetpointGenerator(settings)
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
@@ -95,6 +95,7 @@ class Controller:
         self._orientation = np.ascontiguousarray(skill.orientation)
         self._nothing = np.zeros((3, 3))
         self._here: Kinematics | None = None  # of the joints asked about last
+        self.measured = (0.0, 0.0)  # how far the arm is off [rad], the tool's speed [m/s]; at the fault, in one
 
     @property
     def state(self) -> Record:
@@ -237,6 +238,7 @@ class Controller:
             state["arm_ready"] = READY
         here = self._arm_at(state["joints"][0])  # no farther than that error from where it is measured
         error, speed = measured_error(here.joints, here.tasks, state["measured"], state["measured_velocities"])
+        self.measured = error, speed
         if error > arm.fault_error_rad:
             return Reason.ARM_ERROR
         if speed <= self._settings.tool.fault_speed:
@@ -303,7 +305,9 @@ class Controller:
             moved, limited = (stop, True) if stopped else (moved, limited)
         if self._comes_to(moved) > fastest:
             moved, limited = self._limiter.stop(q, dq, ddq), True
-            if self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0] > fastest:
+            speed = self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0]
+            if speed > fastest:
+                self.measured = self.measured[0], speed
                 state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
         return limited, stopped

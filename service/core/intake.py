@@ -5,6 +5,7 @@ the tick.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +43,20 @@ def rest_ticks(settings: Settings) -> int:
     return math.ceil(round(REST_S / settings.period_s, 6))
 
 
+class Refused(NamedTuple):
+    """A sample that was rejected, and the stamp [ns] of the newest one accepted before."""
+
+    cause: Cause
+    sample: PoseStamped | JointState
+    newest_ns: int
+
+
 class Intake:
-    """Hand and arm samples into the state: each hand's estimate, the arm's newest sample."""
+    """Hand and arm samples into the state: each hand's estimate, the arm's newest sample.
+
+    For people only, no part of the state: `rejected` counts (sources, causes) what this intake
+    rejected, and `refused` has the newest of it, by source and cause.
+    """
 
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands
@@ -55,7 +68,12 @@ class Intake:
         limits = np.array([settings.joints.lower, settings.joints.upper])
         self._plausible = limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]])
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
-        self._frame = np.column_stack((UNIT_M[hands.unit] * axes, origin))
+        self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
+        self._in_base = np.eye(3, 4)
+        # a tracker with a frame of its own: what says that it is in base has been mapped already
+        self._maps_base = hands.frame in ("", BASE)
+        self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
+        self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
     def begin(self, state: Record) -> None:
@@ -94,17 +112,20 @@ class Intake:
         """One hand's sample filtered in, or counted as rejected."""
         if sample.frame_id not in self._frames:
             state["rejected"][Cause.WRONG_FRAME] += 1
+            self._note(state, side, Cause.WRONG_FRAME, sample)
             return
-        _take_hand(
+        cause = _take_hand(
             as_array(state),
             side,
             sample.stamp_ns,
             sample.position,
             sample.orientation,
-            self._frame,
+            self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
             self._stale_ticks,
             self._period_s,
         )
+        if cause >= 0:
+            self._note(state, side, cause, sample)
 
     def take_arm(self, state: Record, sample: JointState) -> None:
         """The arm's sample into the state, or counted as rejected."""
@@ -112,8 +133,9 @@ class Intake:
             position, velocity = in_order(sample, self._names)
         except WireError:
             state["rejected"][Cause.INCOMPLETE] += 1
+            self._note(state, ARM, Cause.INCOMPLETE, sample)
             return
-        _take_arm(
+        cause = _take_arm(
             as_array(state),
             sample.stamp_ns,
             np.array(position),
@@ -122,6 +144,13 @@ class Intake:
             self._silent_ticks,
             self._period_s,
         )
+        if cause >= 0:
+            self._note(state, ARM, cause, sample)
+
+    def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+        newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns)
+        self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other
 
 
 @compiled
@@ -133,14 +162,16 @@ def _take_arm(
     plausible: Vector,
     silent_ticks: int,
     period_s: float,
-) -> None:
-    """`Intake.take_arm`, with the least and the greatest plausible joints (2, J) [rad]."""
+) -> int:
+    """`Intake.take_arm`, with the least and the greatest plausible joints (2, J) [rad]: the cause
+    for which it was rejected, or -1.
+    """
     state = states[0]
     passed = state.tick - state.arm_tick
     fresh = state.arm_tick >= 0 and passed < silent_ticks
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
-        return
+        return NOT_FINITE
     near, off, moved = True, 0.0, 0.0
     for i in range(len(position)):
         near = near and plausible[0, i] <= position[i] <= plausible[1, i] and abs(velocity[i]) <= FASTEST_JOINT
@@ -159,9 +190,10 @@ def _take_arm(
         state.rest_tick = state.tick
     if cause >= 0:
         state.rejected[cause] += 1
-        return
+        return cause
     state.measured[:], state.measured_velocities[:] = position, velocity
     state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
+    return -1
 
 
 @compiled
@@ -174,8 +206,10 @@ def _take_hand(
     frame: Vector,
     stale_ticks: int,
     period_s: float,
-) -> None:
-    """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base."""
+) -> int:
+    """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base: the cause for
+    which it was rejected, or -1.
+    """
     state, in_base, norm, far = states[0], np.empty(3), 0.0, 0.0
     for k in range(4):
         norm += turn[k] * turn[k]
@@ -202,8 +236,9 @@ def _take_hand(
             cause = JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
-        return
+        return cause
     take(states, side, in_base, since * period_s, jumped or not fresh)
     state.doubts[side, 2] = 0
     state.hand_stamps_ns[side] = stamp_ns
     state.hand_ticks[side] = state.tick
+    return -1

@@ -132,6 +132,12 @@ class Skill:
         return plain.through(*bent(plain.at_rest, plain.corners_of_hands(), others))
 
     @cached_property
+    def demonstrated(self) -> Vector:
+        """Least and greatest corner (2, 2, 3) of where it knows the left and the right hand [m]."""
+        hands = self.hands.reshape(-1, 2, 3)
+        return np.stack([hands.min(axis=0), hands.max(axis=0)])
+
+    @cached_property
     def digest(self) -> bytes:
         """16 bytes that tell this skill from any other."""
         return hashlib.blake2b(self.file, digest_size=16).digest()

@@ -227,6 +227,7 @@ class Scribe:
             "rrd": report.rrd,
             "live": report.live,
             "errors": list(self._errors),
+            "free_mb": report.free_mb,
         }
 
     def close(self, timeout_s: float = 20.0) -> str:

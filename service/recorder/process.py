@@ -150,6 +150,7 @@ class ScribeProcess:
             lost=segments.lost,
             unmarked=segments.unmarked,
             errors=tuple(self._errors),
+            free_mb=segments.free_mb(),
         )
         with contextlib.suppress(OSError):
             self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)

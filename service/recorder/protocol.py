@@ -118,3 +118,4 @@ class Report(msgspec.Struct, frozen=True):
     lost: int = 0
     unmarked: int = 0
     errors: tuple[str, ...] = ()  # new ones
+    free_mb: float | None = None  # room left where it writes; None: it writes nothing

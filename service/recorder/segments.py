@@ -103,6 +103,12 @@ class Segments:
             _discard(path)
             return None
 
+    def free_mb(self) -> float | None:
+        """Room left where the recording is written; None where none is."""
+        with contextlib.suppress(OSError):
+            return None if self.path is None else round(shutil.disk_usage(_there(self.path)).free / 1e6)
+        return None
+
     def _failed(self, path: Path, error: OSError) -> None:
         self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         cause = error.errno or str(error)

@@ -10,7 +10,7 @@ import logging
 import signal
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -23,8 +23,9 @@ from service.client import endpoints, open_session
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
+from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment, WireError
-from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
+from service.contract.records import STAGES, Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
 from service.core.controller import Controller, rehearse, run
@@ -48,6 +49,8 @@ from service.shell.clock import (
 from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
+from service.shell.sources import Sources
+from service.shell.survey import Survey
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
@@ -57,7 +60,7 @@ STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SLOWEST_START_S = 120.0  # of the workshop, on a machine that is busy
 LONG_START_S = 3.0
 MOST_NOTES = 100  # a second
-LONGEST_LATENCY_MS = 10_000.0  # beyond it, stamps tell of clocks
+LONGEST_LATENCY_MS = 1000.0  # beyond it, stamps tell of clocks
 
 
 class LoopError(ExplainedError, RuntimeError):
@@ -103,7 +106,8 @@ class Daemon:
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
-        self._malformed: Counter[str] = Counter()
+        self._sources = Sources(settings)
+        self._failure = ""  # of the service, the last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._faults: deque[Event] = deque()
@@ -139,7 +143,7 @@ class Daemon:
             workshop=workshop,
             skills=skills,
             status=lambda: self._status,
-            tick=lambda: int(self._frame["tick"]),
+            frame=lambda: self._frame,
             note=self.note,
             keep=scribe.keep,
             failed=self._fail,
@@ -192,6 +196,7 @@ class Daemon:
 
     def _fail(self, what: str) -> None:
         """Says what of the service failed; the next tick is at fault for it."""
+        self._failure = what
         self._faults.append(order("fault", what))
         self._say(what)
 
@@ -248,14 +253,16 @@ class Daemon:
         sample = subscriber.try_recv()
         if sample is None:
             return None
+        arrivals = self._sources.arrivals[channel.key]
         try:
             if len(sample.payload) > LARGEST_MESSAGE:
-                raise WireError(f"{len(sample.payload)} bytes")
+                raise WireError(f"{len(sample.payload)} bytes, at most {LARGEST_MESSAGE} accepted")
             payload = sample.payload.to_bytes()
             event = self._seen[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
+            arrivals.take(event.value, time.time_ns())
             return event
-        except WireError:
-            self._malformed[channel.key] += 1
+        except WireError as error:
+            arrivals.refuse(str(error))
             return None
 
     def _lap(self, stage: str) -> None:
@@ -307,42 +314,27 @@ class Daemon:
                 if error_text not in told:
                     told.append(error_text)
                     log.warning("%s", error_text)
+            for line in self._sources.news(status.sources, time.monotonic()):
+                log.warning("%s", line)
             if status.tick >= 0 and (status.mode, status.reason) != said:
                 said = (status.mode, status.reason)
-                log.info(f"{status.mode}{f' ({status.reason})' if status.reason else ''} at tick {status.tick}")
+                log.info("%s at tick %d%s", in_brief(*said), status.tick, in_full(status.because, status.remedy))
 
     def _survey(self) -> Status:
         """The status at this moment."""
-        frame, clock = self._frame, self._clock
-        reason = Reason(int(frame["reason"]))
-        skill = self._controller.skill
-        rejected = {
-            cause.name.lower(): int(count) for cause, count in zip(Cause, frame["rejected"], strict=True) if count
-        }
-        return Status(
-            cell=self._settings.cell,
-            mode=Mode(int(frame["mode"])).name.lower(),
-            reason="" if reason is Reason.NONE else reason.name.lower(),
-            flags=tuple(str(flag.name).lower() for flag in Flag(int(frame["flags"]))),
-            tick=int(frame["tick"]),
+        frame, state, clock = self._frame, self._controller.state, self._clock
+        sources = self._sources.survey(self._controller, state, time.monotonic())
+        return Survey(frame, self._controller, state, sources, self._settings, self._failure).status(
+            time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
             realtime=self._granted.realtime,
             memory_locked=self._granted.locked,
-            skill=skill.name,
-            places=tuple(point.name for point in skill.via_points),
-            rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},
-            hand_age_ms={
-                side: round(float(age) * self._settings.period_s * 1e3, 1)
-                for side, age in zip(SIDES, frame["hand_ages"], strict=True)
-                if age >= 0
-            },
-            hand_distance_m=round(float(frame["hand_distance"]), 4),
-            hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             lateness_us=self._lateness.percentiles(),
             work_us=self._work.percentiles(),
             latency_ms=self._latency.percentiles(),
             scribe=self._scribe.status(),
+            command_heard=self._publishers["joints/command"].matching_status.matching,  # type: ignore[attr-defined]
             endpoints=self.endpoints,
             version=self._version,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,7 +26,7 @@ from service.contract.requests import (
     ViaPoint,
     encode_json,
 )
-from service.core.frame import Event, order
+from service.core.frame import Event, Frame, order
 from service.core.skill import Skill
 from service.core.workspace import is_reachable
 from service.learning.skill_file import SkillError
@@ -33,9 +34,11 @@ from service.learning.via_points import in_force, misgivings, points_made_of
 from service.shell import watch
 from service.shell.clock import run_beside_real_time
 from service.shell.saved_via_points import SavedViaPoints
+from service.shell.survey import outcome
 from service.shell.workshop import Workshop
 
 ADOPTION_TIMEOUT_S = 2.0
+DECIDED_S = 0.001  # between looks whether the tick that took a request has been decided
 MOST_POINTS = 400  # that all via-points come to, with their neighbours
 MOST_WAITING = 16  # requests in a line
 LONGEST_LIST = 100  # bytes
@@ -119,7 +122,7 @@ class Requests:
         workshop: Workshop,
         skills: Path,
         status: Callable[[], bytes],
-        tick: Callable[[], int],
+        frame: Callable[[], Frame],
         note: Callable[[str], None],
         keep: Callable[[bytes], object],
         failed: Callable[[str], None],
@@ -130,7 +133,7 @@ class Requests:
         self._workshop = workshop
         self._skills = skills
         self._status = status
-        self._tick = tick
+        self._frame = frame
         self._note = note
         self._keep = keep
         self._failed = failed
@@ -199,12 +202,28 @@ class Requests:
             case SkillRequest(name):
                 return self._load(name)
             case List():
-                return Reply(self._tick(), self._in_force)
+                return Reply(int(self._frame()["tick"]), self._in_force)
             case Add() | Remove() | Clear():
                 return self._teach(request)
             case Nothing():
-                return Reply(self._through_the_loop(order(suffix)))
+                return self._order(suffix)
         raise RequestError(f"nothing is done with a request on {suffix}")
+
+    def _order(self, suffix: str) -> Reply:
+        """Hold, resume or reset, with the mode that resulted."""
+        before, _ = outcome(self._frame())
+        tick, end = self._through_the_loop(order(suffix)), time.monotonic() + ADOPTION_TIMEOUT_S
+        while int(self._frame()["tick"]) < tick and time.monotonic() < end:
+            time.sleep(DECIDED_S)
+        mode, reason = outcome(self._frame())
+        note = ""
+        if suffix == "reset" and before != "fault":
+            note = "there was no fault: nothing was reset"
+        elif suffix == "resume" and before == "follow":
+            note = "there was no hold to end"
+        elif suffix == "resume" and mode == "fault":
+            note = "a fault is ended by reset, not by resume"
+        return Reply(tick, mode=mode, reason=reason, note=note)
 
     def _through_the_loop(self, event: Event) -> int:
         pending = Pending(event)

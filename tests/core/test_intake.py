@@ -153,6 +153,40 @@ def test_a_hand_in_a_frame_that_nobody_configured_is_refused(frame: str, configu
     assert hands.rejected() == ({} if taken else {Cause.WRONG_FRAME: 1})
 
 
+@pytest.mark.parametrize(
+    ("configured", "frame", "mapped"),
+    [
+        ("optitrack", "optitrack", True),
+        ("optitrack", "", True),
+        ("optitrack", "base", False),
+        ("base", "base", True),
+        ("", "base", True),
+        ("", "", True),
+    ],
+)
+def test_a_pose_in_base_is_not_mapped_again_where_the_tracker_has_a_frame_of_its_own(
+    configured: str, frame: str, mapped: bool
+) -> None:
+    hands = Hands(HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT)))
+    hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
+    np.testing.assert_allclose(hands.state["hands"][LEFT, 0], (0.5004, 0.0002, 0.0001) if mapped else (0.4, 0.2, 0.1))
+
+
+def test_what_is_rejected_is_counted_by_source_too() -> None:
+    hands = Hands()
+    hands.hand(1, (math.nan, 0.0, 0.0), side=RIGHT)
+    hands.arm(1, names=("other",), position=(0.0,))
+    hands.arm(2, position=(90.0,) * 7)
+    counted = {(source, Cause(cause)) for source, cause in zip(*np.nonzero(hands.intake.rejected), strict=True)}
+    assert counted == {(RIGHT, Cause.NOT_FINITE), (2, Cause.INCOMPLETE), (2, Cause.OUT_OF_RANGE)}
+    np.testing.assert_array_equal(hands.intake.rejected.sum(axis=0), hands.state["rejected"])
+    assert hands.intake.refused.keys() == {
+        ("right", Cause.NOT_FINITE),
+        ("arm", Cause.INCOMPLETE),
+        ("arm", Cause.OUT_OF_RANGE),
+    }
+
+
 # --- stamps and ages -----------------------------------------------------------------------------
 
 

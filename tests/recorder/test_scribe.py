@@ -5,6 +5,7 @@ to it the loop does not notice.
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import statistics
@@ -71,6 +72,7 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
         one.note("requests", "via_points add handover", at_ns(20))
         status = one.status()
         assert (status["alive"], status["sent"], status["lost"], status["errors"]) == (True, 200, 0, [])
+        assert status["free_mb"] == pytest.approx(shutil.disk_usage(tmp_path).free / 1e6, rel=0.2)
     recording = Recording.open(status["recording"])
     first, *steps = recording.steps()
     assert Path(status["recording"]).name.startswith("hall-bench-1-2")

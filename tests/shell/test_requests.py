@@ -19,6 +19,7 @@ import zenoh
 from service.client import Client, RefusedError, endpoints, open_session
 from service.config import Files, Settings
 from service.contract import channels, requests
+from service.contract.records import Mode, Reason
 from service.core.frame import Event
 from service.core.skill import Skill
 from service.learning.skill_file import with_file
@@ -46,7 +47,7 @@ class Cell:
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
-        tell = {"status": lambda: requests.encode_json(self.status()), "tick": lambda: self._tick}
+        tell = {"status": lambda: requests.encode_json(self.status()), "frame": self.frame}
         tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
         self.requests = Requests(near, self.settings, skill, workshop=workshop, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
@@ -72,6 +73,9 @@ class Cell:
         words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}
         lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
         return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
+
+    def frame(self) -> dict[str, int]:
+        return {"tick": self._tick, "mode": Mode.HOLD, "reason": Reason.NO_HANDS}
 
     def _drain(self) -> None:
         while not self._end.wait(0.0005):

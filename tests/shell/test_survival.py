@@ -238,14 +238,13 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
     with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
         told = daemon.client.status()
         said = thirdhand("status", "--connect", daemon.endpoint)
-        assert (told["tick"], told["mode"], told["reason"]) == (-1, "hold", "arm_not_ready")
+        assert (told["tick"], told["mode"], told["reason"], told["remedy"]) == (-1, "hold", "", "")
         assert (told["hand_age_ms"], told["hand_distance_m"]) == ({}, 3.0)
-        rows = {line[:10].strip(): line[11:] for line in said.stdout.splitlines()}
-        assert rows["mode"] == "hold (arm_not_ready)  it starts: nothing has been decided yet"
-        assert (rows["hands"], rows["nearest"]) == ("none seen", "no hand seen")
-        assert (rows["loop"], rows["scheduling"]) == ("no tick yet", "not known yet")
+        rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
+        assert rows["mode"] == "starting: nothing has been decided yet"
+        assert rows.keys() == {"mode", "skill", "listening"}
         daemon.until(lambda status: status["tick"] >= 0)
-        assert "no tick yet" not in thirdhand("status", "--connect", daemon.endpoint).stdout
+        assert "starting" not in thirdhand("status", "--connect", daemon.endpoint).stdout
 
 
 def test_no_child_outlives_a_daemon_that_is_killed(tmp_path: Path) -> None:

@@ -1,0 +1,199 @@
+"""`thirdhand status`: what a running daemon does, once or live."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Generator, Iterator
+
+import msgspec
+import zenoh
+from zenoh.handlers import RingChannel
+
+from service import interrupt
+from service.cli.clients import ask
+from service.cli.usage import CONNECT_TIMEOUT_S
+from service.client import UnreachableError, open_session
+from service.contract import channels
+from service.contract.incidents import SOURCE_NAMES, in_brief
+from service.contract.records import SIDES
+from service.contract.requests import Source, Status
+
+LOOK_S, LINE_S, SILENT_S = 0.02, 0.5, 2.0
+LATE_MS, AHEAD_MS = 1000.0, -5.0  # beyond these a sample's stamp tells of clocks
+
+
+def status(args: argparse.Namespace) -> int:
+    """Exit code 0 if a daemon answers; with --watch 1 once it does no more."""
+    if args.watch:
+        return _watch(args)
+    now = msgspec.convert(ask(args, "status"), Status)
+    if args.json:
+        print(msgspec.json.format(msgspec.json.encode(now)).decode())
+        return 0
+    for name, text in rows(now).items():
+        print(f"{name:<11} {text}")
+    return 0
+
+
+def _watch(args: argparse.Namespace) -> int:
+    with open_session(
+        connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
+    ) as session:
+        told = heard(session, args.cell)
+        if args.json:
+            for now in told:
+                print(msgspec.json.encode(now).decode(), flush=True)
+        elif sys.stdout.isatty():
+            _draw(told)
+        else:
+            last, said = 0.0, ("", "")
+            for now in told:
+                if time.monotonic() - last >= LINE_S or (now.mode, now.reason) != said:
+                    last, said = time.monotonic(), (now.mode, now.reason)
+                    print(line(now), flush=True)
+    return 1
+
+
+def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
+    """Each status as it comes. Raises UnreachableError once none does."""
+    key = channels.key(cell, "status")
+    with session.declare_subscriber(key, RingChannel(1)) as subscriber:
+        heard = time.monotonic()
+        while time.monotonic() - heard < SILENT_S:
+            if (sample := subscriber.try_recv()) is None:
+                time.sleep(LOOK_S)
+                continue
+            heard = time.monotonic()
+            yield msgspec.json.decode(sample.payload.to_bytes(), type=Status)
+    raise UnreachableError(f"nothing comes on {key}: has the daemon ended, and is the cell's name right?")
+
+
+def _draw(told: Iterator[Status]) -> None:
+    """Draws each status over the one before."""
+    from rich.live import Live  # most calls draw nothing
+    from rich.table import Table
+    from rich.text import Text
+
+    colours = {"follow": "green", "hold": "yellow", "fault": "bold red"}
+    with interrupt.put_away_first(), Live(refresh_per_second=10) as live:  # which hides the cursor
+        for now in told:
+            table = Table.grid(padding=(0, 2))
+            for name, text in rows(now).items():
+                table.add_row(Text(name, style="dim"), Text(text, style=colours[now.mode] if name == "mode" else ""))
+            live.update(table)
+
+
+def line(now: Status) -> str:
+    """A status in one line."""
+    parts = [f"tick {now.tick}", in_brief(now.mode, now.reason) + "".join(f" +{flag}" for flag in now.flags)]
+    if now.tick < 0:
+        return "starting: nothing has been decided yet"
+    parts += [f"{side} {_where(now, side)}" for side in SIDES]
+    parts.append(f"tool {_at(now.tool_m)}")
+    if now.target_m is not None:
+        parts.append(f"target {_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm")
+    parts.append(_nearest(now))
+    return " | ".join(parts)
+
+
+def rows(now: Status) -> dict[str, str]:
+    """A status as names and texts."""
+    if now.tick < 0:
+        return {
+            "mode": "starting: nothing has been decided yet",
+            "skill": now.skill,
+            "listening": ", ".join(now.endpoints) or "nowhere, it connects",
+        }
+    scribe = now.scribe
+    granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
+        ", memory locked" if now.memory_locked else ", memory not locked"
+    )
+    found = {
+        "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
+        "because": now.because,
+        "what to do": now.remedy,
+        "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
+        "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
+        "scheduling": granted,
+        "left hand": _where(now, "left"),
+        "right hand": _where(now, "right"),
+        "nearest": _nearest(now),
+        "arm": _arm(now),
+        "tool": _at(now.tool_m),
+        "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
+        if now.target_m is not None
+        else "none: it needs both hands",
+        "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
+        or "none",
+        "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
+        "lost": f"{scribe['lost']} ticks are not recorded" if scribe.get("lost") else "",
+        "trouble": "; ".join(scribe.get("errors") or ()),
+    }
+    for name in ("lateness_us", "work_us", "latency_ms"):
+        label, unit = name.rsplit("_", 1)
+        values, digits = getattr(now, name), 1 if unit == "us" else 2
+        found[label] = (
+            f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f} "
+            + unit.replace("us", "µs")
+            if values.max
+            else "none yet"
+        )
+    if clocks := differing_clocks(now):
+        found["latency"] = f"unknown: {clocks}"
+    return {name: text for name, text in found.items() if text}
+
+
+def differing_clocks(now: Status) -> str:
+    """Whose clocks differ so much that no latency can be told, and by how much."""
+    told = []
+    for side in SIDES:
+        apart_ms = getattr(now.sources.get(side), "clock_ms", None)
+        if apart_ms is not None and not AHEAD_MS <= apart_ms <= LATE_MS:
+            way = "ahead of" if apart_ms < 0 else "behind"
+            told.append(f"the {SOURCE_NAMES[side]}'s stamps are {abs(apart_ms) / 1000:.3g} s {way} this daemon's clock")
+    return ", ".join(told)
+
+
+def _at(point: tuple[float, float, float] | None) -> str:
+    return "unknown" if point is None else "({:.3f}, {:.3f}, {:.3f}) m".format(*point)
+
+
+def _where(now: Status, side: str) -> str:
+    source = now.sources.get(side, Source())
+    if source.age_ms is None:
+        return "not seen yet" + (f"; {source.rate_hz:.0f} messages/s are rejected" if source.rate_hz else "")
+    if not source.fresh:
+        return f"not seen for {source.age_ms / 1000:.1f} s"
+    return f"{_at(now.hands_m.get(side))}, {source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
+
+
+def _nearest(now: Status) -> str:
+    fresh = [side for side in SIDES if now.sources.get(side, Source()).fresh]
+    if not fresh:
+        return "no hand is seen"
+    near = f"{100 * now.hand_distance_m:.1f} cm to a hand, toward which {now.hand_limit_m_s:.2f} m/s are allowed"
+    gone = [side for side in now.hand_age_ms if side not in fresh]
+    return near + (f"; the {gone[0]} one counts where it was last seen" if gone else "")
+
+
+def _arm(now: Status) -> str:
+    source = now.sources.get("arm")
+    if source is None:
+        return "assumed, not measured"
+    heard = "commands are heard" if now.command_heard else "nobody listens to commands"
+    if source.age_ms is None:
+        return "nothing came yet" + (f"; {source.rate_hz:.0f} messages/s are rejected" if source.rate_hz else "")
+    age = f"{source.age_ms:.0f} ms old" if source.fresh else f"silent for {source.age_ms / 1000:.1f} s"
+    return f"{source.rate_hz:.0f} Hz, {age}, {heard}"
+
+
+def _off(now: Status) -> str:
+    assert now.tool_m is not None
+    assert now.target_m is not None
+    return f"{1000 * sum((a - b) ** 2 for a, b in zip(now.tool_m, now.target_m, strict=True)) ** 0.5:.1f} mm"
+
+
+def _rejected(name: str, source: Source) -> str:
+    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items())

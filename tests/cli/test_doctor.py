@@ -1,0 +1,178 @@
+"""A cell with one's own arm and tracker, as its user meets it: the driver template follows and
+brakes by itself, and `doctor`, `status --watch` and the log say what is wrong.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from cell import LEFT, Daemon, Tracker
+from tests_paths import ROOT
+
+from service.cli.main import main
+from service.client import endpoints, open_session
+from service.config import Settings
+from service.contract import cdr, messages
+from service.launch import launched
+
+NEAR_LEFT = (0.95, -0.30, 0.08)  # a hand that moves a little: an arm that is late is not far off
+PATIENT = """# Threads of a busy test may be late.
+[network]
+listen = ["tcp/127.0.0.1:0"]
+[arm]
+silent_ms = 1000
+fault_error_rad = 0.5
+[hands]
+frame = "optitrack"
+stale_ms = 500
+"""
+OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
+
+
+def template() -> ModuleType:
+    """The driver template as a module."""
+    spec = importlib.util.spec_from_file_location("own_arm", ROOT / "examples" / "own_arm.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
+    """The template's fake arm, driven on a session of its own."""
+    settings, stop = Settings(), threading.Event()
+    arm = own_arm.FakeArm(settings.joints.names, settings.arm.posture)
+    with open_session(connect=[endpoint]) as session:
+        driver = threading.Thread(target=own_arm.drive, args=(arm, session, "thirdhand", stop))
+        driver.start()
+        try:
+            yield arm
+        finally:
+            stop.set()
+            driver.join(10)
+
+
+def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, list[dict[str, str]]]:
+    """Exit code and findings of `thirdhand doctor`, without those of this machine."""
+    capsys.readouterr()
+    code = main(["doctor", "--json", "--seconds", "0.5", "--connect", daemon.endpoint, *more])
+    told = json.loads(capsys.readouterr().out)
+    return code, [finding for finding in told if finding["what"] not in OF_THE_MACHINE]
+
+
+def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own_arm = template()
+    with (
+        launched(tmp_path, record=tmp_path / "records", network=PATIENT) as service,
+        open_session(connect=[service.endpoint]) as session,
+    ):
+        daemon = Daemon(service, session)
+        code, found = findings(daemon, capsys)
+        wrong = {finding["what"]: finding for finding in found if finding["level"] == "wrong"}
+        assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
+        assert all(finding["wanted"] and finding["remedy"] for finding in wrong.values())
+        assert "no joint states came yet" in wrong["mode"]["found"]
+
+        with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
+            daemon.until(lambda status: status["mode"] == "follow")
+            _, found = findings(daemon, capsys)
+            assert {finding["level"] for finding in found} == {"ok"}, found
+            assert {"left hand", "right hand", "arm", "recording"} <= {finding["what"] for finding in found}
+
+            tracker.left = NEAR_LEFT
+            daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
+            assert main(["hold", "--connect", daemon.endpoint]) == 0
+            assert ": hold (operator)" in capsys.readouterr().out
+            assert main(["resume", "--connect", daemon.endpoint]) == 0
+            assert ": follow" in capsys.readouterr().out
+            assert main(["resume", "--connect", daemon.endpoint]) == 0
+            assert "there was no hold to end" in capsys.readouterr().out
+
+            watch = subprocess.Popen(
+                [sys.executable, "-m", "service", "status", "--watch", "--connect", daemon.endpoint],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                cwd=ROOT,
+            )
+            assert watch.stdout is not None
+            line = watch.stdout.readline()
+            assert " | follow" in line
+            assert line.count("Hz") == 2
+            assert all(f" | {name} (" in line for name in ("left", "right", "tool", "target"))
+
+            tracker.left = None
+            foreign = messages.PoseStamped(0, "camera", NEAR_LEFT, (0.0, 0.0, 0.0, 1.0))
+
+            def refused(status: dict[str, object]) -> bool:
+                payload = cdr.encode_pose(foreign._replace(stamp_ns=time.time_ns()))
+                daemon.session.put("thirdhand/hands/left", payload)
+                return "wrong_frame" in str(status["because"])
+
+            told = daemon.until(refused)
+            assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "set [hands] frame a")
+            assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
+            assert set(told["hands_m"]) == {"left", "right"}
+            tracker.left = LEFT
+            daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
+            daemon.process.kill()
+            daemon.process.wait()
+            end = time.monotonic() + 10
+            while any(arm.velocity):  # type: ignore[attr-defined]
+                assert time.monotonic() < end
+                time.sleep(0.01)
+        assert watch.stderr is not None
+        said, ended = watch.stdout.read(), watch.stderr.read()
+        watch.wait(20)
+        watch.stdout.close()
+        watch.stderr.close()
+        assert "hold (stale_hand)" in said
+        assert "left not seen for" in said
+        assert (watch.returncode, "nothing comes on thirdhand/status" in ended) == (1, True)
+        log = daemon.log.read_text()
+        assert log.count("left hand: rejected as wrong_frame: frame 'camera'") == 1
+        assert main(["doctor", "--connect", daemon.endpoint]) == 1
+        assert "nothing listens on 127.0.0.1 port" in capsys.readouterr().out
+
+
+def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        assert main(["doctor", "--connect", f"tcp/127.0.0.1:{other.getsockname()[1]}"]) == 1
+    assert "opens no Zenoh session" in capsys.readouterr().out
+    assert main(["doctor", "--connect", "7447"]) == 1
+    assert "an endpoint like tcp/127.0.0.1:7447" in capsys.readouterr().out
+
+
+def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
+    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
+        token = near.liveliness().declare_token("lab/bench2/daemon/1")
+        assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
+        token.undeclare()  # type: ignore[no-untyped-call]
+    said = capsys.readouterr().out
+    assert "nothing comes on lab/status" in said
+    assert "give --cell: lab/bench2 can be reached here" in said
+
+
+def test_words_that_are_not_known_are_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    for given, near in ((["stauts"], "status"), (["via-points", "lst"], "list"), (["dotcor"], "doctor")):
+        with pytest.raises(SystemExit, match="2"):
+            main(given)
+        assert f"; did you mean {near}?" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["xyzzy"])
+    assert "did you mean" not in capsys.readouterr().err
