@@ -17,6 +17,8 @@ from service.contract import cdr, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
 LARGEST_REQUEST = 256 * 1024  # bytes
+PRESENCE = "daemon"  # below it each daemon's liveliness token, named by its Zenoh session
+PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
 
 class Codec(NamedTuple):
@@ -121,6 +123,11 @@ EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 def key(cell: str, suffix: str) -> str:
     """The key expression of one channel of a cell; also its topic in a recording."""
     return suffix if suffix.startswith("/") else f"{cell}/{suffix}"
+
+
+def presence(cell: str, session: str = "*") -> str:
+    """The key of the liveliness token by which the daemon of a Zenoh session serves a cell."""
+    return key(cell, f"{PRESENCE}/{session}")
 
 
 def sent_by_the_loop(tick: int) -> tuple[Channel, ...]:

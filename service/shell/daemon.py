@@ -10,20 +10,17 @@ import logging
 import signal
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import zenoh
-from zenoh.handlers import RingChannel
-
 from service.client import endpoints, open_session
 from service.config import Settings, robot_description
-from service.contract import cdr, channels
+from service.contract import cdr
 from service.contract.explain import ExplainedError
-from service.contract.messages import Attachment, WireError
+from service.contract.messages import Attachment
 from service.contract.records import SIDES, STAGES, Cause, Flag, Mode, Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
@@ -48,10 +45,10 @@ from service.shell.clock import (
 from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
+from service.shell.streams import Streams
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
-LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SLOWEST_START_S = 120.0  # of the workshop, on a machine that is busy
@@ -85,7 +82,9 @@ class Daemon:
                 connect=network.connect,
                 listen=network.listen,
                 certificate=network.certificate,
-                more=BOUNDS | (access_control(settings.cell, network.revoked) if network.certificate else {}),
+                zenoh_config=network.zenoh_config,
+                more=BOUNDS
+                | (access_control(settings.cell, network.revoked, network.ros2_domain) if network.certificate else {}),
             )
         try:
             self._token = occupy(self._session, settings.cell)
@@ -99,11 +98,9 @@ class Daemon:
         finally:
             slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
-        self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
-        self._malformed: Counter[str] = Counter()
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._faults: deque[Event] = deque()
@@ -114,22 +111,7 @@ class Daemon:
         self._laps: list[tuple[str, int]] = []
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         lock.tell(self.endpoints)
-        self._subscribers = [
-            (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
-            for channel in channels.CHANNELS
-            if channel.direction == "in" and channel.event
-            if channel.key != "joints/state" or settings.arm.source == "state"
-        ]
-        self._publishers = {
-            channel.key: self._session.declare_publisher(
-                channels.key(settings.cell, channel.key),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.REAL_TIME,
-                express=True,
-            )
-            for channel in channels.CHANNELS
-            if channel.direction == "out"
-        }
+        self._streams = Streams(self._session, settings, failed=self._fail)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._survey())
         self._requests = Requests(
@@ -185,6 +167,7 @@ class Daemon:
             if reporter is not None:
                 reporter.join(2)
             self._requests.close()
+            self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
             if missing := self._scribe.close(timeout_s=20):
                 log.warning("%s", missing)
@@ -219,9 +202,7 @@ class Daemon:
             self._newest = index
             self._began_ns = time.perf_counter_ns()
             self._laps = []
-            inbox = [
-                event for channel, subscriber in self._subscribers if (event := self._receive(channel, subscriber))
-            ]
+            inbox = self._streams.receive()
             while self._requests.inbox:
                 if (event := self._requests.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
@@ -241,22 +222,7 @@ class Daemon:
     def _warm_up(self) -> None:
         """Steps a twin through what the next tick may be: so it finds code and numbers near."""
         self._twin.imitate(self._controller)
-        self._twin.step(Tick(self._newest + 1, tuple(self._seen.values())))
-
-    def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
-        """The newest message on one channel, if it is one."""
-        sample = subscriber.try_recv()
-        if sample is None:
-            return None
-        try:
-            if len(sample.payload) > LARGEST_MESSAGE:
-                raise WireError(f"{len(sample.payload)} bytes")
-            payload = sample.payload.to_bytes()
-            event = self._seen[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
-            return event
-        except WireError:
-            self._malformed[channel.key] += 1
-            return None
+        self._twin.step(Tick(self._newest + 1, tuple(self._streams.newest.values())))
 
     def _lap(self, stage: str) -> None:
         self._laps.append((stage, time.perf_counter_ns()))
@@ -265,7 +231,7 @@ class Daemon:
         now_ns = time.time_ns()
         attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
         for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
-            self._publishers[channel.key].put(payload, attachment=attachment)
+            self._streams.publish(channel.key, payload, attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
@@ -297,7 +263,7 @@ class Daemon:
             status = self._survey()
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
-            self._publishers["status"].put(payload)
+            self._streams.publish("status", payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
             try:
                 self._scribe.supervise()
@@ -331,7 +297,8 @@ class Daemon:
             memory_locked=self._granted.locked,
             skill=skill.name,
             places=tuple(point.name for point in skill.via_points),
-            rejected=rejected | {f"malformed {kind}": count for kind, count in self._malformed.items()},
+            rejected=rejected | {f"malformed {kind}": count for kind, count in self._streams.malformed.items()},
+            received=dict(self._streams.received),
             hand_age_ms={
                 side: round(float(age) * self._settings.period_s * 1e3, 1)
                 for side, age in zip(SIDES, frame["hand_ages"], strict=True)
