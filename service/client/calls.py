@@ -103,7 +103,8 @@ class Client:
             self._key(suffix),
             payload=payload,
             encoding=zenoh.Encoding.APPLICATION_JSON,
-            target=zenoh.QueryTarget.ALL,  # a storage that calls itself complete would else be asked alone
+            target=zenoh.QueryTarget.ALL,  # a storage that calls itself complete would else be asked alone,
+            consolidation=zenoh.ConsolidationMode.NONE,  # and its answer be taken for the daemon's
             timeout=self._timeout_s,
         ):
             text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")

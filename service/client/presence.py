@@ -33,7 +33,13 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
     """All cells that are served on a network, by name; their daemons are asked at the same time."""
     found = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))
     asked = [
-        session.get(channels.key(name, "status"), payload=b"{}", target=zenoh.QueryTarget.ALL, timeout=timeout_s)
+        session.get(
+            channels.key(name, "status"),
+            payload=b"{}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+        )
         for name in dict(found)
     ]
     told: dict[str, Status] = {}
@@ -44,7 +50,7 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
     return tuple(Cell(name, own, told.get(own)) for name, own in found)
 
 
-def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> list[tuple[str, str]]:
+def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:
     """Cell and Zenoh session of each token under a key."""
     tokens = (str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=timeout_s) if reply.ok)
-    return [(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens]
+    return {(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens}  # some come twice

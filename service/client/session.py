@@ -103,7 +103,7 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
         file.read_bytes()
         return zenoh.Config.from_file(file)
     except (OSError, RuntimeError, zenoh.ZError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error).split(" at ")[0]
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
         raise UnreachableError(f"cannot read the Zenoh configuration {path}: {reason}") from None
 
 

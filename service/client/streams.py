@@ -9,12 +9,14 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
+from service.client.presence import living
 from service.client.session import UnreachableError
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 
 BRAKE_AFTER_S = 0.02  # without a command: then whoever follows brakes
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
+ASKED_AGAIN_S = 0.02
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SIDES = ("left", "right")
 
@@ -34,19 +36,20 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
 class Tracker:
     """Publishes hand poses of a cell, as long as its context lasts.
 
-    `timeout_s` [s] it waits for a daemon that listens. Raises UnreachableError where none does.
+    Up to `timeout_s` [s] it waits for a living daemon. Raises UnreachableError where there is none.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 5.0) -> None:
+        self._session, self._cell = session, cell
         self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
         until = time.monotonic() + timeout_s
         while not self.heard():
             if time.monotonic() > until:
                 self.close()
                 raise UnreachableError(
-                    f"nobody listens to {channels.key(cell, 'hands/left')}: is a daemon running in this cell?"
+                    f"no daemon listens to {channels.key(cell, 'hands/left')}: is one running in this cell?"
                 )
-            time.sleep(0.01)
+            time.sleep(ASKED_AGAIN_S)
 
     def publish(
         self,
@@ -68,8 +71,9 @@ class Tracker:
         self._publishers[side].put(cdr.encode_pose(pose))
 
     def heard(self) -> bool:
-        """Whether somebody listens to both hands."""
-        return all(publisher.matching_status for publisher in self._publishers.values())
+        """Whether a daemon of the cell is alive, and both hands are listened to."""
+        listened = all(publisher.matching_status for publisher in self._publishers.values())
+        return listened and bool(living(self._session, self._cell))
 
     def close(self) -> None:
         """Publishes no more."""
