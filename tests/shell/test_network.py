@@ -84,6 +84,7 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
         until(lambda: modes() == {NAMES[0]: "hold"} | others)
         assert client.status().reason == "operator"
         assert client.resume().tick > 0
+    until(lambda: client.status().reason == "stale_hand")
     heard.undeclare()
     told = {channels.key(NAMES[0], c.key): c.codec.encoding for c in (*ros2.SAID, *ros2.HEARD[:2])}
     assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}

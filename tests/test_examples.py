@@ -1,0 +1,63 @@
+"""The programs in examples/, run as they stand: a tracker and a follower around one daemon, a
+teacher and a watcher beside them; and the mathematics alone.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cell import serving
+from tests_paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+
+
+def example(name: str) -> ModuleType:
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(tmp_path) as daemon:
+        at, ended = ["--connect", daemon.endpoint], dict[str, Any]()
+
+        def run(name: str, *arguments: str) -> threading.Thread:
+            def work() -> None:
+                ended[name] = example(name).main([*at, *arguments])
+
+            thread = threading.Thread(target=work)
+            thread.start()
+            return thread
+
+        running = [run(name, "--seconds", "4") for name in ("watch", "follower", "tracker")]
+        daemon.until(lambda status: status["mode"] == "follow")
+        teaching = run("teach")
+        for thread in (*running, teaching):
+            thread.join(60)
+        received = daemon.client.status().received
+    said = capsys.readouterr().out
+    assert ended.keys() == {"watch", "follower", "tracker", "teach"}
+    assert received.keys() == {"hands/left", "hands/right", "joints/state"}
+    assert "thirdhand: follow" in said
+    assert "commands come, at tick " in said
+    assert "were none of this arm's" not in said
+    assert "example: missed by " in said
+    assert "refused: $.names[0]: no via-point 'no such place'" in said
+    assert np.abs(ended["follower"]).max() > 0.1
+
+
+def test_the_mathematics_alone_goes_through_the_point_it_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+    adapted = example("kmp_alone").main()
+    assert np.allclose(adapted.mean(np.array([[1.0]])), [[0.29, -0.26]], atol=2e-3)
+    assert len(capsys.readouterr().out.splitlines()) == 6
