@@ -12,6 +12,11 @@ from service.contract import ros2
 from service.contract.channels import ENDPOINT
 from service.contract.roles import DAEMON, ROLES, names
 
+Domain = Annotated[
+    Annotated[int, msgspec.Meta(ge=0, le=ros2.LAST_DOMAIN)] | None,
+    msgspec.Meta(extra={"accepted": f"a whole number from 0 to {ros2.LAST_DOMAIN}"}),
+]
+
 
 def is_local(endpoint: str) -> bool:
     """Whether only processes of this machine reach a Zenoh endpoint."""
@@ -34,7 +39,7 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
     revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
     zenoh_config: str = ""  # a file of Zenoh's own, for what is not set by the service; empty: none
-    ros2_domain: Annotated[int, msgspec.Meta(ge=0, le=ros2.LAST_DOMAIN)] | None = None  # seen by rmw_zenoh; None: not
+    ros2_domain: Domain = None  # of ROS 2 nodes that see the cell through rmw_zenoh; None: none
     allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
 
     def __post_init__(self) -> None:

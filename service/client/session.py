@@ -87,7 +87,8 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     if connect and "connect" in reason:
         secured = any(endpoint.startswith("tls/") for endpoint in connect)
         return (
-            f"nobody answers at {', '.join(connect)}: is a daemon running and listening there, and not overrun?"
+            f"nobody answers at {', '.join(connect)}: "
+            "is a daemon running and listening there, or a router, and not overrun?"
             + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
             "not expired?" * secured
         )

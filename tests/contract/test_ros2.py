@@ -69,5 +69,7 @@ def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(cel
 
 
 def test_a_domain_that_is_none_is_refused() -> None:
-    with pytest.raises(SettingsError, match=r"\$\.network\.ros2_domain: .*233"):
+    with pytest.raises(
+        SettingsError, match=r"\$\.network\.ros2_domain: 233 given; a whole number from 0 to 232 accepted"
+    ):
         parse("network.ros2_domain = 233", origin="cell.toml")
