@@ -5,9 +5,7 @@ Units stand in the names or beside them, defaults are safe.
 
 from __future__ import annotations
 
-import ipaddress
 import math
-import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from service.contract.channels import ENDPOINT
+from service.contract import ros2
 from service.contract.explain import InvalidError, validated
-from service.contract.roles import DAEMON, ROLES, names
 from service.described_arm import SettingsError, check, completed
+from service.network_settings import Network
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
@@ -36,8 +34,8 @@ Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quat
 PerJoint = tuple[float, ...]
 
 
-PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), ("arm", "urdf"), ("network", "certificate"))
-BESIDE = PATHS[-2:]  # those that lie beside the configuration, where they are not absolute
+BESIDE = (("arm", "urdf"), ("network", "certificate"), ("network", "zenoh_config"))  # the configuration, if relative
+PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
@@ -165,51 +163,6 @@ class Table(Section, frozen=True):
     half_size: tuple[Positive, Positive] = (0.45, 0.60)
 
 
-def is_local(endpoint: str) -> bool:
-    """Whether only processes of this machine reach a Zenoh endpoint."""
-    protocol, _, address = endpoint.partition("/")
-    host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
-    try:
-        return protocol == "unixsock-stream" or host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-class Network(Section, frozen=True):
-    """Zenoh endpoints. Nothing is announced by multicast; peers are named.
-
-    With a certificate all endpoints are TLS, and each role may do its own only.
-    """
-
-    listen: tuple[str, ...] = (ENDPOINT,)
-    connect: tuple[str, ...] = ()
-    certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
-    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
-    allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
-
-    def __post_init__(self) -> None:
-        endpoints = {f"listen[{i}]": endpoint for i, endpoint in enumerate(self.listen)}
-        endpoints |= {f"connect[{i}]": endpoint for i, endpoint in enumerate(self.connect)}
-        for name, endpoint in endpoints.items():
-            if self.certificate and not endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
-            if not self.certificate and endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
-            if not (self.certificate or self.allow_insecure or is_local(endpoint)):
-                raise ValueError(
-                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an address like "
-                    "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
-                )
-        if self.revoked and not self.certificate:
-            raise ValueError("$.network.revoked: given without $.network.certificate; without one nobody is told apart")
-        for i, name in enumerate(self.revoked):
-            if not any(name in names(role) for role in (*ROLES, DAEMON)):
-                raise ValueError(
-                    f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
-                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
-                )
-
-
 class Files(Section, frozen=True):
     """Where skills are read, and via-points, recordings and viewer files are written."""
 
@@ -251,6 +204,11 @@ class Settings(Section, frozen=True):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
         if unusable:
             return
+        if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
+            yield (
+                f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
+                "none of them with a digit first, joined by slashes needed"
+            )
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
@@ -354,8 +312,9 @@ def _resolve_paths(given: Any, folder: Path | None) -> None:
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
-    Where URDF and certificate are not absolute paths they lie in `folder`. What is not said of an
-    arm with a URDF of its own is taken from there; no limit may be wider than the URDF's.
+    Where URDF, certificate and Zenoh configuration are no absolute paths they lie in `folder`. What
+    is not said of an arm with a URDF of its own is taken from there; no limit may be wider than the
+    URDF's.
     """
     try:
         _resolve_paths(given, folder)

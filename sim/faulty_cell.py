@@ -24,7 +24,7 @@ from service.launch import Launched, launched
 from service.shell.clock import Deadlines
 from sim.bench import Bench
 from sim.network import Bridge, Live
-from sim.parts import CLIENT, Link, Part, as_usual_afterwards, before_others
+from sim.parts import Link, Part, as_usual_afterwards, before_others
 from sim.scene import Scene
 from sim.script import HandScript
 
@@ -76,7 +76,6 @@ class _Arm:
     """The bench's arm on the network: follows commands and tells its joints, on a thread."""
 
     endpoint: str
-    routed: bool
     steps: list[tuple[float, ...]] = field(default_factory=list)  # time [s], tool [m], speed [m/s]
 
     def __post_init__(self) -> None:
@@ -88,7 +87,7 @@ class _Arm:
         before_others()
         with (
             Bench(HandScript(Scene(), seed=1)) as bench,
-            open_session(connect=[self.endpoint], more=CLIENT if self.routed else None) as session,
+            open_session(connect=[self.endpoint]) as session,
             contextlib.closing(Bridge(session, Live(cell=CELL), bench.joint_names)) as bridge,
         ):
             deadlines = Deadlines(round(1 / bench.period_s))
@@ -138,13 +137,12 @@ class FaultyCell:
                 to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
             else:
                 to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
-            routed = self.network == "router"
             # the operator is at the service itself, so that what left it is known whatever is cut
             with as_usual_afterwards():
                 self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
-            self.tracker = self._part(parts, "tracker", to_tracker, *["--routed"] * routed)
-            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, routed)))
+            self.tracker = self._part(parts, "tracker", to_tracker)
+            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm)))
             self._listen()
             self.until_fast()
             self._parts = parts.pop_all()
@@ -210,16 +208,16 @@ class FaultyCell:
             with contextlib.suppress(FaultError, UnreachableError):
                 return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
             with contextlib.suppress(UnreachableError):
-                if self.client.status()["mode"] == "fault":
+                if self.client.status().mode == "fault":
                     self.unasked += 1
-                    self.client.ask("reset")
+                    self.client.reset()
         raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
 
     def suffer(self, name: str, fault: Fault) -> Event:
         """What came of a fault that strikes while the tool is fast, and of mending it."""
         time.sleep(STEADY_S)
         self.until_fast()
-        lost = self.client.status()["scribe"]["lost"]
+        lost = self.client.status().scribe["lost"]
         self.until_fast()
         struck = time.monotonic()
         tick = self.commands[-1][1]
@@ -228,7 +226,7 @@ class FaultyCell:
         mended = time.monotonic()
         fault.mend(self)
         moving = self.until_fast(MOVES)
-        lost = self.client.status()["scribe"]["lost"] - lost
+        lost = self.client.status().scribe["lost"] - lost
         return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
 
     def close(self) -> int:

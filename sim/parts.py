@@ -40,7 +40,6 @@ HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
 MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
 START_TIMEOUT_S = 60.0
 PRIORITY = 20  # below the service's loop, above what it does beside
-CLIENT = {"mode": "client"}  # as a router wants it
 
 
 def before_others() -> None:
@@ -71,7 +70,7 @@ def script_time(time_s: float) -> float:
     return MIDDLE_S + SWING_S * math.sin(FASTEST / SWING_S * time_s)
 
 
-def track(endpoint: str, *, routed: bool) -> None:
+def track(endpoint: str) -> None:
     """Publishes both hands for good; on SIGUSR1 what it sent last, again and again, on SIGUSR2 by a
     clock that was set.
     """
@@ -85,7 +84,7 @@ def track(endpoint: str, *, routed: bool) -> None:
     signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
     signal.signal(signal.SIGUSR2, set_the_clock)
     script, sides = HandScript(Scene(), seed=1), ("left", "right")
-    with open_session(connect=[endpoint], more=CLIENT if routed else None) as session:
+    with open_session(connect=[endpoint]) as session:
         publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
         clock, payloads = Deadlines(HANDS_HZ), [b"", b""]
         print("begun", flush=True)
@@ -236,7 +235,6 @@ def main(arguments: list[str] | None = None) -> int:
     kinds = p.add_subparsers(dest="kind", required=True)
     tracker = kinds.add_parser("tracker", help="both hands, to and fro")
     tracker.add_argument("endpoint", metavar="ENDPOINT", help="where the service or a router listens")
-    tracker.add_argument("--routed", action="store_true", help="as a router's client")
     relaying = kinds.add_parser("relay", help="a network between two ends")
     relaying.add_argument("target", metavar="TARGET", help="where it leads to, like tcp/127.0.0.1:7447")
     routing = kinds.add_parser("router", help="a Zenoh router")
@@ -246,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     child.end_with_parent()
     before_others()
     if args.kind == "tracker":
-        track(args.endpoint, routed=args.routed)
+        track(args.endpoint)
     elif args.kind == "relay":
         asyncio.run(relay(args.target, args.port))
     else:

@@ -40,7 +40,7 @@ class Daemon:
     def until(self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0) -> dict[str, Any]:
         """The first status of which something is true."""
         end = time.monotonic() + timeout_s
-        while not what(status := self.client.status()):
+        while not what(status := self.client.ask("status")):
             assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
         return status
 

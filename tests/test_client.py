@@ -8,11 +8,13 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
-from service.client import Client, RefusedError, UnreachableError, endpoints, open_session
+from service.client import Client, RefusedError, UnreachableError, endpoints, living, open_session
+from service.contract import channels, requests
 from service.contract.requests import ViaPoint
 
 Answer = Callable[[zenoh.Query], object]
@@ -35,9 +37,13 @@ def session(daemon: zenoh.Session) -> Iterator[zenoh.Session]:
 @pytest.fixture
 def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
     """Declares who answers on a key, until the test ends."""
-    declared = []
+    declared: list[Any] = []
 
     def answer(key: str, with_what: Answer) -> None:
+        cell = key.rsplit("/", 1)[0]
+        if not living(daemon, cell):
+            declared.append(daemon.liveliness().declare_token(channels.presence(cell, str(daemon.zid()))))
+
         def reply(query: zenoh.Query) -> None:
             with query:
                 with_what(query)
@@ -49,8 +55,31 @@ def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
         queryable.undeclare()
 
 
+STATUS = requests.Status(
+    cell="bench",
+    mode="hold",
+    reason="no_hands",
+    skill="",
+    version="",
+    flags=(),
+    places=(),
+    endpoints=(),
+    rejected={},
+    hand_age_ms={},
+    scribe={},
+    tick=3,
+    rate_hz=500.0,
+    missed=0,
+    hand_distance_m=3.0,
+    hand_limit_m_s=1.5,
+    realtime=False,
+    memory_locked=False,
+    **dict.fromkeys(("lateness_us", "work_us", "latency_ms"), requests.Percentiles()),
+)  # type: ignore[arg-type]
+
+
 def ready(query: zenoh.Query) -> None:
-    query.reply(query.key_expr, b'{"mode": "hold"}')
+    query.reply(query.key_expr, requests.encode_json(STATUS))
 
 
 # --- sessions ------------------------------------------------------------------------------------
@@ -69,10 +98,9 @@ def test_a_session_that_does_not_listen_has_no_endpoints() -> None:
 
 def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: zenoh.Session) -> None:
     """No scouting: who was not told where another listens does not meet it."""
-    told = {str(zid) for zid in daemon.info.peers_zid()}
     with open_session(listen=["tcp/127.0.0.1:0"]) as stranger:
         time.sleep(0.5)
-        assert str(session.zid()) in told
+        assert list(session.info.peers_zid()) == [daemon.zid()]
         assert list(stranger.info.peers_zid()) + list(stranger.info.routers_zid()) == []
         assert stranger.zid() not in list(daemon.info.peers_zid())
 
@@ -109,7 +137,7 @@ def test_a_reply_ends_the_call_at_once(session: zenoh.Session, answering: Callab
     client = Client(session, "bench", timeout_s=20)
     client.wait_until_ready()
     begin = time.monotonic()
-    assert client.status() == {"mode": "hold"}
+    assert client.status() == STATUS
     assert time.monotonic() - begin < 2
 
 
@@ -138,9 +166,8 @@ def test_places_are_asked_for_as_the_wire_says(
     answering("bench/via_points", take)
     client = Client(session, "bench")
     client.wait_until_ready()
-    assert client.add([ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))], tolerance=0.1) == {
-        "tick": 3
-    }
+    there = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
+    assert client.add([there], tolerance=0.1) == requests.Reply(3)
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
@@ -157,7 +184,7 @@ def test_a_cell_with_slashes_is_a_cell_of_its_own(
     session: zenoh.Session, answering: Callable[[str, Answer], None]
 ) -> None:
     answering("lab/bench2/status", ready)
-    assert Client(session, "lab/bench2").wait_until_ready() == {"mode": "hold"}
+    assert Client(session, "lab/bench2").wait_until_ready() == STATUS
     with pytest.raises(UnreachableError):
         Client(session, "lab", timeout_s=0.5).status()
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.config import Settings, SettingsError, is_local, load, parse
+from service.config import Settings, SettingsError, load, parse
+from service.network_settings import is_local
 
 
 def refusal(text: str) -> str:

@@ -1,5 +1,6 @@
 """The manual for incidents tells of every mode, reason, flag and counter; the table of faults names
-tests that are there and the figures that were measured.
+tests that are there and the figures that were measured. The tables of the wire and of ROS 2's
+topics are the table of channels.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import numpy as np
 from tests_paths import ROOT
 
 from service.config import Settings, robot_description
-from service.contract import incidents, requests
+from service.contract import incidents, requests, ros2
+from service.contract.channels import CHANNELS, Channel
 from service.contract.records import Cause, Flag, Mode, Reason
+from service.contract.roles import ROLES
 from service.core.arm import Arm
 from service.recorder.client import Scribe
 
@@ -94,3 +97,36 @@ def test_each_fault_has_the_figures_that_were_measured() -> None:
     for name, one in MEASURED.items():
         figures = (one.get(key) for key in ("hold_ms", "rest_ms", "travelled_mm", "lost_ticks"))
         assert rows[name] == ["-" if value is None else f"{value:.0f}" for value in figures], name
+
+
+def rows_of(page: str, first: str) -> list[str]:
+    """The rows of a page's tables that begin so."""
+    lines = (ROOT / "docs" / page).read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line.startswith(first)]
+
+
+def says(channel: Channel) -> str:
+    """Who publishes or answers on a channel."""
+    if channel.direction == "out":
+        return "the service" + ", which answers too" * channel.queryable
+    if channel.direction == "request":
+        return "the service answers"
+    return next((name for name, role in ROLES.items() if channel.key in role.publishes), "who demonstrates")
+
+
+def test_the_table_of_the_wire_is_the_table_of_channels() -> None:
+    assert rows_of("wire.md", "| `<cell>/") == [
+        f"| `<cell>/{channel.key}` | `{channel.codec.type}` | `application/{channel.codec.encoding}` | "
+        f"{says(channel)} | {channel.rate} | {channel.about} |"
+        for channel in CHANNELS
+        if channel.direction != "recording"
+    ]
+
+
+def test_the_table_of_topics_is_what_ros2_is_told() -> None:
+    does = {True: "subscribes | best effort, volatile", False: "publishes | reliable, volatile"}
+    assert rows_of("ros2.md", "| `/<cell>/") == [
+        f"| `/<cell>/{channel.key}` | `{ros2.type_of(channel)}`{', JSON' * (channel.codec.encoding == 'json')} | "
+        f"{does[channel in ros2.HEARD]} |"
+        for channel in (*ros2.HEARD, *ros2.SAID)
+    ]

@@ -109,7 +109,7 @@ def _whole(  # noqa: PLR0917
         )
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
     return heard | {
-        "granted": {name: status[name] for name in ("realtime", "memory_locked")},
+        "granted": {"realtime": status.realtime, "memory_locked": status.memory_locked},
         "ticks": int(timing["tick"][-1] - timing["tick"][0]),
         "missed": int(timing["missed"][-1] - timing["missed"][0]),
         **figures(timing["lateness_us"], timing["work_us"]),

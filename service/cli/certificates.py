@@ -19,7 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from service.cli.usage import UsageError
 from service.client import AUTHORITY, CERTIFICATE, KEY
 from service.contract.explain import ExplainedError
-from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, names
+from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"
@@ -113,14 +113,15 @@ def _write(
     folder: Path, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey, *, hosts: list[str], days: int
 ) -> datetime.datetime:
     """A folder, named as its holder, with certificate, key and the authority's certificate, all
-    private to their user; until when it is valid. A daemon's is for what clients reach as `hosts`.
+    private to their user; until when it is valid. A daemon's or router's is for what clients reach
+    as `hosts`.
     """
     record = os.open(folder.parent / GIVEN, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(record, "a", encoding="utf-8") as given:
         print(folder.name, file=given)
     own = ec.generate_private_key(ec.SECP256R1())
-    is_daemon = folder.name in names(DAEMON)
-    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * is_daemon
+    serves = any(folder.name in names(role) for role in SERVERS)
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * serves
     until = min(_days_from_now(days), authority.not_valid_after_utc)
     builder = (
         _builder(_name(folder.name), authority.subject, own, until)
@@ -129,7 +130,7 @@ def _write(
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key()), critical=False)
     )
-    if is_daemon:
+    if serves:
         builder = builder.add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
     _save(folder / KEY, _pem(own))
     _save(folder / CERTIFICATE, _public(builder.sign(key, hashes.SHA256())))

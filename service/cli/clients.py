@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import zenoh
+
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
 from service.contract import requests
@@ -56,8 +58,21 @@ def hold(args: argparse.Namespace) -> int:
 resume = reset = hold
 
 
+def reached(args: argparse.Namespace) -> zenoh.Session:
+    """A session to where a command line says that a daemon or router is.
+
+    Raises UnreachableError.
+    """
+    return open_session(
+        connect=args.connect or (),
+        otherwise=[ENDPOINT],
+        timeout_s=CONNECT_TIMEOUT_S,
+        certificate=args.certificate,
+        zenoh_config=args.zenoh_config,
+    )
+
+
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
-    with open_session(
-        connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
-    ) as session:
+    """The reply to one request, as it came. Raises UnreachableError and RefusedError."""
+    with reached(args) as session:
         return Client(session, args.cell).ask(suffix, request)

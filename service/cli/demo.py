@@ -17,7 +17,7 @@ import numpy as np
 
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
-from service.contract.requests import Add, decode_request
+from service.contract.requests import Add, Status, decode_request
 from service.core.frame import TIMING
 from service.launch import launched, played
 from service.recorder.recording import Recording
@@ -50,9 +50,9 @@ def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], Non
             client = Client(session)
             reply = client.add(add.points, tolerance=add.tolerance)
             names = ", ".join(
-                f"{point['name']} (missed by {1000 * point['missed_by_m']:.1f} mm)" for point in reply["points"]
+                f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
-            say(f"taught while it runs, in force since tick {reply['tick']}: {names}")
+            say(f"taught while it runs, in force since tick {reply.tick}: {names}")
             report = json.loads(played(service.endpoint, *([] if scene is None else ["--scene", str(scene)]), say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
@@ -61,10 +61,10 @@ def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], Non
     return _report(report, status) | {"missing": missing}
 
 
-def _report(report: dict[str, Any], status: dict[str, Any]) -> dict[str, Any]:
-    recording, rrd = status["scribe"]["recording"], status["scribe"]["rrd"]
+def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
+    recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
-        raise DemoError(f"nothing was recorded: {'; '.join(status['scribe']['errors']) or 'the scribe gave no reason'}")
+        raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
     steps = [step.timing for step in Recording.open(recording).steps() if step.timing is not None]
     timing = np.array(steps, TIMING)
     span_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9
@@ -77,7 +77,7 @@ def _report(report: dict[str, Any], status: dict[str, Any]) -> dict[str, Any]:
         "latency_ms": report["latency_ms"],
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
-        "realtime": status["realtime"],
+        "realtime": status.realtime,
         "recording": recording,
         "rrd": rrd,
     }

@@ -25,6 +25,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
@@ -71,7 +72,7 @@ class Cell:
 
     def scribe(self) -> int:
         """The process number of its scribe. Raises LoadError."""
-        pid = self.client.status()["scribe"]["pid"]
+        pid = self.client.status().scribe["pid"]
         if pid is None:
             raise LoadError("the daemon has no scribe")
         return int(pid)
@@ -167,7 +168,7 @@ def _teaching(client: Client, session: Any) -> None:
 
 def _loading(client: Client, session: Any) -> None:
     names = (LARGE_SKILL, SHIPPED_SKILL.removesuffix(".npz"))
-    _asked(0.5, lambda k: client.ask("skill", {"name": names[k % 2]}))
+    _asked(0.5, lambda k: client.load_skill(names[k % 2]))
 
 
 def _hands(rate_hz: float, client: Client, session: Any) -> None:
@@ -236,17 +237,17 @@ def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[
                 realtime = _let_others_first(service.process.pid)
                 empty = probe("empty", rate_hz, seconds)
             service.stop()
-        ticks = after["tick"] - before["tick"]
+        ticks = after.tick - before.tick
         replayed = [replay(path) for path in sorted(folder.glob("*.mcap"))]
         return {
             "realtime": realtime,
-            "mode": after["mode"],
+            "mode": after.mode,
             "ticks": ticks,
-            "places": after["places"],
-            "scribe": {name: after["scribe"][name] for name in ("lost", "restarts", "errors")},
-            "missed": (after["missed"] - before["missed"]) / max(1, ticks),
-            "lateness_us": after["lateness_us"],
-            "work_us": after["work_us"],
+            "places": after.places,
+            "scribe": {name: after.scribe[name] for name in ("lost", "restarts", "errors")},
+            "missed": (after.missed - before.missed) / max(1, ticks),
+            "lateness_us": msgspec.to_builtins(after.lateness_us),
+            "work_us": msgspec.to_builtins(after.work_us),
             "empty_missed": empty["missed"] / max(1, empty["ticks"]),
             "empty_lateness_us": {name: empty["lateness_us"][name] for name in ("p50", "p99", "max")},
             "recorded": sum(one.ticks for one in replayed),
@@ -265,9 +266,9 @@ def _let_others_first(pid: int) -> bool:
 def until_following(client: Client) -> None:
     """Waits until a daemon follows the hands, and a little more. Raises LoadError."""
     until = time.monotonic() + 15.0
-    while (now := client.status())["mode"] != "follow":
+    while (now := client.status()).mode != "follow":
         if time.monotonic() > until:
-            raise LoadError(f"the daemon does not follow the hands: {now['mode']} ({now['reason']})")
+            raise LoadError(f"the daemon does not follow the hands: {now.mode} ({now.reason})")
         time.sleep(0.1)
     time.sleep(SETTLE_S)
 

@@ -36,6 +36,7 @@ RUN_BY = {
     "hold": "clients",
     "resume": "clients",
     "reset": "clients",
+    "cells": "cells",
     "view": "view",
     "certificates": "certificates",
     "bench": "bench",
@@ -111,6 +112,7 @@ def parser() -> argparse.ArgumentParser:
         help=f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})",
     )
     c.add_argument("--connect", metavar="EP", action="append", help="Zenoh endpoint to connect to; may be repeated")
+    _zenoh_config(c)
     c.add_argument("--rate", metavar="HZ", type=_rate, help="of the loop (default: 500)")
     c.add_argument(
         "--skill",
@@ -253,6 +255,10 @@ def parser() -> argparse.ArgumentParser:
     client("resume", "Ends an operator's hold.", "thirdhand resume")
     client("reset", "Ends a fault.", "thirdhand reset")
 
+    c = command("cells", "The daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447")
+    c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
+    _reach(c, cell=False)
+
     c = command(
         "certificates",
         "Makes an authority, and a certificate for the daemon and for each role on a network; with --role, one more "
@@ -308,16 +314,33 @@ def _positive(given: str) -> float:
     raise argparse.ArgumentTypeError(f"{given} given, 0.001 to 10000 needed")
 
 
-def _reach(sub: argparse.ArgumentParser) -> None:
+def _reach(sub: argparse.ArgumentParser, *, cell: bool = True) -> None:
     sub.add_argument(
-        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint of the daemon (default: {channels.ENDPOINT})"
+        "--connect",
+        metavar="EP",
+        action="append",
+        help="Zenoh endpoint of the daemon or of a router; of several the first that answers "
+        f"(default: {channels.ENDPOINT})",
     )
-    sub.add_argument("--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    if cell:
+        sub.add_argument(
+            "--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)"
+        )
     sub.add_argument(
         "--certificate",
         metavar="DIR",
         type=Path,
         help="of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)",
+    )
+    _zenoh_config(sub)
+
+
+def _zenoh_config(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--zenoh-config",
+        metavar="FILE",
+        type=Path,
+        help="Zenoh's own settings, for all that the service does not set itself (default: $THIRDHAND_ZENOH_CONFIG)",
     )
 
 

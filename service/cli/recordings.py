@@ -5,13 +5,17 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
+from collections.abc import Mapping
 
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
-from service.client import UnreachableError, open_session
+from service.cli.clients import reached
+from service.cli.usage import UsageError, check_writable
+from service.client import Client, Tracker
 from service.config import load
-from service.contract import cdr, channels, requests
+from service.contract import cdr, requests
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
+from service.contract.requests import Status
 from service.learning.judgement import table
 from service.learning.learn import Evidence
 from service.learning.learn import learn as learned
@@ -19,6 +23,8 @@ from service.learning.picture import draw
 from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.mcap_file import ends_early
 from service.recorder.replay import replay as replayed
+
+COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
 
 
 def play(args: argparse.Namespace) -> int:
@@ -30,34 +36,43 @@ def play(args: argparse.Namespace) -> int:
     except WireError as error:
         raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
     start_ns, last_ns = hands[0][0], hands[-1][0]
-    with open_session(
-        connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
-    ) as session:
-        publishers = {
-            side: session.declare_publisher(channels.key(args.cell, f"hands/{side}")) for side in ("left", "right")
-        }
-        until = time.monotonic() + 5.0
-        while not all(publisher.matching_status for publisher in publishers.values()):
-            if time.monotonic() > until:
-                raise UnreachableError(
-                    f"nobody listens to {channels.key(args.cell, 'hands/left')}: is a daemon running in this cell?"
-                )
-            time.sleep(0.02)
-        if ends_early(args.file):
-            print(f"{args.file} is cut: its end is missing, and what is there is played", file=sys.stderr)
+    if ends_early(args.file):
+        print(f"{args.file} is cut: its end is missing, and what is there is played", file=sys.stderr)
+    with reached(args) as session, Tracker(session, args.cell) as tracker:
+        client = Client(session, args.cell)
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
         while True:
+            before = client.status()
             begin = time.monotonic()
             for time_ns, side, pose in hands:
                 early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()
                 if early > 0:
                     time.sleep(early)
                 # a tracker stamps what it sees now
-                publishers[side].put(cdr.encode_pose(pose._replace(stamp_ns=time.time_ns())))
-            if not all(publisher.matching_status for publisher in publishers.values()):
-                raise UnreachableError("the daemon stopped listening")
+                tracker.publish(side, pose.position, pose.orientation, frame_id=pose.frame_id)
+            print(_arrived(client, before, Counter(side for _, side, _ in hands)), file=sys.stderr)
             if not args.loop:
                 return 0
+
+
+def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
+    """What of the hands played came to the daemon's loop, by its own count.
+
+    Raises ExplainedError where of a hand none did.
+    """
+    until = time.monotonic() + COUNTED_WITHIN_S
+    while True:
+        now = client.status()
+        came = {side: now.received.get(f"hands/{side}", 0) - before.received.get(f"hands/{side}", 0) for side in played}
+        if all(came[side] >= played[side] for side in played) or time.monotonic() > until:
+            break
+        time.sleep(0.1)
+    counts = ", ".join(f"{max(0, came[side])} of {played[side]} of the {side} hand" for side in played)
+    refused = {cause: now.rejected[cause] - before.rejected.get(cause, 0) for cause in now.rejected}
+    if any(came[side] <= 0 for side in played):
+        raise ExplainedError(f"of the poses played the daemon counted {counts}: was it started anew, or is it stalled?")
+    causes = ", ".join(f"{count} {cause}" for cause, count in refused.items() if count > 0)
+    return f"{counts} came to the daemon's loop" + f"; rejected meanwhile: {causes}" * bool(causes)
 
 
 def replay(args: argparse.Namespace) -> int:

@@ -47,10 +47,10 @@ def run(minutes: float, rate_hz: int, *, say: Callable[[str], None]) -> dict[str
         return {
             "minutes": minutes,
             "rate_hz": rate_hz,
-            "ticks": after["tick"] - before["tick"],
-            "missed": after["missed"] - before["missed"],
-            "lost": after["scribe"]["lost"],
-            "restarts": after["scribe"]["restarts"],
+            "ticks": after.tick - before.tick,
+            "missed": after.missed - before.missed,
+            "lost": after.scribe["lost"],
+            "restarts": after.scribe["restarts"],
             "processes": {who: judged(np.array(values)) for who, values in samples.items()},
             "files": sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".rrd")),
         }

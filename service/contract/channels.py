@@ -1,10 +1,11 @@
 """The one table of channels: everything that passes between the service and others, enters its
 loop, or is recorded.
 
-Subscribers, publishers, queryables, the kinds of events, the topics of a recording, staleness and
-the README's table are all derived from it. A new channel is one more line here and, if it enters
-the loop, a case in `core.controller`; if the loop sends on it, a function in `core.outputs`; if its
-message is new, a codec in `cdr` and a definition in `ros2msg`.
+Subscribers, publishers, queryables, the kinds of events, the topics of a recording and of ROS 2,
+staleness and the table in docs/wire.md are all derived from it. A new channel is one more line here
+and, if it enters the loop, a case in `core.controller`; if the loop sends on it, a function in
+`core.outputs`; if its message is new, a codec in `cdr`, a definition in `ros2msg` and, unless it is
+only recorded, a hash in `ros2`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from service.contract import cdr, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
 LARGEST_REQUEST = 256 * 1024  # bytes
+PRESENCE = "daemon"  # below it each daemon's liveliness token, named by its Zenoh session
+PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
 
 class Codec(NamedTuple):
@@ -121,6 +124,11 @@ EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 def key(cell: str, suffix: str) -> str:
     """The key expression of one channel of a cell; also its topic in a recording."""
     return suffix if suffix.startswith("/") else f"{cell}/{suffix}"
+
+
+def presence(cell: str, session: str = "*") -> str:
+    """The key of the liveliness token by which the daemon of a Zenoh session serves a cell."""
+    return key(cell, f"{PRESENCE}/{session}")
 
 
 def sent_by_the_loop(tick: int) -> tuple[Channel, ...]:

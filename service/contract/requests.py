@@ -160,6 +160,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     skill: str
     places: tuple[str, ...]
     rejected: dict[str, int]
+    received: dict[str, int] = {}  # messages that the loop took, by channel; of many in one tick the newest
     hand_age_ms: dict[str, float]
     hand_distance_m: float  # of the nearest hand from the arm; 3 at most, and where none is seen
     hand_limit_m_s: float  # least speed toward a hand that is allowed at some part of the arm

@@ -7,9 +7,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
-from service.contract import channels
+from service.contract import channels, ros2
 
-DAEMON = "daemon"
+DAEMON, ROUTER = "daemon", "router"
+SERVERS = (DAEMON, ROUTER)  # others connect to them
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
@@ -21,7 +22,7 @@ class Role(NamedTuple):
     about: str
     publishes: tuple[str, ...] = ()
     hears: bool = False  # all that the daemon publishes
-    asks: bool = False  # any request
+    asks: bool = False  # any request; all roles may ask for the status, and which daemons are alive
 
 
 ROLES = {
@@ -30,6 +31,7 @@ ROLES = {
     "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
     "observer": Role("hears all", hears=True),
+    ROUTER: Role("passes on what all others may do, and has to keep them apart", (*HANDS, *ARM), hears=True, asks=True),
 }
 
 
@@ -38,15 +40,18 @@ def names(role: str) -> tuple[str, ...]:
     return (role, *(f"{role}-{number}" for number in range(2, MOST_OF_A_ROLE + 1)))
 
 
-def access_control(cell: str, revoked: Collection[str] = ()) -> dict[str, Any]:
+def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | None = None) -> dict[str, Any]:
     """Zenoh's settings by which a daemon of this cell keeps the roles apart, and lets certificates
-    of the `revoked` names do nothing.
+    of the `revoked` names do nothing. What a role may do it may do in a ROS 2 domain too.
     """
 
-    def keys(suffixes: tuple[str, ...]) -> list[str]:
-        return [channels.key(cell, suffix) for suffix in suffixes]
+    def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
+        found = [channels.key(cell, suffix) for suffix in suffixes]
+        if topics and ros2_domain is not None:
+            found += [ros2.key(ros2_domain, cell, channels.BY_KEY[suffix]) for suffix in suffixes]
+        return found
 
-    heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"))
+    heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)
     asked = keys(tuple(channel.key for channel in channels.CHANNELS if channel.queryable))
     rules: list[dict[str, Any]] = []
 
@@ -61,25 +66,40 @@ def access_control(cell: str, revoked: Collection[str] = ()) -> dict[str, Any]:
         allow("ask", "egress", ["declare_queryable", "reply"], asked),
     ]
 
+    status, present = keys(("status",)), [channels.presence(cell)]
+    tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
+    see = [
+        allow("see", "ingress", ["query"], status),
+        allow("see", "egress", ["declare_queryable", "reply"], status),
+        allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]),
+        allow("see who lives", "egress", tokens, present),
+    ]
+    if ros2_domain is not None:
+        domain = [ros2.all_tokens(ros2_domain)]
+        see += [
+            allow("see topics", "ingress", [*tokens, *queries], domain),
+            allow("see topics", "egress", [*tokens, *queries], domain),
+        ]
+
+    neighbours = [  # two daemons see that they are two
+        rule
+        for flow in ("ingress", "egress")
+        for rule in (
+            allow("neighbours", flow, [*tokens, *queries], present),
+            allow("neighbours' status", flow, ["query", "reply", "declare_queryable"], status),
+        )
+    ]
+
     def policies() -> Iterator[tuple[str, list[str]]]:
         for name, role in ROLES.items():
             publish: list[str] = []
             if role.publishes:
-                published = keys(role.publishes)
+                published = keys(role.publishes, topics=True)
                 publish.append(allow(f"{name} publish", "ingress", ["put"], published))
                 publish.append(allow(f"{name} publish", "egress", ["declare_subscriber"], published))
-            yield name, publish + role.hears * hear + role.asks * ask
-        # two daemons see that they are two
-        liveliness = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
-        present, status = [channels.key(cell, "daemon/*")], keys(("status",))
-        yield (
-            DAEMON,
-            [allow("neighbours", flow, liveliness, present) for flow in ("ingress", "egress")]
-            + [
-                allow("neighbours' status", flow, ["query", "reply", "declare_queryable"], status)
-                for flow in ("ingress", "egress")
-            ],
-        )
+            through = (name == ROUTER) * neighbours
+            yield name, publish + see + role.hears * hear + role.asks * ask + through
+        yield DAEMON, neighbours
 
     granted = [
         (role, valid, rules_of)

@@ -16,15 +16,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import zenoh
-from zenoh.handlers import RingChannel
-
 from service.client import endpoints, open_session
 from service.config import Settings, robot_description
-from service.contract import cdr, channels
+from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.incidents import in_brief, in_full
-from service.contract.messages import Attachment, WireError
+from service.contract.messages import Attachment
 from service.contract.records import STAGES, Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
@@ -50,11 +47,11 @@ from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, o
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.sources import Sources
+from service.shell.streams import Streams
 from service.shell.survey import Survey
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
-LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SLOWEST_START_S = 120.0  # of the workshop, on a machine that is busy
@@ -88,7 +85,9 @@ class Daemon:
                 connect=network.connect,
                 listen=network.listen,
                 certificate=network.certificate,
-                more=BOUNDS | (access_control(settings.cell, network.revoked) if network.certificate else {}),
+                zenoh_config=network.zenoh_config,
+                more=BOUNDS
+                | (access_control(settings.cell, network.revoked, network.ros2_domain) if network.certificate else {}),
             )
         try:
             self._token = occupy(self._session, settings.cell)
@@ -102,7 +101,6 @@ class Daemon:
         finally:
             slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
-        self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
@@ -118,22 +116,7 @@ class Daemon:
         self._laps: list[tuple[str, int]] = []
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         lock.tell(self.endpoints)
-        self._subscribers = [
-            (channel, self._session.declare_subscriber(channels.key(settings.cell, channel.key), RingChannel(1)))
-            for channel in channels.CHANNELS
-            if channel.direction == "in" and channel.event
-            if channel.key != "joints/state" or settings.arm.source == "state"
-        ]
-        self._publishers = {
-            channel.key: self._session.declare_publisher(
-                channels.key(settings.cell, channel.key),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.REAL_TIME,
-                express=True,
-            )
-            for channel in channels.CHANNELS
-            if channel.direction == "out"
-        }
+        self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._survey())
         self._requests = Requests(
@@ -189,6 +172,7 @@ class Daemon:
             if reporter is not None:
                 reporter.join(2)
             self._requests.close()
+            self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
             if missing := self._scribe.close(timeout_s=20):
                 log.warning("%s", missing)
@@ -224,9 +208,7 @@ class Daemon:
             self._newest = index
             self._began_ns = time.perf_counter_ns()
             self._laps = []
-            inbox = [
-                event for channel, subscriber in self._subscribers if (event := self._receive(channel, subscriber))
-            ]
+            inbox = self._streams.receive()
             while self._requests.inbox:
                 if (event := self._requests.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
@@ -246,24 +228,7 @@ class Daemon:
     def _warm_up(self) -> None:
         """Steps a twin through what the next tick may be: so it finds code and numbers near."""
         self._twin.imitate(self._controller)
-        self._twin.step(Tick(self._newest + 1, tuple(self._seen.values())))
-
-    def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
-        """The newest message on one channel, if it is one."""
-        sample = subscriber.try_recv()
-        if sample is None:
-            return None
-        arrivals = self._sources.arrivals[channel.key]
-        try:
-            if len(sample.payload) > LARGEST_MESSAGE:
-                raise WireError(f"{len(sample.payload)} bytes, at most {LARGEST_MESSAGE} accepted")
-            payload = sample.payload.to_bytes()
-            event = self._seen[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
-            arrivals.take(event.value, time.time_ns())
-            return event
-        except WireError as error:
-            arrivals.refuse(str(error))
-            return None
+        self._twin.step(Tick(self._newest + 1, tuple(self._streams.newest.values())))
 
     def _lap(self, stage: str) -> None:
         self._laps.append((stage, time.perf_counter_ns()))
@@ -272,7 +237,7 @@ class Daemon:
         now_ns = time.time_ns()
         attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
         for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
-            self._publishers[channel.key].put(payload, attachment=attachment)
+            self._streams.publish(channel.key, payload, attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
@@ -304,7 +269,7 @@ class Daemon:
             status = self._survey()
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
-            self._publishers["status"].put(payload)
+            self._streams.publish("status", payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
             try:
                 self._scribe.supervise()
@@ -330,11 +295,12 @@ class Daemon:
             missed=clock.missed,
             realtime=self._granted.realtime,
             memory_locked=self._granted.locked,
+            received={key: arrivals.count for key, arrivals in self._sources.arrivals.items()},
             lateness_us=self._lateness.percentiles(),
             work_us=self._work.percentiles(),
             latency_ms=self._latency.percentiles(),
             scribe=self._scribe.status(),
-            command_heard=self._publishers["joints/command"].matching_status.matching,  # type: ignore[attr-defined]
+            command_heard=self._streams.is_followed,
             endpoints=self.endpoints,
             version=self._version,
         )

@@ -119,11 +119,11 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     Raises OccupiedError where another one on this network does; of two that start at once, both may
     be refused.
     """
-    own = channels.key(cell, f"daemon/{session.zid()}")
+    own = channels.presence(cell, str(session.zid()))
     token = session.liveliness().declare_token(own)
     others = [
         str(reply.ok.key_expr)
-        for reply in session.liveliness().get(channels.key(cell, "daemon/*"), timeout=NEIGHBOURS_TIMEOUT_S)
+        for reply in session.liveliness().get(channels.presence(cell), timeout=NEIGHBOURS_TIMEOUT_S)
         if reply.ok is not None and str(reply.ok.key_expr) != own
     ]
     if not others:
@@ -132,5 +132,5 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     which = f"Zenoh session {others[0].rsplit('/', 1)[1]}"
     with contextlib.suppress(UnreachableError, RefusedError):
         found = Client(session, cell, timeout_s=2.0).status()
-        which += f", version {found['version']}, listening on {', '.join(found['endpoints']) or 'nothing'}"
+        which += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"
     raise OccupiedError(f"cell {cell} is served already ({which}): stop that daemon, or give this one another --cell")

@@ -146,7 +146,7 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
     def pong(sample: zenoh.Sample) -> None:
         trips_ms.append((time.time_ns() - int(sample.payload.to_bytes())) / 1e6)
 
-    with open_session(connect=[endpoint, echo_at]) as session:
+    with open_session(connect=[endpoint, echo_at], more={"mode": "peer"}) as session:
         listening = [
             session.declare_subscriber(channels.key(cell, "joints/command"), command),
             session.declare_subscriber("probe/pong", pong),

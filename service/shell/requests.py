@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
+from service.client import ENCODINGS
 from service.config import Settings
 from service.contract import channels
 from service.contract.requests import (
@@ -42,6 +43,7 @@ DECIDED_S = 0.001  # between looks whether the tick that took a request has been
 MOST_POINTS = 400  # that all via-points come to, with their neighbours
 MOST_WAITING = 16  # requests in a line
 LONGEST_LIST = 100  # bytes
+TEXT = zenoh.Encoding.TEXT_PLAIN
 ORDERS = ("hold", "resume", "reset")
 COMPUTED = "teaching"  # the line of what the workshop computes for
 
@@ -92,7 +94,8 @@ class Line:
             self._waiting.put_nowait((suffix, query))
         except queue.Full:
             with query:
-                query.reply_err(f"busy: {MOST_WAITING} {self._name} requests wait already; try again later".encode())
+                said = f"busy: {MOST_WAITING} {self._name} requests wait already; try again later"
+                query.reply_err(said.encode(), encoding=TEXT)
 
     def close(self) -> None:
         """Ends the thread; what waits is answered first."""
@@ -187,14 +190,14 @@ class Requests:
                 answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")
-                query.reply_err(str(error).encode())
+                query.reply_err(str(error).encode(), encoding=TEXT)
             except Exception as error:  # one request that fails must not end all others
                 self._note(f"{suffix} failed: {error!r}")
-                query.reply_err(f"{type(error).__name__}: {error}".encode())
+                query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
             else:
                 if noted:
                     self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
-                query.reply(key, answer)
+                query.reply(key, answer, encoding=ENCODINGS["json"])
 
     def _answer(self, suffix: str, payload: bytes) -> Reply:
         request = channels.BY_KEY[suffix].codec.decode(payload)

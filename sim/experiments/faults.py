@@ -54,8 +54,8 @@ def _and_reset(mend: Act) -> Act:
 
     def mend_and_reset(cell: FaultyCell) -> None:
         mend(cell)
-        if cell.client.wait_until_ready()["mode"] == "fault":
-            cell.client.ask("reset")
+        if cell.client.wait_until_ready().mode == "fault":
+            cell.client.reset()
 
     return mend_and_reset
 
@@ -97,7 +97,7 @@ def _empty_the_disk(cell: FaultyCell) -> None:
 
 
 def _until_recorded(cell: FaultyCell) -> None:
-    cell.until(lambda: cell.client.status()["scribe"]["state"] == "recording", "nothing was recorded again")
+    cell.until(lambda: cell.client.status().scribe["state"] == "recording", "nothing was recorded again")
 
 
 KILL, STOP, CONT = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT

@@ -54,17 +54,19 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
             commands.undeclare()
 
             reply = daemon.client.add([HANDOVER])
-            assert [point["name"] for point in reply["points"]] == ["handover"]
-            assert reply["points"][0]["missed_by_m"] < 0.005
-            assert daemon.until(lambda s: s["tick"] >= reply["tick"])["places"] == ["handover"]
+            (point,) = reply.points or ()
+            assert point.name == "handover"
+            assert point.missed_by_m < 0.005
+            assert daemon.until(lambda s: s["tick"] >= reply.tick)["places"] == ["handover"]
 
             tracker.left = None
             assert daemon.until(lambda s: s["mode"] == "hold")["reason"] == "stale_hand"
             tracker.left = LEFT
             daemon.until(following)
 
-            held = daemon.client.ask("hold")
-            assert (held["mode"], held["reason"]) == ("hold", "operator")
+            held = daemon.client.hold()
+            assert held.tick > 0
+            assert (held.mode, held.reason) == ("hold", "operator")
             assert daemon.until(lambda s: s["mode"] == "hold")["reason"] == "operator"
             daemon.client.ask("resume")
             daemon.until(following)
@@ -93,13 +95,13 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
         assert daemon.end() == 0
     with serving(tmp_path, "--arm", "assumed") as daemon:
-        assert daemon.client.status()["places"] == ["handover"]
+        assert daemon.client.status().places == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]
         daemon.client.ask("via_points", {"op": "clear"})
         daemon.process.kill()
     with serving(tmp_path, "--arm", "assumed") as daemon:
-        assert daemon.client.status()["places"] == []
+        assert daemon.client.status().places == ()
 
 
 @pytest.mark.parametrize(
@@ -198,8 +200,10 @@ def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> Non
     )
     assert played.returncode == 0, played.stderr
     status = shared_daemon.client.status()
-    assert set(status["hand_age_ms"]) == {"left", "right"}
-    assert status["rejected"].get("not_finite", 0) == 0
+    assert set(status.hand_age_ms) == {"left", "right"}
+    assert status.rejected.get("not_finite", 0) == 0
+    assert "of the left hand" in played.stderr
+    assert "came to the daemon's loop" in played.stderr
 
 
 def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
@@ -263,6 +267,7 @@ def test_bad_usage_and_failures_are_told_on_standard_error(
         "hold",
         "resume",
         "reset",
+        "cells",
         "view",
         "certificates",
     ],

@@ -52,6 +52,7 @@ class Cell:
         self.requests = Requests(near, self.settings, skill, workshop=workshop, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
+        self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
         self.session = far
         self.client = Client(far, self.settings.cell)
         self.client.wait_until_ready()
@@ -177,11 +178,12 @@ def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
 
 
 def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> None:
-    assert cell.client.ask("via_points", {"op": "list"})["points"] == []
-    reply = cell.client.add(PLACES)
-    assert [taught["name"] for taught in reply["points"]] == ["handover", "glass", "soldering"]
-    assert all(taught["missed_by_m"] < 0.003 for taught in reply["points"])
-    assert cell.client.ask("via_points", {"op": "list"})["points"] == reply["points"]
+    assert cell.client.places() == ()
+    points = cell.client.add(PLACES).points
+    assert points is not None
+    assert [taught.name for taught in points] == ["handover", "glass", "soldering"]
+    assert all(taught.missed_by_m < 0.003 for taught in points)
+    assert cell.client.places() == points
 
     moved = cell.client.ask(
         "via_points", add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3]))
@@ -189,16 +191,14 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
     assert len(moved["points"]) == 3
 
-    assert [
-        taught["name"] for taught in cell.client.ask("via_points", {"op": "remove", "names": ["glass"]})["points"]
-    ] == ["handover", "soldering"]
-    assert cell.client.ask("via_points", {"op": "clear"})["points"] == []
+    assert [taught.name for taught in cell.client.remove("glass").points or ()] == ["handover", "soldering"]
+    assert cell.client.clear().points == ()
     assert cell.kinds() == ["skill"] * 4
     assert cell.taken[0].value.via_points == PLACES
 
 
 def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
-    assert "warnings" not in cell.client.add(PLACES)
+    assert cell.client.add(PLACES).warnings == ()
     at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
     reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
     missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
@@ -217,7 +217,7 @@ def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to
     cell: Cell, skill: Skill, name: str
 ) -> None:
     cell.client.add(PLACES)
-    assert len(cell.client.ask("skill", {"name": name})["points"]) == len(PLACES)
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
     other = with_file(replace(skill, learned_from="other demonstrations"))
     (cell.folder / "other.npz").write_bytes(other.file)
     assert cell.client.ask("skill", {"name": "other"})["points"] == []
@@ -261,7 +261,7 @@ def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[Workshop],
         slow.let.set()
         taught = teaching.result(20)
     assert cell.kinds() == ["hold", "skill"]
-    assert held["tick"] < taught["tick"]
+    assert held["tick"] < taught.tick
 
 
 def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Workshop], Cell]) -> None:
@@ -272,7 +272,7 @@ def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[Worksh
         assert slow.begun.wait(10)
         closing = pool.submit(cell.close)
         slow.let.set()
-        assert teaching.result(20)["points"]
+        assert teaching.result(20).points
         closing.result(20)
 
 

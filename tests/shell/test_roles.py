@@ -11,7 +11,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -20,10 +20,10 @@ from cell import LEFT, Tracker, thirdhand
 from cryptography import x509
 
 from service.cli.main import main
-from service.client import Client, UnreachableError, endpoints, open_session
-from service.contract import cdr, channels
+from service.client import Client, UnreachableError, endpoints, living, open_session
+from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
-from service.contract.roles import ROLES, access_control, names
+from service.contract.roles import ROLES, ROUTER, access_control, names
 from service.launch import launched
 from service.shell.door import BOUNDS
 
@@ -31,6 +31,7 @@ CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
+DOMAIN = 3  # of ROS 2
 PATIENCE_S = 1.0  # what is refused is only seen by waiting
 
 
@@ -44,21 +45,33 @@ def secrets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def keys(suffixes: Iterable[str]) -> set[str]:
+    """The keys of streams, in the cell and in the ROS 2 domain."""
+    plain = {channels.key(CELL, suffix) for suffix in suffixes}
+    return plain | {ros2.key(DOMAIN, CELL, channels.BY_KEY[suffix]) for suffix in suffixes}
+
+
 class Guarded:
     """A session in the daemon's place: takes in, publishes and answers as a daemon does."""
 
     def __init__(self, secrets: Path, revoked: tuple[str, ...] = ()) -> None:
         self.session = open_session(
-            listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=BOUNDS | access_control(CELL, revoked)
+            listen=["tls/127.0.0.1:0"],
+            certificate=secrets / "daemon",
+            more=BOUNDS | access_control(CELL, revoked, DOMAIN),
         )
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
         self.asked: set[str] = set()
         self._declared = [
-            self.session.declare_subscriber(channels.key(CELL, key), lambda s: self.taken.add(str(s.key_expr)))
-            for key in INPUTS
+            self.session.declare_subscriber(key, lambda s: self.taken.add(str(s.key_expr))) for key in keys(INPUTS)
         ]
-        self._publishers = [self.session.declare_publisher(channels.key(CELL, key)) for key in OUTPUTS]
+        self._publishers = [self.session.declare_publisher(key) for key in keys(OUTPUTS)]
+        own = str(self.session.zid())
+        topics = ros2.tokens(DOMAIN, CELL, own, ros2.HEARD).values()
+        self._tokens = [
+            self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, own), *topics)
+        ]
         self._answering = [self.session.declare_queryable(channels.key(CELL, key), self._answer) for key in REQUESTS]
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -95,7 +108,7 @@ def within(what: Callable[[], bool]) -> bool:
 @pytest.mark.parametrize("name", ROLES)
 def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path, name: str) -> None:
     role = ROLES[name]
-    full = {key: channels.key(CELL, key) for key in (*INPUTS, *OUTPUTS, *REQUESTS)}
+    full = {key: channels.key(CELL, key) for key in REQUESTS}
     guarded.taken.clear()
     guarded.asked.clear()
     with (
@@ -112,24 +125,32 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         def observe(sample: zenoh.Sample) -> None:
             forged.extend([str(sample.key_expr)] if bytes(sample.payload) != b"out" else [])
 
-        heard = [session.declare_subscriber(key, hear) for key in (*full.values(), "**")]
+        streams = keys((*INPUTS, *OUTPUTS))
+        heard = [session.declare_subscriber(key, hear) for key in (*full.values(), *streams, "**")]
+        false_token = session.liveliness().declare_token(channels.presence(CELL, "f00"))
         false_answers = [session.declare_queryable(full[key], lambda query: query.drop()) for key in REQUESTS]
-        seen = [observer.declare_subscriber(full[key], observe) for key in OUTPUTS]
+        seen = [observer.declare_subscriber(key, observe) for key in keys(OUTPUTS)]
         assert within(lambda: Client(operator, CELL, timeout_s=1.0).ask("status") == {})
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
-            for key in (*INPUTS, *OUTPUTS):  # every input, and every output in the daemon's place
-                session.put(full[key], b"from a client")
+            for key in streams:  # every input, and every output in the daemon's place
+                session.put(key, b"from a client")
             guarded.publish()
             time.sleep(0.05)
+        own = {str(guarded.session.zid())}
+        assert living(session, CELL) == own | {"f00"}  # its own words it hears too
+        assert living(observer, CELL) == (own | {"f00"} if name == ROUTER else own)
+        listed = session.liveliness().get(ros2.all_tokens(DOMAIN), timeout=5.0)
+        assert len({str(reply.ok.key_expr) for reply in listed if reply.ok}) == 1 + len(INPUTS) + len(OUTPUTS)
+        false_token.undeclare()
         asked = [session.get(full[key], payload=b"{}", timeout=PATIENCE_S) for key in REQUESTS]
         answered = sum(reply.ok is not None for replies in asked for reply in replies)
         for declared in (*heard, *seen, *false_answers):
             declared.undeclare()
-    assert guarded.taken == {full[key] for key in role.publishes}
-    assert got == ({full[key] for key in OUTPUTS} if role.hears else set())
+    assert guarded.taken == keys(role.publishes)
+    assert got == (keys(OUTPUTS) if role.hears else set())
     assert forged == []
-    assert answered == (len(REQUESTS) if role.asks else 0)
+    assert answered == (len(REQUESTS) if role.asks else 1)  # the status is for all
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
 
 
@@ -301,7 +322,7 @@ def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path
         ):
             client = Client(operating)
             client.ask("resume")
-            assert within(lambda: client.status()["mode"] == "follow")
+            assert within(lambda: client.status().mode == "follow")
             operating.put("thirdhand/hands/left", cdr.encode_pose(PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))))
         assert service.stop() == 0
     written = [path for path in (tmp_path / "records").rglob("*") if path.is_file()]

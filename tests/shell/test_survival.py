@@ -200,7 +200,7 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         other = tmp_path / "other"
         other.mkdir()
         with serving(other, "--arm", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
-            assert daemon.client.status()["cell"] == "thirdhand"
+            assert daemon.client.status().cell == "thirdhand"
         assert daemon.end() == 0
 
 
@@ -238,8 +238,8 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
     with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
         told = daemon.client.status()
         said = thirdhand("status", "--connect", daemon.endpoint)
-        assert (told["tick"], told["mode"], told["reason"], told["remedy"]) == (-1, "hold", "", "")
-        assert (told["hand_age_ms"], told["hand_distance_m"]) == ({}, 3.0)
+        assert (told.tick, told.mode, told.reason, told.remedy) == (-1, "hold", "", "")
+        assert (told.hand_age_ms, told.hand_distance_m) == ({}, 3.0)
         rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
         assert rows["mode"] == "starting: nothing has been decided yet"
         assert rows.keys() == {"mode", "skill", "listening"}

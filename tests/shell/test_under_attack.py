@@ -103,7 +103,7 @@ def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
 def slowest_hold_s(daemon: Daemon, during_s: float = 1.5) -> float:
     """The longest that a hold took to be in force; the status goes on meanwhile."""
     worst, end = 0.0, time.monotonic() + during_s
-    first = daemon.client.status()["tick"]
+    first = daemon.client.status().tick
     while (begin := time.monotonic()) < end:
         daemon.client.ask("hold")
         worst = max(worst, time.monotonic() - begin)
@@ -132,7 +132,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with serving(tmp_path_factory.mktemp("attacked"), "--arm", "assumed", before=FEW_DESCRIPTORS) as daemon:
         yield daemon
         log = daemon.log.read_text()
-        assert daemon.client.status()["mode"] != "fault", log
+        assert daemon.client.status().mode != "fault", log
         assert daemon.end() == 0
         assert "Traceback" not in log
 
@@ -254,7 +254,7 @@ def test_large_messages_are_not_taken_in(daemon: Daemon) -> None:
         assert said == "0"
         assert slowest_hold_s(daemon) < SOON_S
     assert peak_mib(daemon.process.pid) - before < 32
-    assert daemon.client.status()["rejected"].get("malformed hands/left") is None
+    assert daemon.client.status().rejected.get("malformed hands/left") is None
 
 
 def test_a_client_is_told_that_its_request_is_too_large(daemon: Daemon) -> None:

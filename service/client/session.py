@@ -1,6 +1,4 @@
-"""What a client of the daemon needs: a Zenoh session that announces nothing, and its requests as
-plain calls.
-"""
+"""Zenoh sessions between named endpoints, which announce nothing."""
 
 from __future__ import annotations
 
@@ -8,14 +6,12 @@ import datetime
 import json
 import os
 import re
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from service.contract import channels, requests
 from service.contract.explain import ExplainedError
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
@@ -34,19 +30,30 @@ def open_session(
     *,
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
+    otherwise: Sequence[str] = (),
     timeout_s: float = 10.0,
     certificate: str | Path | None = None,
+    zenoh_config: str | Path | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
     """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
 
+    One that only connects is a Zenoh client, of the first endpoint that answers: peers do not meet
+    through a router. One that listens is a peer, or where it connects too a router, unless
+    `zenoh_config`, a file of Zenoh's own, says a `mode`. All else that is set here goes before what
+    that file says. Only a client that is given no `connect` takes the file's endpoints, or else
+    those in `otherwise`.
+
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
-    begin with `tls/`; where it is None, the one that $THIRDHAND_CERTIFICATE names is taken. Close
-    the session. Raises UnreachableError.
+    begin with `tls/`. Where one of the two is None, the one that $THIRDHAND_CERTIFICATE or
+    $THIRDHAND_ZENOH_CONFIG names is taken. Close the session. Raises UnreachableError.
     """
-    config = zenoh.Config()
+    config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
+    if otherwise and not connect and not listen:
+        connect = _endpoints_in(config) or otherwise
+    role = ("router" if connect else "peer") if listen or not connect else "client"
     settings: dict[str, Any] = {
-        "mode": "peer",
+        "mode": json.loads(config.get_json("mode")) or role,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "listen/endpoints": list(listen),
@@ -55,7 +62,9 @@ def open_session(
         "connect/exit_on_failure": True,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
-        "adminspace/enabled": bool(listen),
+        "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
+        "plugins_loading/enabled": False,
+        "namespace": None,  # the contract's keys are whole
         "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in
         **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
         **(more or {}),
@@ -65,28 +74,44 @@ def open_session(
             config.insert_json5(name, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
-        reason = str(error).split(" at ")[0]
-        wrong = next(
-            (
-                endpoint
-                for endpoint in (*connect, *listen)
-                if not re.match(r"[a-z]+/.+:.+|unixsock-stream/.+", endpoint)
-            ),
-            None,
+        raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
+
+
+def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
+    """In words, why there is no session between these endpoints."""
+    form = r"[a-z]+/.+:.+|unixsock-stream/.+"
+    wrong = next((endpoint for endpoint in (*connect, *listen) if not re.match(form, endpoint)), None)
+    if wrong is not None:
+        how = f"connect to {wrong}" if wrong in connect else f"listen on {wrong}"
+        return f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed"
+    if connect and "connect" in reason:
+        secured = any(endpoint.startswith("tls/") for endpoint in connect)
+        return (
+            f"nobody answers at {', '.join(connect)}: "
+            "is a daemon running and listening there, or a router, and not overrun?"
+            + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
+            "not expired?" * secured
         )
-        if wrong is not None:
-            how = f"connect to {wrong}" if wrong in connect else f"listen on {wrong}"
-            raise UnreachableError(
-                f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed"
-            ) from None
-        if connect and "connect" in reason:
-            secured = any(endpoint.startswith("tls/") for endpoint in connect)
-            raise UnreachableError(
-                f"nobody answers at {', '.join(connect)}: is a daemon running and listening there, and not overrun?"
-                + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
-                "not expired?" * secured
-            ) from None
-        raise UnreachableError(f"cannot listen on {', '.join(listen)}: {reason}") from None
+    return f"cannot listen on {', '.join(listen)}: {reason}" if listen else f"no Zenoh session: {reason}"
+
+
+def _zenoh_config(path: str | Path | None) -> zenoh.Config:
+    """What a file of Zenoh's own says, or Zenoh's defaults. Raises UnreachableError."""
+    if not path:
+        return zenoh.Config()
+    try:
+        file = Path(path).expanduser()
+        file.read_bytes()
+        return zenoh.Config.from_file(file)
+    except (OSError, RuntimeError, zenoh.ZError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise UnreachableError(f"cannot read the Zenoh configuration {path}: {reason}") from None
+
+
+def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
+    """The endpoints to connect to that a configuration says for every mode or for clients."""
+    said = json.loads(config.get_json("connect/endpoints"))
+    return tuple(said.get("client") or () if isinstance(said, dict) else said or ())
 
 
 def _tls(folder: str | Path | None) -> dict[str, Any]:
@@ -109,7 +134,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
     settings |= {"verify_name_on_connect": True, "close_link_on_expiration": True}
-    return {f"transport/link/tls/{name}": value for name, value in settings.items()}
+    return {"transport/link/tls": settings}  # whole: nothing of another's stays beside it
 
 
 def _check_dates(path: Path) -> None:
@@ -141,51 +166,3 @@ def endpoints(session: zenoh.Session) -> tuple[str, ...]:
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
     return ()
-
-
-class Client:
-    """A running daemon's requests as calls.
-
-    Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers.
-    """
-
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
-        self._session = session
-        self._cell = cell
-        self._timeout_s = timeout_s
-
-    def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
-        """The reply to one request; `request` is anything that becomes JSON."""
-        payload = requests.encode_json({} if request is None else request)
-        if len(payload) > channels.LARGEST_REQUEST:
-            raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
-        for reply in self._session.get(channels.key(self._cell, suffix), payload=payload, timeout=self._timeout_s):
-            if reply.ok is not None:
-                answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
-                return answer
-            text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else "no reason given"
-            if text != "Timeout":
-                raise RefusedError(text)
-        raise UnreachableError(
-            f"nobody answers on {channels.key(self._cell, suffix)}: "
-            "is the daemon running there, and is the cell's name right?"
-        )
-
-    def status(self) -> dict[str, Any]:
-        """What `<cell>/status` carries."""
-        return self.ask("status")
-
-    def add(self, points: Iterable[requests.ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> dict[str, Any]:
-        """Teaches via-points; returns once they are in force."""
-        return self.ask("via_points", requests.Add(tuple(points), tolerance))
-
-    def wait_until_ready(self, *, timeout_s: float = 15.0) -> dict[str, Any]:
-        """The status, once a daemon answers on this cell."""
-        end = time.monotonic() + timeout_s
-        while True:
-            try:
-                return self.status()
-            except UnreachableError:
-                if time.monotonic() > end:
-                    raise
-                time.sleep(0.05)

@@ -1,0 +1,44 @@
+"""A follower of joint commands: here an arm that is ideal and only a list of numbers. It tells its
+joints, and brakes where commands end. Try: python examples/follower.py --seconds 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from service.client import Follower, open_session
+from service.config import Settings
+
+PERIOD_S = 0.005
+
+
+def main(arguments: list[str] | None = None) -> list[float]:
+    """The joints [rad] after so many seconds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    args = parser.parse_args(arguments)
+    names, joints = Settings().joints.names, list(Settings().arm.posture)
+    with open_session(connect=[args.connect]) as session, Follower(session, names) as follower:
+        begin, braking = time.monotonic(), True
+        while time.monotonic() - begin < args.seconds:
+            command = follower.command()  # waits for one, 20 ms at most
+            if command is None:
+                velocity = (0.0,) * len(joints)  # an arm of mass would brake
+            else:
+                joints, velocity = list(command.position), command.velocity
+            if braking != (command is None):
+                braking = not braking
+                print(
+                    "no command for 20 ms: it brakes" if command is None else f"commands come, at tick {command.tick}"
+                )
+            follower.tell(joints, velocity)
+            time.sleep(PERIOD_S)
+        if follower.rejected:
+            print(f"{follower.rejected} commands were none of this arm's: {follower.reason}")
+    return joints
+
+
+if __name__ == "__main__":
+    main()

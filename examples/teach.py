@@ -1,0 +1,42 @@
+"""Teaches one place to a running daemon, looks how well it is met, and forgets it again.
+Try: python examples/teach.py
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from service.client import Client, RefusedError, open_session
+from service.contract.requests import ViaPoint
+
+HANDOVER = ViaPoint(
+    "example",
+    left=(0.62, -0.28, 0.30),
+    right=(0.98, 0.32, 0.06),
+    tool=(0.54, -0.28, 0.38),  # where the tool is to go with the hands there [m]
+    std=0.001,  # how exactly [m]
+    radius=0.03,  # also for hands so far off [m]
+    follow="left",  # within that the tool moves with the left hand
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints what the daemon answers."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
+    args = parser.parse_args(arguments)
+    with open_session(connect=[args.connect]) as session:
+        client = Client(session)
+        reply = client.add([HANDOVER])
+        print(f"in force since tick {reply.tick}")
+        for point in client.places():
+            print(f"{point.name}: missed by {1000 * point.missed_by_m:.1f} mm")
+        try:
+            client.remove("no such place")
+        except RefusedError as error:
+            print(f"refused: {error}")
+        client.remove(HANDOVER.name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""What a client of the daemon needs: sessions, requests as plain calls, hands in and commands out,
+and which daemons there are.
+"""
+
+from service.client.calls import Client
+from service.client.presence import Cell, cells, living
+from service.client.session import (
+    AUTHORITY,
+    CERTIFICATE,
+    ENDPOINTS_TIMEOUT_S,
+    KEY,
+    RefusedError,
+    UnreachableError,
+    endpoints,
+    open_session,
+)
+from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, publisher
+
+__all__ = [
+    "AUTHORITY",
+    "BRAKE_AFTER_S",
+    "CERTIFICATE",
+    "ENCODINGS",
+    "ENDPOINTS_TIMEOUT_S",
+    "KEY",
+    "Cell",
+    "Client",
+    "Command",
+    "Follower",
+    "RefusedError",
+    "Tracker",
+    "UnreachableError",
+    "cells",
+    "endpoints",
+    "living",
+    "open_session",
+    "publisher",
+]

@@ -1,0 +1,127 @@
+"""A running daemon's requests as calls, and their answers as the contract's types."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from service.client.presence import living
+from service.client.session import RefusedError, UnreachableError
+from service.contract import channels, requests
+from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
+
+ASKED_AGAIN_S = 0.05
+Answer = TypeVar("Answer")
+
+
+class Client:
+    """A running daemon's requests as calls.
+
+    Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers: only
+    the answer of a daemon that is alive counts, not what a Zenoh storage kept of one.
+    """
+
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
+        self._session = session
+        self._cell = cell
+        self._timeout_s = timeout_s
+
+    def hold(self) -> Reply:
+        """Stops the arm, which then stays; returns once that is in force."""
+        return self._typed("hold", None, Reply)
+
+    def resume(self) -> Reply:
+        """Ends an operator's hold; returns once that is in force."""
+        return self._typed("resume", None, Reply)
+
+    def reset(self) -> Reply:
+        """Ends a fault; returns once that is in force."""
+        return self._typed("reset", None, Reply)
+
+    def status(self) -> Status:
+        """What `<cell>/status` carries."""
+        return self._typed("status", None, Status)
+
+    def places(self) -> tuple[ViaPointInForce, ...]:
+        """The via-points in force, and how far each is missed [m]."""
+        return self._typed("via_points", requests.List(), Reply).points or ()
+
+    def add(self, points: Iterable[ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> Reply:
+        """Teaches via-points, all or nothing; returns once they are in force.
+
+        Points that were learned nearer than `tolerance` [m] give way.
+        """
+        return self._typed("via_points", requests.Add(tuple(points), tolerance), Reply)
+
+    def remove(self, *names: str) -> Reply:
+        """Forgets via-points by name, all or nothing; returns once that is in force."""
+        return self._typed("via_points", requests.Remove(names), Reply)
+
+    def clear(self) -> Reply:
+        """Forgets all via-points; returns once that is in force."""
+        return self._typed("via_points", requests.Clear(), Reply)
+
+    def load_skill(self, name: str) -> Reply:
+        """Loads a file of the daemon's skill folder; returns once it is in force."""
+        return self._typed("skill", requests.SkillRequest(name), Reply)
+
+    def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
+        """The reply to one request as it came; `request` is anything that becomes JSON."""
+        answer: dict[str, Any] = json.loads(self._answer(suffix, request))
+        return answer
+
+    def wait_until_ready(self, *, timeout_s: float = 15.0) -> Status:
+        """The status, once a daemon answers on this cell."""
+        end = time.monotonic() + timeout_s
+        while True:
+            try:
+                return self.status()
+            except UnreachableError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(ASKED_AGAIN_S)
+
+    def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
+        try:
+            return msgspec.json.decode(self._answer(suffix, request), type=kind)
+        except msgspec.DecodeError as error:
+            raise RefusedError(
+                f"the answer on {self._key(suffix)} is not a {kind.__name__}: {error}. Is the daemon of this version?"
+            ) from None
+
+    def _answer(self, suffix: str, request: Any) -> bytes:
+        payload = requests.encode_json({} if request is None else request)
+        if len(payload) > channels.LARGEST_REQUEST:
+            raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
+        alive: frozenset[str] | None = None
+        for reply in self._session.get(
+            self._key(suffix),
+            payload=payload,
+            encoding=zenoh.Encoding.APPLICATION_JSON,
+            target=zenoh.QueryTarget.ALL,  # a storage that calls itself complete would else be asked alone,
+            consolidation=zenoh.ConsolidationMode.NONE,  # and its answer be taken for the daemon's
+            timeout=self._timeout_s,
+        ):
+            text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")
+            if text == "Timeout":
+                continue
+            if alive is None:
+                alive = living(self._session, self._cell, timeout_s=self._timeout_s)
+            if reply.replier_id is None or str(reply.replier_id.zid) not in alive:
+                continue
+            if reply.ok is None:
+                raise RefusedError(text or "no reason given")
+            return reply.ok.payload.to_bytes()
+        raise UnreachableError(
+            f"nobody answers on {self._key(suffix)}: is the daemon running there, and is the cell's name right?"
+            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps what one said."
+            * (alive is not None)
+        )
+
+    def _key(self, suffix: str) -> str:
+        return channels.key(self._cell, suffix)

@@ -1,0 +1,158 @@
+"""The streams of a cell from a client's side: a tracker's hands in, a follower's commands out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+import zenoh
+
+from service.client.presence import living
+from service.client.session import UnreachableError
+from service.contract import cdr, channels
+from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
+
+BRAKE_AFTER_S = 0.02  # without a command: then whoever follows brakes
+ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
+ASKED_AGAIN_S = 0.02
+UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
+SIDES = ("left", "right")
+
+
+def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
+    """A publisher on one channel of a cell, of the encoding that the contract says; it drops what
+    cannot be sent rather than wait.
+    """
+    return session.declare_publisher(
+        channels.key(cell, suffix),
+        encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
+        congestion_control=zenoh.CongestionControl.DROP,
+        **more,
+    )
+
+
+class Tracker:
+    """Publishes hand poses of a cell, as long as its context lasts.
+
+    Up to `timeout_s` [s] it waits for a living daemon. Raises UnreachableError where there is none.
+    """
+
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 5.0) -> None:
+        self._session, self._cell = session, cell
+        self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
+        until = time.monotonic() + timeout_s
+        while not self.heard():
+            if time.monotonic() > until:
+                self.close()
+                raise UnreachableError(
+                    f"no daemon listens to {channels.key(cell, 'hands/left')}: is one running in this cell?"
+                )
+            time.sleep(ASKED_AGAIN_S)
+
+    def publish(
+        self,
+        side: str,
+        position: Vector3,
+        orientation: Quaternion = UNTURNED,
+        *,
+        stamp_ns: int | None = None,
+        frame_id: str = BASE,
+    ) -> None:
+        """Publishes one hand, `left` or `right`: position [m], quaternion x y z w.
+
+        `stamp_ns` is when it was seen [ns since 1970]; None: now. Stamps of a hand must grow.
+        Raises ValueError for another hand.
+        """
+        if side not in self._publishers:
+            raise ValueError(f"hand {side!r} given; {' or '.join(SIDES)} accepted")
+        pose = PoseStamped(time.time_ns() if stamp_ns is None else stamp_ns, frame_id, position, orientation)
+        self._publishers[side].put(cdr.encode_pose(pose))
+
+    def heard(self) -> bool:
+        """Whether a daemon of the cell is alive, and both hands are listened to."""
+        listened = all(publisher.matching_status for publisher in self._publishers.values())
+        return listened and bool(living(self._session, self._cell))
+
+    def close(self) -> None:
+        """Publishes no more."""
+        for one in self._publishers.values():
+            one.undeclare()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Command(NamedTuple):
+    """What the arm is to do: position [rad] and velocity [rad/s] of the joints that were asked for.
+
+    Beside it the tick that decided it, when it was published and the stamp of the newest hand
+    sample that it answers [ns]; -1, 0 and 0 where its sender did not say.
+    """
+
+    stamp_ns: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    tick: int
+    published_ns: int
+    hand_stamp_ns: int
+
+
+class Follower:
+    """Takes joint commands of a cell and tells the joints' state, as long as its context lasts.
+
+    `names` are the arm's joints, in the order of all that is given and taken here. A command that
+    is no command of these joints is not taken; `rejected` counts them, `reason` is the last one's.
+    """
+
+    def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
+        self.rejected, self.reason = 0, ""
+        self._names = tuple(names)
+        self._came = threading.Condition()
+        self._newest: Command | None = None
+        self._state = publisher(session, cell, "joints/state", express=True)
+        self._subscriber = session.declare_subscriber(channels.key(cell, "joints/command"), self._take)
+
+    def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
+        """The newest command that was not taken yet, once there is one.
+
+        None after `timeout_s` [s] without: whoever follows brakes then.
+        """
+        with self._came:
+            self._came.wait_for(lambda: self._newest is not None, timeout_s)
+            newest, self._newest = self._newest, None
+            return newest
+
+    def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
+        """Publishes the joints as measured [rad, rad/s]; `stamp_ns` is when [ns], None: now."""
+        now_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        self._state.put(cdr.encode_joints(JointState(now_ns, self._names, tuple(position), tuple(velocity))))
+
+    def close(self) -> None:
+        """Takes and tells no more."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._state.undeclare()  # type: ignore[no-untyped-call]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        try:
+            message = cdr.decode_joints(sample.payload.to_bytes())
+            position, velocity = in_order(message, self._names)
+            if not finite(position + velocity):
+                raise WireError("a joint that is not finite")
+            rides = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
+        except WireError as error:
+            self.rejected, self.reason = self.rejected + 1, str(error)
+            return
+        with self._came:
+            self._newest = Command(message.stamp_ns, position, velocity, *rides)
+            self._came.notify()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,65 @@
+"""How a cell is reached: endpoints, certificates, and who else sees it."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import Annotated
+
+import msgspec
+
+from service.contract import ros2
+from service.contract.channels import ENDPOINT
+from service.contract.roles import DAEMON, ROLES, names
+
+Domain = Annotated[
+    Annotated[int, msgspec.Meta(ge=0, le=ros2.LAST_DOMAIN)] | None,
+    msgspec.Meta(extra={"accepted": f"a whole number from 0 to {ros2.LAST_DOMAIN}"}),
+]
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether only processes of this machine reach a Zenoh endpoint."""
+    protocol, _, address = endpoint.partition("/")
+    host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
+    try:
+        return protocol == "unixsock-stream" or host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Zenoh endpoints. Nothing is announced by multicast; peers are named.
+
+    With a certificate all endpoints are TLS, and each role may do its own only.
+    """
+
+    listen: tuple[str, ...] = (ENDPOINT,)
+    connect: tuple[str, ...] = ()
+    certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
+    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
+    zenoh_config: str = ""  # a file of Zenoh's own, for what is not set by the service; empty: none
+    ros2_domain: Domain = None  # of ROS 2 nodes that see the cell through rmw_zenoh; None: none
+    allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
+
+    def __post_init__(self) -> None:
+        endpoints = {f"listen[{i}]": endpoint for i, endpoint in enumerate(self.listen)}
+        endpoints |= {f"connect[{i}]": endpoint for i, endpoint in enumerate(self.connect)}
+        for name, endpoint in endpoints.items():
+            if self.certificate and not endpoint.startswith("tls/"):
+                raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
+            if not self.certificate and endpoint.startswith("tls/"):
+                raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
+            if not (self.certificate or self.allow_insecure or is_local(endpoint)):
+                raise ValueError(
+                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an address like "
+                    "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
+                )
+        if self.revoked and not self.certificate:
+            raise ValueError("$.network.revoked: given without $.network.certificate; without one nobody is told apart")
+        for i, name in enumerate(self.revoked):
+            if not any(name in names(role) for role in (*ROLES, DAEMON)):
+                raise ValueError(
+                    f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
+                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
+                )

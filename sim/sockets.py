@@ -1,0 +1,61 @@
+"""A relay of TCP connections that counts what passes."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from typing import Self
+
+
+class CountingRelay:
+    """Carries bytes between whoever connects to `endpoint` and a target, as long as its context
+    lasts.
+    """
+
+    def __init__(self, target: str) -> None:
+        host, _, port = target.removeprefix("tcp/").rpartition(":")
+        self._target = host, int(port)
+        self._there = self._back = 0
+        self._sockets: list[socket.socket] = []
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
+        self._spawn(self._accept)
+
+    def counted(self) -> tuple[int, int]:
+        """Bytes that were carried to the target and back from it so far."""
+        return self._there, self._back
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in (self._listening, *self._sockets):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+    @staticmethod
+    def _spawn(work: object, *arguments: object) -> None:
+        threading.Thread(target=work, args=arguments, name="relay", daemon=True).start()  # type: ignore[arg-type]
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # it is closed
+            while True:
+                near, _ = self._listening.accept()
+                far = socket.create_connection(self._target)
+                self._sockets += [near, far]
+                self._spawn(self._carry, near, far, True)
+                self._spawn(self._carry, far, near, False)
+
+    def _carry(self, source: socket.socket, sink: socket.socket, there: bool) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                sink.sendall(data)
+                if there:
+                    self._there += len(data)
+                else:
+                    self._back += len(data)
+        for one in (source, sink):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)

@@ -1,0 +1,54 @@
+"""Many daemons in one process, each a cell of its own, all connected to one router: `python
+many_cells.py FOLDER ENDPOINT CELL ...` serves until its standard input ends.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import os
+import sys
+import threading
+from pathlib import Path
+
+import msgspec
+
+from service.cli.usage import recordings, shipped
+from service.config import ArmSettings, Files, Settings
+from service.network_settings import Network
+from service.recorder.client import Scribe
+from service.shell import daemon
+from service.shell.daemon import Daemon
+from service.shell.door import Lock
+from service.shell.saved_via_points import state_folder
+from service.shell.workshop import Workshop
+
+RATE_HZ, ROS2_DOMAIN = 50, 7
+
+
+def main(folder: Path, endpoint: str, *cells: str) -> None:
+    """Serves the cells; each says its name once it is announced."""
+    skill, workshop = shipped(), Workshop()
+    daemons = []
+    for cell in cells:
+        settings = Settings(
+            cell=cell,
+            rate_hz=RATE_HZ,
+            arm=msgspec.structs.replace(ArmSettings(), source="assumed"),
+            network=Network(listen=(), connect=(endpoint,), ros2_domain=ROS2_DOMAIN),
+            files=Files(state=str(folder)),
+        )
+        lock = Lock(state_folder(settings), cell)
+        scribe = Scribe(settings)
+        daemons.append(Daemon(settings, skill, workshop=workshop, skills=recordings(), scribe=scribe, lock=lock))
+        daemon.rehearse = lambda *_, **__: None  # once a process is enough
+    for one, cell in zip(daemons, cells, strict=True):
+        say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
+        say.start()
+    sys.stdin.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *sys.argv[2:])

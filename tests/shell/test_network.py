@@ -1,0 +1,268 @@
+"""Eight daemons and their clients on one Zenoh router, also as ROS 2 sees them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import zenoh
+from many_cells import ROS2_DOMAIN
+from tests_paths import RECORDINGS, ROOT
+from wam import JOINT_NAMES
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
+from zenoh_ros2_sdk.session import ZenohSession
+
+from service.cli.main import main
+from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
+from service.contract import cdr, channels, requests, ros2, ros2msg
+from service.contract.messages import PoseStamped
+
+NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
+LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
+
+
+class Lab(NamedTuple):
+    """A router's endpoint, a session that is its client, and the process of eight daemons."""
+
+    endpoint: str
+    session: zenoh.Session
+    daemons: subprocess.Popen[str]
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as router:
+        (endpoint,) = endpoints(router)
+        command = [sys.executable, str(ROOT / "tests" / "many_cells.py"), str(tmp_path_factory.mktemp("lab")), endpoint]
+        process = subprocess.Popen([*command, *NAMES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            assert {process.stdout.readline().strip() for _ in NAMES} == set(NAMES)
+            with open_session(connect=[endpoint]) as session:
+                yield Lab(endpoint, session, process)
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def until(what: Callable[[], Any], within_s: float = 15.0) -> Any:
+    """What a call returns, once that is true."""
+    end = time.monotonic() + within_s
+    while not (found := what()):
+        assert time.monotonic() < end, "it did not come to hold"
+        time.sleep(0.05)
+    return found
+
+
+def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
+    lab: Lab, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """While the hands of one are followed, and then held by its client."""
+    encodings: dict[str, str] = {}
+    heard = lab.session.declare_subscriber(
+        f"{NAMES[0]}/**", lambda sample: encodings.setdefault(str(sample.key_expr), str(sample.encoding))
+    )
+    client = Client(lab.session, NAMES[0])
+    with Tracker(lab.session, NAMES[0]) as tracker:
+
+        def modes() -> dict[str, str]:
+            tracker.publish("left", LEFT)
+            tracker.publish("right", RIGHT)
+            return {cell.name: cell.status.mode for cell in cells(lab.session) if cell.status}
+
+        others = dict.fromkeys(NAMES[1:], "hold")
+        until(lambda: modes() == {NAMES[0]: "follow"} | others and f"{NAMES[0]}/tool/target" in encodings)
+        assert client.hold().tick > 0
+        until(lambda: modes() == {NAMES[0]: "hold"} | others)
+        assert client.status().reason == "operator"
+        assert client.resume().tick > 0
+    until(lambda: client.status().reason == "stale_hand")
+    heard.undeclare()
+    told = {channels.key(NAMES[0], c.key): c.codec.encoding for c in (*ros2.SAID, *ros2.HEARD[:2])}
+    assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}
+    assert main(["cells", "--connect", lab.endpoint]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == sorted(NAMES)
+    assert all("  hold (no_hands) " in line for line in lines[1:])
+    assert main(["cells", "--json", "--connect", lab.endpoint]) == 0
+    assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
+
+
+def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    play = ["play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "50", "--connect", lab.endpoint]
+    assert main([*play, "--cell", NAMES[1]]) == 0
+    assert "of the left hand, " in (said := capsys.readouterr().err)
+    assert "came to the daemon's loop" in said
+    client = Client(lab.session, NAMES[1])
+    assert client.status().received["hands/left"] > 3
+    stuck = requests.encode_json(client.status())
+    with pytest.raises(UnreachableError, match="no daemon listens to nowhere/hands/left"):
+        Tracker(lab.session, "nowhere", timeout_s=0.1)
+    with (
+        _answering(lab, "stuck/status", stuck),
+        lab.session.liveliness().declare_token(channels.presence("stuck", str(lab.session.zid()))),
+        lab.session.declare_subscriber("stuck/hands/*", lambda sample: None),
+    ):
+        assert main([*play, "--cell", "stuck"]) == 1
+    assert "the daemon counted 0 of " in capsys.readouterr().err
+
+
+@contextlib.contextmanager
+def _answering(lab: Lab, key: str, answer: bytes) -> Iterator[None]:
+    """Something that answers on a key as a storage does, as long as the context lasts."""
+    queryable = lab.session.declare_queryable(key, lambda query: query.reply(key, answer), complete=True)
+    yield
+    queryable.undeclare()
+
+
+def test_what_a_storage_kept_passes_for_no_daemon(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    with open_session(connect=[lab.endpoint]) as asking:
+        live = Client(asking, NAMES[3])
+        kept = requests.encode_json(live.status()).replace(b'"hold"', b'"follow"')
+        with _answering(lab, f"{NAMES[3]}/status", kept), _answering(lab, "gone/status", kept):
+            assert {live.status().mode for _ in range(5)} == {"hold"}
+            with pytest.raises(UnreachableError, match="no daemon of this cell is alive: a Zenoh storage"):
+                Client(asking, "gone", timeout_s=1.0).status()
+            assert main(["status", "--cell", "gone", "--connect", lab.endpoint]) == 1
+    assert "no daemon of this cell is alive" in capsys.readouterr().err
+
+
+# --- as ROS 2 sees it ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ros(lab: Lab) -> Iterator[dict[str, Any]]:
+    """Where a ROS 2 node finds the domain."""
+    at = {"domain_id": ROS2_DOMAIN, "router_ip": "127.0.0.1", "router_port": int(lab.endpoint.rpartition(":")[2])}
+    yield at
+    ZenohSession.get_instance().close()
+
+
+def typed(kind: str) -> dict[str, str]:
+    """What a ROS 2 node knows of a message type."""
+    definition = ros2msg.schema(kind, joints=len(JOINT_NAMES))
+    return {"msg_type": kind, "msg_definition": definition, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
+
+
+def test_ros2_lists_the_topics_of_every_cell_with_their_types(ros: dict[str, Any]) -> None:
+    found = {name: kinds for name, kinds in get_topic_names_and_types(**ros, timeout=5.0) if name[:4] == "/lab"}
+    expected = {f"/{name}/{c.key}": [ros2.type_of(c)] for name in NAMES for c in (*ros2.HEARD[:2], *ros2.SAID)}
+    assert found == expected
+
+
+def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, Any]) -> None:
+    cell, said = NAMES[4], list[Any]()
+    commands, statuses = list[Any](), list[Any]()
+    topics = {f"/{cell}/joints/command": ("sensor_msgs/msg/JointState", commands.append)}
+    topics |= {f"/{cell}/status": ("std_msgs/msg/String", statuses.append)}
+    listening = [ROS2Subscriber(topic, callback=take, **typed(kind), **ros) for topic, (kind, take) in topics.items()]
+    pose = typed("geometry_msgs/msg/PoseStamped")
+    hands = [ROS2Publisher(f"/{cell}/hands/{side}", **pose, **ros) for side in ("left", "right")]
+    store = hands[0].session_mgr.store.types
+    header, stamp, place, point, turn = (
+        store[name]
+        for name in (
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+            "geometry_msgs/msg/Pose",
+            "geometry_msgs/msg/Point",
+            "geometry_msgs/msg/Quaternion",
+        )
+    )
+
+    def follows() -> bool:
+        now_ns = time.time_ns()
+        at = header(stamp=stamp(sec=now_ns // 10**9, nanosec=now_ns % 10**9), frame_id="base")
+        for hand, (x, y, z) in zip(hands, (LEFT, RIGHT), strict=True):
+            hand.publish(
+                header=at, pose=place(position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0))
+            )
+        said[:] = [json.loads(status.data)["mode"] for status in statuses]
+        return "follow" in said
+
+    until(follows)
+    for one in (*listening, *hands):
+        one.close()
+    assert tuple(commands[-1].name) == JOINT_NAMES
+    assert len(commands[-1].position) == len(commands[-1].velocity) == 7
+    own = Client(lab.session, cell).status()
+    assert own.received.keys() == {"hands/left", "hands/right"}
+    assert own.rejected.keys() <= {"two_sources", "repeated", "older", "ahead"}
+
+
+def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    """The last test here: all of them end."""
+    lab.daemons.kill()
+    lab.daemons.wait()
+    until(lambda: not cells(lab.session))
+    assert main(["cells", "--connect", lab.endpoint]) == 1
+    assert "no daemon is alive on this network" in capsys.readouterr().err
+    with pytest.raises(UnreachableError, match="nobody answers on"):
+        Client(lab.session, NAMES[0], timeout_s=1.0).status()
+
+
+# --- sessions ------------------------------------------------------------------------------------
+
+
+def test_who_listens_and_connects_meets_all_others_too(tmp_path: Path) -> None:
+    """Two that are behind a router and listen besides; one of their own clients."""
+    with contextlib.ExitStack() as closing:
+        listen = ["tcp/127.0.0.1:0"]
+        router = closing.enter_context(open_session(listen=listen, more={"mode": "router"}))
+        both = [closing.enter_context(open_session(connect=endpoints(router), listen=listen)) for _ in range(2)]
+        behind = closing.enter_context(open_session(connect=endpoints(both[0])))
+        tokens = [s.liveliness().declare_token(f"here/{i}") for i, s in enumerate((*both, behind))]
+        keys = {f"here/{i}" for i in range(len(tokens))}
+
+        def seen(session: zenoh.Session) -> set[str]:
+            return {str(reply.ok.key_expr) for reply in session.liveliness().get("here/*", timeout=5.0) if reply.ok}
+
+        for session in (*both, behind):
+            until(lambda session=session: seen(session) == keys)
+
+
+SAYS_ALL = """{
+  // what a user may say, and what the service does not let it
+  mode: "client",
+  listen: { endpoints: ["tcp/0.0.0.0:0"] },
+  connect: { endpoints: ["tcp/127.0.0.1:1"] },
+  scouting: { multicast: { enabled: true }, gossip: { enabled: true } },
+  transport: { link: { tx: { lease: 1234 }, tls: { root_ca_certificate: "/nowhere" } } },
+  namespace: "elsewhere",
+}"""
+
+
+def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(SAYS_ALL)
+    with open_session(connect=[lab.endpoint], zenoh_config=file) as session:
+        assert list(session.info.routers_zid())
+        assert endpoints(session) == ()
+        one, came = publisher(session, "cell", "hands/left"), []
+        with lab.session.declare_subscriber("cell/hands/left", lambda sample: came.append(str(sample.key_expr))):
+            until(lambda: one.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0)))) or came)
+    assert set(came) == {"cell/hands/left"}  # and not elsewhere
+    with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1"):
+        open_session(otherwise=[lab.endpoint], zenoh_config=file, timeout_s=0.3)
+    with open_session(listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}) as listening:
+        assert endpoints(listening)[0].startswith("tcp/127.0.0.1:")
+        assert not list(listening.info.routers_zid())
+
+
+def test_a_zenoh_configuration_that_is_none_is_told(
+    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broken.json5").write_text("{ mode: ")
+    for name, words in (("broken.json5", "broken.json5: "), ("missing.json5", "No such file")):
+        assert main(["status", "--zenoh-config", str(tmp_path / name), "--connect", lab.endpoint]) == 1
+        assert words in (said := capsys.readouterr().err)
+        assert said.startswith("thirdhand status: cannot read the Zenoh configuration ")
+        assert said.count("\n") == 1

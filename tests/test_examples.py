@@ -1,0 +1,66 @@
+"""The programs in examples/, run as they stand: a tracker and a follower around one daemon, a
+teacher and a watcher beside them; and the mathematics alone.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cell import serving
+from tests_paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+
+
+def example(name: str) -> ModuleType:
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Once more with twice the time where a busy machine did not let them."""
+    said, ended = "", dict[str, Any]()
+    with serving(tmp_path) as daemon:
+        at = ["--connect", daemon.endpoint]
+        example("teach").main(at)
+        modules = {name: example(name) for name in ("watch", "follower", "tracker")}
+        for seconds in (2, 4, 8, 16):
+            daemon.client.reset()
+
+            def run(name: str, *arguments: str) -> None:
+                ended[name] = modules[name].main([*at, *arguments])
+
+            running = [threading.Thread(target=run, args=(name, "--seconds", f"{seconds}")) for name in modules]
+            for thread in running:
+                thread.start()
+            for thread in running:
+                thread.join(60)
+            said += capsys.readouterr().out
+            if "thirdhand: follow" in said:
+                break
+        received = daemon.client.status().received
+    assert ended.keys() == modules.keys()
+    assert received.keys() == {"hands/left", "hands/right", "joints/state"}
+    assert "thirdhand: follow" in said
+    assert "commands come, at tick " in said
+    assert "were none of this arm's" not in said
+    assert "example: missed by " in said
+    assert "refused: $.names[0]: no via-point 'no such place'" in said
+    assert np.abs(ended["follower"]).max() > 0.1
+
+
+def test_the_mathematics_alone_goes_through_the_point_it_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+    adapted = example("kmp_alone").main()
+    assert np.allclose(adapted.mean(np.array([[1.0]])), [[0.20, 0.10]], atol=2e-3)
+    assert len(capsys.readouterr().out.splitlines()) == 6
