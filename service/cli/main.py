@@ -163,12 +163,22 @@ def parser() -> argparse.ArgumentParser:
         metavar="DEMO",
         nargs="+",
         type=Path,
-        help="MCAP files with hands/left, hands/right and tool/pose",
+        help="recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's "
+        "folder",
     )
+    for name in ("left", "right", "tool"):
+        c.add_argument(
+            f"--{name}",
+            metavar="TOPIC[:PART]",
+            help=f"where the {name}{' hand' * (name != 'tool')} is in recordings of others: poses, a PoseArray with an "
+            "index, or a TFMessage with a child frame" + "; or joint states" * (name == "tool"),
+        )
     c.add_argument("--output", metavar="FILE", type=Path, required=True, help="the skill, .npz")
     c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
-    c.add_argument("--config", metavar="FILE", type=Path, help="settings of the cell, for the arm's reach")
+    c.add_argument(
+        "--config", metavar="FILE", type=Path, help="settings of the cell: the tracker's axes and unit, the arm"
+    )
     c.add_argument(
         "--places",
         metavar="FILE",
