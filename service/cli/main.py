@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
+from service.cli import record_options
 from service.cli.usage import Parser, UsageError, check_cell
 from service.config import RATES_HZ
 from service.contract import channels
@@ -30,6 +31,7 @@ RUN_BY = {
     "play": "recordings",
     "replay": "recordings",
     "learn": "recordings",
+    "record": "record",
     "via-points": "clients",
     "status": "status",
     "doctor": "doctor",
@@ -40,7 +42,7 @@ RUN_BY = {
     "certificates": "certificates",
     "bench": "bench",
 }
-PUT_AWAY_FIRST = ("demo", "bench", "view")  # what they started or wrote for a while, before Ctrl-C ends them
+PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
 
@@ -151,6 +153,10 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
     )
+
+    c = command("record", record_options.ABOUT, record_options.EXAMPLE)
+    record_options.add_options(c)
+    _reach(c, cell=None)
 
     c = command(
         "learn",
@@ -318,11 +324,13 @@ def _positive(given: str) -> float:
     raise argparse.ArgumentTypeError(f"{given} given, 0.001 to 10000 needed")
 
 
-def _reach(sub: argparse.ArgumentParser) -> None:
+def _reach(sub: argparse.ArgumentParser, cell: str | None = "thirdhand") -> None:
     sub.add_argument(
         "--connect", metavar="EP", action="append", help=f"Zenoh endpoint of the daemon (default: {channels.ENDPOINT})"
     )
-    sub.add_argument("--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    sub.add_argument(
+        "--cell", metavar="NAME", default=cell, help=f"prefix of all keys (default: {cell or 'as configured'})"
+    )
     sub.add_argument(
         "--certificate",
         metavar="DIR",
