@@ -211,11 +211,12 @@ def parser() -> argparse.ArgumentParser:
     a = actions.add_parser(
         "add", help="teach via-points, all or nothing", formatter_class=FORMATTER,
         epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
-        "--radius .03 --follow left --std .001",
+        "--radius .03 --follow left --std .001\n  thirdhand via-points add glass --here",
     )  # fmt: skip
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
     for hand in ("left", "right", "tool"):
         a.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+    a.add_argument("--here", action="store_true", help="hands and tool as they are now, but for those that are given")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     a.add_argument(
         "--std",

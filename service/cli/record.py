@@ -107,6 +107,8 @@ def _take(args: argparse.Namespace, settings: Settings) -> None:
             progress=_progress if sys.stderr.isatty() else lambda line: None,
             say=lambda line: print(f"\r{line}", file=sys.stderr, flush=True),
         )
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
     taken.write(path)
     for key, count in taken.malformed.items():
         print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)

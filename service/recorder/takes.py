@@ -21,6 +21,7 @@ from service.recorder.pose_streams import SIDES, Recorded, Track, chosen
 
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # after which the daemon calls a hand stale
+JUMP_M, FASTEST = 0.02, 5.0  # [m, m/s] of a hand, from one sample to the next
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDTH = 60  # letters of the plot
 COLOURS = {"left": "#0072B2", "right": "#D55E00", "tool": "#009E73"}  # of Okabe and Ito
@@ -90,7 +91,9 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     recorded = Recorded.open(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
-    for one in streams:
+    for side, one in zip(SIDES, streams, strict=True):
+        if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
+            remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
         if one.gap_s > GAP_S:
             remarks.append(f"{one.name}: nothing for {1e3 * one.gap_s:.0f} ms at {one.gap_at_s:.1f} s")
     return Summary(path, demonstration, streams, tuple(remarks))
@@ -98,6 +101,11 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
 
 def _without(path: Path, line: str) -> str:
     return line.removeprefix(f"{path}: ")
+
+
+def _jumps(at: Vector, seconds: Vector) -> int:
+    """How often positions (N, 3) [m] change as no hand moves."""
+    return int((np.linalg.norm(np.diff(at, axis=0), axis=1) > JUMP_M + FASTEST * np.diff(seconds)).sum())
 
 
 def _stream(side: str, track: Track) -> Stream:

@@ -29,7 +29,7 @@ REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, a
 MOVED = 5.0  # times that, before rest is the end
 KEPT_S = 0.3  # of the rest before and after the motion
 SILENT_S = 2.0  # after which nothing more is waited for
-POLL_S = 0.02
+POLL_S, TELL_S = 0.02, 0.1
 Until = Literal["key", "rest"]
 
 
@@ -233,14 +233,16 @@ def take(
             time.sleep(POLL_S)
             taken.collect()
         taken.begin()
-        begun_s = time.monotonic()
+        begun_s, told_s = time.monotonic(), 0.0
         say("recording")
         while not is_ended():
             time.sleep(POLL_S)
             taken.collect()
             lasts_s = time.monotonic() - begun_s
-            counts = ", ".join(f"{key} {len(samples)}" for key, samples in taken.streams.items())
-            progress(f"{lasts_s:5.1f} s   {counts}")
+            if lasts_s - told_s > TELL_S:
+                told_s = lasts_s
+                counts = ", ".join(f"{key} {len(samples)}" for key, samples in taken.streams.items())
+                progress(f"{lasts_s:5.1f} s   {counts}")
             if until == "rest" and taken.is_over(rest_s):
                 break
             if lasts_s > longest_s:

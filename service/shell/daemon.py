@@ -47,6 +47,7 @@ from service.shell.clock import (
     run_beside_real_time,
 )
 from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
+from service.shell.measured_tool import MeasuredTool
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.sources import Sources
@@ -102,6 +103,7 @@ class Daemon:
         finally:
             slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
+        self._measured_tool = MeasuredTool(settings, urdf)
         self._seen: dict[str, Event] = {}
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
@@ -337,6 +339,7 @@ class Daemon:
             command_heard=self._publishers["joints/command"].matching_status.matching,  # type: ignore[attr-defined]
             endpoints=self.endpoints,
             version=self._version,
+            tool_measured_m=self._measured_tool.told(state),
         )
 
 
