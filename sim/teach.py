@@ -15,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import zenoh
 
 from service.client import open_session
 from service.contract import cdr
@@ -110,7 +111,8 @@ def perform(
     scene: Scene, *, seed: int, connect: list[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
 ) -> bool:
     """Publishes one demonstration in real time, as a tracker of hands and tool would, from when
-    somebody listens until nobody does: hands and tool rest for BEFORE_S first, and to the end.
+    somebody listens to the hands until nobody does: they rest for BEFORE_S first, and AFTER_S at
+    the end.
 
     Whether somebody listened to its end. Raises UnreachableError.
     """
@@ -118,13 +120,14 @@ def perform(
     with open_session(connect=connect, timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
         publishers = [session.declare_publisher(key(cell, name)) for name in names]
-        until = time.monotonic() + wait_s
-        while not all(publisher.matching_status for publisher in publishers):
+        until, of_hands = time.monotonic() + wait_s, publishers[:2]
+        while not _are_heard(of_hands):
             if time.monotonic() > until:
                 return False
             time.sleep(0.02)
-        begin, step, lasts_s = time.monotonic() + BEFORE_S, 0, script.duration_s
-        while all(publisher.matching_status for publisher in publishers):
+        before_s = BEFORE_S / speed
+        begin, step, lasts_s = time.monotonic() + before_s, 0, script.duration_s
+        while _are_heard(of_hands):
             t = time.monotonic() - begin
             if t > lasts_s + AFTER_S:
                 return True
@@ -133,8 +136,13 @@ def perform(
                 row = pose.tolist()
                 publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))))
             step += 1
-            time.sleep(max(0.0, begin - BEFORE_S + step / rate_hz - time.monotonic()))
+            time.sleep(max(0.0, begin - before_s + step / rate_hz - time.monotonic()))
         return t >= lasts_s
+
+
+def _are_heard(publishers: list[zenoh.Publisher]) -> bool:
+    """Whether somebody listens to each."""
+    return all(publisher.matching_status.matching for publisher in publishers)  # type: ignore[attr-defined]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -152,7 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
         help="folder for demonstration-1.mcap and so on; made if missing",
     )
     p.add_argument(
-        "--live", action="store_true", help="publish them instead, each from when somebody listens to hands and tool"
+        "--live", action="store_true", help="publish them instead, each from when somebody listens to the hands"
     )
     p.add_argument(
         "--connect", metavar="EP", action="append", help=f"Zenoh endpoint to publish at (default: {ENDPOINT})"

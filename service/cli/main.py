@@ -216,7 +216,7 @@ def parser() -> argparse.ArgumentParser:
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
     for hand in ("left", "right", "tool"):
         a.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
-    a.add_argument("--here", action="store_true", help="hands and tool as they are now, but for those that are given")
+    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     a.add_argument(
         "--std",

@@ -26,6 +26,7 @@ from service.recorder.tool import tool_poses
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES)
 REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, and hands tremble
+TOLD = 0.7  # of that time samples have to cover
 MOVED = 5.0  # times that, before rest is the end
 KEPT_S = 0.3  # of the rest before and after the motion
 SILENT_S = 2.0  # after which nothing more is waited for
@@ -117,9 +118,11 @@ class Take:
         if now_ns - began_ns < 1e9 * rest_s:
             return False
         for key, samples in self.streams.items():
-            still = [sample.at for sample in _since(samples, now_ns - int(1e9 * rest_s))]
+            lately = _since(samples, now_ns - int(1e9 * rest_s))
+            still = [sample.at for sample in lately]
             self._moved = self._moved or (bool(still) and _apart(key, np.array([samples[0].at, still[-1]])) > MOVED)
-            if len(still) < 2 or _apart(key, np.array(still)) > 1:
+            told_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
+            if told_s < TOLD * rest_s or _apart(key, np.array(still)) > 1:
                 return False
         return self._moved
 

@@ -57,7 +57,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     taken, joints = Take(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
     publishers = {key: told.declare_publisher(f"bench/{key}") for key in taken.samples}
     end, sent = time.monotonic() + 10, []
-    while not all(publisher.matching_status for publisher in publishers.values()):
+    while not all(publisher.matching_status.matching for publisher in publishers.values()):
         assert time.monotonic() < end
         time.sleep(0.01)
     for i in range(30):
@@ -121,12 +121,12 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By the command, of the bench's teacher, eight times as fast."""
-    at, plot = f"tcp/127.0.0.1:{free_port()}", tmp_path / "take.png"
+    at = f"tcp/127.0.0.1:{free_port()}"
     told = {"connect": [at], "cell": "thirdhand", "speed": 8.0, "wait_s": 20.0}
     teacher = threading.Thread(target=perform, args=(Scene(),), kwargs=told | {"seed": 1})
     teacher.start()
     folder = ["--folder", str(tmp_path / "takes")]
-    ended = ["--until", "rest", "--rest", "0.5", "--plot", str(plot)]
+    ended = ["--until", "rest", "--rest", "0.5"]
     assert main(["record", "take-1", "--listen", at, *ended, *folder]) == 0
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
@@ -140,7 +140,6 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     tool = found.demonstration.tool[:, :3]
     assert np.linalg.norm(tool[0] - Scene().robot_start) < 0.05
     assert np.linalg.norm(tool[-1] - Scene().carry) < 0.05
-    assert plot.stat().st_size > 10_000
 
     with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
         trim(path, 20, 30)
