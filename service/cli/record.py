@@ -58,7 +58,8 @@ def _list(folder: Path, settings: Settings | None) -> int:
             print(f"{path.stem:<20} {error}")
             continue
         rates = ", ".join(f"{one.name} {one.rate_hz:.0f} Hz" for one in found.streams)
-        print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {rates}{''.join(f'; {said}' for said in found.remarks)}")
+        gap = f"longest gap {1e3 * max(one.gap_s for one in found.streams):.0f} ms"
+        print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}")
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
 
