@@ -12,6 +12,7 @@ from service.contract import channels
 DAEMON = "daemon"
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
+TOOL = ("tool/pose",)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
 
@@ -22,14 +23,16 @@ class Role(NamedTuple):
     publishes: tuple[str, ...] = ()
     hears: bool = False  # all that the daemon publishes
     asks: bool = False  # any request
+    hears_inputs: bool = False  # what trackers and the arm publish
 
 
 ROLES = {
-    "tracker": Role("may publish hands", HANDS),
-    "arm": Role("may publish joint states, and hears commands", ARM, hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM), hears=True),
+    "tracker": Role("may publish hands, and the tool in demonstrations", (*HANDS, *TOOL)),
+    "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
+    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
-    "observer": Role("hears all", hears=True),
+    "observer": Role("hears all that the daemon publishes", hears=True),
+    "recorder": Role("hears what trackers and the arm publish, for demonstrations", hears_inputs=True),
 }
 
 
@@ -56,6 +59,11 @@ def access_control(cell: str, revoked: Collection[str] = ()) -> dict[str, Any]:
         return str(rule["id"])
 
     hear = [allow("hear", "ingress", ["declare_subscriber"], heard), allow("hear", "egress", ["put"], heard)]
+    told = keys((*HANDS, *ARM, *TOOL))
+    record = [
+        allow("record", "ingress", ["declare_subscriber"], told),
+        allow("record", "egress", ["put"], told),
+    ]
     ask = [
         allow("ask", "ingress", ["query"], asked),
         allow("ask", "egress", ["declare_queryable", "reply"], asked),
@@ -68,7 +76,7 @@ def access_control(cell: str, revoked: Collection[str] = ()) -> dict[str, Any]:
                 published = keys(role.publishes)
                 publish.append(allow(f"{name} publish", "ingress", ["put"], published))
                 publish.append(allow(f"{name} publish", "egress", ["declare_subscriber"], published))
-            yield name, publish + role.hears * hear + role.asks * ask
+            yield name, publish + role.hears * hear + role.asks * ask + role.hears_inputs * record
         # two daemons see that they are two
         liveliness = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
         present, status = [channels.key(cell, "daemon/*")], keys(("status",))

@@ -134,8 +134,8 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     """Tracks of left hand, right hand and tool in frame `base`, and in words which were brought
     there.
 
-    The hands' as the daemon takes what comes in; the tool's too where it is in their frame, and
-    that is not `base`. Raises RecordingError for other frames.
+    The hands' as the daemon takes what comes in: all but what is in `base` where the tracker has a
+    frame of its own. The tool's only where it names that frame. Raises RecordingError for others.
     """
     for track in tracks:
         if track.frame not in ("", BASE, hands.frame):
@@ -147,7 +147,12 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []
-    by_tracker = [track.name != ENDINGS["tool"] or track.frame not in ("", BASE) for track in tracks]
+    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
+    by_tracker = [
+        track.frame not in ("", BASE) or (track.name != ENDINGS["tool"] and track.frame in of_hands) for track in tracks
+    ]
+    if not any(by_tracker):
+        return list(tracks), []
     turn, out = Rotation.from_matrix(axes), []
     for track, is_mapped in zip(tracks, by_tracker, strict=True):
         if is_mapped:

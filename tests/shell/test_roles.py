@@ -28,7 +28,7 @@ from service.launch import launched
 from service.shell.door import BOUNDS
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state")
+INPUTS = ("hands/left", "hands/right", "joints/state", "tool/pose")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 PATIENCE_S = 1.0  # what is refused is only seen by waiting
@@ -54,12 +54,13 @@ class Guarded:
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
         self.asked: set[str] = set()
-        self._declared = [
-            self.session.declare_subscriber(channels.key(CELL, key), lambda s: self.taken.add(str(s.key_expr)))
-            for key in INPUTS
-        ]
+        self._declared = [self.session.declare_subscriber(channels.key(CELL, key), self._take) for key in INPUTS]
         self._publishers = [self.session.declare_publisher(channels.key(CELL, key)) for key in OUTPUTS]
         self._answering = [self.session.declare_queryable(channels.key(CELL, key), self._answer) for key in REQUESTS]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if bytes(sample.payload) != b"from the bench":
+            self.taken.add(str(sample.key_expr))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
@@ -98,16 +99,20 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
     full = {key: channels.key(CELL, key) for key in (*INPUTS, *OUTPUTS, *REQUESTS)}
     guarded.taken.clear()
     guarded.asked.clear()
+    passing = {"mode": "client"} if role.hears_inputs else {}  # a daemon passes nothing on from peer to peer
     with (
-        open_session(connect=[guarded.endpoint], certificate=secrets / name) as session,
+        open_session(connect=[guarded.endpoint], certificate=secrets / name, more=passing) as session,
         open_session(connect=[guarded.endpoint], certificate=secrets / "operator") as operator,
         open_session(connect=[guarded.endpoint], certificate=secrets / "observer") as observer,
+        open_session(connect=[guarded.endpoint], certificate=secrets / "bench") as bench,
     ):
         got: set[str] = set()
+        passed_on: set[str] = set()
         forged: list[str] = []
 
         def hear(sample: zenoh.Sample) -> None:  # its own words it hears too
             got.update([str(sample.key_expr)] if bytes(sample.payload) == b"out" else [])
+            passed_on.update([str(sample.key_expr)] if bytes(sample.payload) == b"from the bench" else [])
 
         def observe(sample: zenoh.Sample) -> None:
             forged.extend([str(sample.key_expr)] if bytes(sample.payload) != b"out" else [])
@@ -120,6 +125,8 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         while time.monotonic() < end:
             for key in (*INPUTS, *OUTPUTS):  # every input, and every output in the daemon's place
                 session.put(full[key], b"from a client")
+            for key in INPUTS:
+                bench.put(full[key], b"from the bench")
             guarded.publish()
             time.sleep(0.05)
         asked = [session.get(full[key], payload=b"{}", timeout=PATIENCE_S) for key in REQUESTS]
@@ -128,6 +135,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
             declared.undeclare()
     assert guarded.taken == {full[key] for key in role.publishes}
     assert got == ({full[key] for key in OUTPUTS} if role.hears else set())
+    assert passed_on == ({full[key] for key in INPUTS} if role.hears_inputs else set())
     assert forged == []
     assert answered == (len(REQUESTS) if role.asks else 0)
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
@@ -173,8 +181,8 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    hands = {full["hands/left"], full["hands/right"]}
-    assert {key for key, names in said.items() if b"tracker" in names} == hands
+    tracked = {full["hands/left"], full["hands/right"], full["tool/pose"]}
+    assert {key for key, names in said.items() if b"tracker" in names} == tracked
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}
