@@ -5,6 +5,7 @@ and joint states, in a tracker's axes and unit, by clocks that differ.
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+from tests_paths import RECORDINGS
 
 from service.config import HandSettings, Settings
 from service.recorder.demonstrations import read_demonstration
@@ -177,3 +179,14 @@ def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "a.db3", tmp_path / "b.bag"):
         with pytest.raises(RecordingError, match=r"is not a bag that can be read: "):
             read_demonstration(path)
+
+
+def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None:
+    """The golden session: with a dropout, spoilt samples, and no `tool/pose`."""
+    said: list[str] = []
+    got = read_demonstration(RECORDINGS / "golden.mcap", say=said.append)
+    assert re.search(
+        r"tool found from .*joints/state by the arm's URDF; \d+ of \d+ poses are none, or farther", said[0]
+    )
+    assert len(got.stamps_ns) > 1000
+    assert np.abs(got.tool[:, :3]).max() < 1.0

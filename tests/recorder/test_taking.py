@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -17,12 +16,12 @@ import zenoh
 from service.cli.main import main
 from service.cli.usage import free_port
 from service.client import endpoints, open_session
-from service.config import HandSettings, Settings, robot_description
+from service.config import HandSettings, Settings, ToolSettings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import JointState, PoseStamped
 from service.core.arm import Arm
 from service.recorder.demonstrations import iter_hands, read_demonstration
-from service.recorder.pose_streams import Recorded
+from service.recorder.pose_streams import Recorded, Source
 from service.recorder.takes import summary, table, trim
 from service.recorder.taking import JOINT_STATES, Sample, Take, TakeError, take
 from sim.scene import Scene
@@ -81,8 +80,11 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
     assert Recorded.open(path).settings == SETTINGS
-    shorter = msgspec.structs.replace(SETTINGS, tool=msgspec.structs.replace(SETTINGS.tool, max_speed=0.5))
-    np.testing.assert_array_equal(read_demonstration(path, settings=shorter).tool, got.tool)
+    longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
+    of_joints = {"tool": Source("bench/joints/state")}
+    np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
+    moved = read_demonstration(path, settings=longer, sources=of_joints).tool - got.tool
+    np.testing.assert_allclose(np.linalg.norm(moved[:, :3], axis=1), 0.1)
 
 
 def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
