@@ -190,6 +190,8 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--seed {args.seed}: 0 or more accepted")
     if args.live == (args.output is not None):
         p.error("--output DIR or --live needed, and one of them")
+    if args.live and args.people:
+        p.error("--people goes with --output: people show nothing live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
     try:
