@@ -55,7 +55,7 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
 def _not_seen(status: dict[str, Any], wanted: list[str]) -> str:
     """What of the hands and the tool is not known now, in words; empty: all is."""
     for side in (side for side in SIDES if side in wanted):
-        age_ms = status["hand_age_ms"].get(side)
+        age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
         if age_ms is None or age_ms > OLDEST_MS:
             ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
             return f"the {side} hand {ago}; --{side} X Y Z says where it would be"
