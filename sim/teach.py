@@ -1,5 +1,5 @@
-"""`python -m sim.teach --output DIR`: demonstrations of the soldering scene as MCAP files, the same
-bytes for the same seed.
+"""`python -m sim.teach`: demonstrations of the soldering scene, as MCAP files (the same bytes for
+the same seed), or published live for `thirdhand record`.
 """
 
 from __future__ import annotations
@@ -10,24 +10,32 @@ from service import one_blas_thread  # noqa: F401
 import argparse
 import math
 import sys
+import time
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import zenoh
 
+from service.client import open_session
+from service.contract import cdr
+from service.contract.channels import ENDPOINT, key
+from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.recorder.demonstrations import write_demonstration
 from sim import sessions
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
-from sim.script import HandScript, Teacher
+from sim.script import Clock, HandScript, Teacher
 
 RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
 EXAMPLE = """example:
+  python -m sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
+BEFORE_S, AFTER_S = 0.5, 3.0  # of rest
 
 
 def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0) -> Demonstration:
@@ -99,11 +107,49 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
     return msgspec.convert(rows, tuple[ViaPoint, ...])
 
 
+def perform(
+    scene: Scene, *, seed: int, connect: list[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
+) -> bool:
+    """Publishes one demonstration in real time, as a tracker of hands and tool would, from when
+    somebody listens to the hands until nobody does: they rest for BEFORE_S first, and AFTER_S at
+    the end.
+
+    Whether somebody listened to its end. Raises UnreachableError.
+    """
+    script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
+    with open_session(connect=connect, timeout_s=wait_s) as session:
+        names = ("hands/left", "hands/right", "tool/pose")
+        publishers = [session.declare_publisher(key(cell, name)) for name in names]
+        until, of_hands = time.monotonic() + wait_s, publishers[:2]
+        while not _are_heard(of_hands):
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.02)
+        before_s = BEFORE_S / speed
+        begin, step, lasts_s = time.monotonic() + before_s, 0, script.duration_s
+        while _are_heard(of_hands):
+            t = time.monotonic() - begin
+            if t > lasts_s + AFTER_S:
+                return True
+            stamp_ns = time.time_ns()
+            for publisher, pose in zip(publishers, (*script.sample(t), teacher.sample(t)), strict=True):
+                row = pose.tolist()
+                publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))))
+            step += 1
+            time.sleep(max(0.0, begin - before_s + step / rate_hz - time.monotonic()))
+        return t >= lasts_s
+
+
+def _are_heard(publishers: list[zenoh.Publisher]) -> bool:
+    """Whether somebody listens to each."""
+    return all(publisher.matching_status.matching for publisher in publishers)  # type: ignore[attr-defined]
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The exit code: 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.teach",
-        description="Demonstrations of the soldering scene: hands and tool at 100 Hz, one MCAP file each.",
+        description="Demonstrations of the soldering scene: hands and tool at 100 Hz, one MCAP file each, or live.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -111,8 +157,17 @@ def main(arguments: list[str] | None = None) -> int:
         "--output",
         metavar="DIR",
         type=Path,
-        required=True,
         help="folder for demonstration-1.mcap and so on; made if missing",
+    )
+    p.add_argument(
+        "--live", action="store_true", help="publish them instead, each from when somebody listens to the hands"
+    )
+    p.add_argument(
+        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint to publish at (default: {ENDPOINT})"
+    )
+    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="times as fast (default: %(default)s)")
+    p.add_argument(
+        "--wait", metavar="S", type=float, default=60.0, help="for somebody who listens (default: %(default)s)"
     )
     p.add_argument("--count", type=int, default=6, help="how many (default: %(default)s)")
     p.add_argument("--seed", type=int, help="of their scatter (default: the scene's)")
@@ -127,14 +182,22 @@ def main(arguments: list[str] | None = None) -> int:
         action="store_true",
         help="by modelled people, two of each, with things moved and named: what is learned between places",
     )
-    p.add_argument("--cell", default="thirdhand", help="prefix of the topics (default: %(default)s)")
+    p.add_argument("--cell", default="thirdhand", help="prefix of topics and keys (default: %(default)s)")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
+    if args.live == (args.output is not None):
+        p.error("--output DIR or --live needed, and one of them")
+    if args.live and args.people:
+        p.error("--people goes with --output: people show nothing live")
+    if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
+        p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
+        if args.live:
+            return _perform_all(scene, args)
         args.output.mkdir(parents=True, exist_ok=True)
         seed = scene.seed if args.seed is None else args.seed
         made = by_people(args.count) if args.people else demonstrations(scene, count=args.count, seed=seed)
@@ -145,6 +208,20 @@ def main(arguments: list[str] | None = None) -> int:
     except (SceneError, OSError) as error:
         print(f"python -m sim.teach: {error}", file=sys.stderr)
         return 1
+    return 0
+
+
+def _perform_all(scene: Scene, args: argparse.Namespace) -> int:
+    """The exit code: 1 where nobody listened to the end of each."""
+    connect, seed = args.connect or [ENDPOINT], scene.seed if args.seed is None else args.seed
+    for number in range(1, args.count + 1):
+        heard = perform(
+            scene, seed=1000 * seed + number, connect=connect, cell=args.cell, speed=args.speed, wait_s=args.wait
+        )
+        if not heard:
+            print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)
+            return 1
+        print(f"demonstration {number} of {args.count} shown", file=sys.stderr, flush=True)
     return 0
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import zenoh
 
+from service.cli.here import still
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
 from service.client import Client, open_session
 from service.contract import requests
@@ -39,8 +40,11 @@ def _add(args: argparse.Namespace) -> Any:
         return requests.decode_request(
             sys.stdin.buffer.read() if args.file == "-" else Path(args.file).read_bytes(), requests.Add
         )
+    if args.here and args.name:
+        for name, place in still(args).items():
+            setattr(args, name, getattr(args, name) or place)
     if not (args.name and args.left and args.right and args.tool):
-        raise UsageError("a name, --left, --right and --tool are needed, or --file")
+        raise UsageError("a name, and --here or --left, --right and --tool, are needed, or --file")
     point = {"name": args.name, **{k: getattr(args, k) for k in ("left", "right", "tool", "std", "radius", "follow")}}
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
 

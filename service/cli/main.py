@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
+from service.cli import record_options
 from service.cli.usage import Parser, UsageError, check_cell
 from service.config import RATES_HZ
 from service.contract import channels
@@ -30,6 +31,7 @@ RUN_BY = {
     "play": "recordings",
     "replay": "recordings",
     "learn": "recordings",
+    "record": "record",
     "via-points": "clients",
     "status": "status",
     "doctor": "doctor",
@@ -41,7 +43,7 @@ RUN_BY = {
     "certificates": "certificates",
     "bench": "bench",
 }
-PUT_AWAY_FIRST = ("demo", "bench", "view")  # what they started or wrote for a while, before Ctrl-C ends them
+PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
 
@@ -154,6 +156,10 @@ def parser() -> argparse.ArgumentParser:
         "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
     )
 
+    c = command("record", record_options.ABOUT, record_options.EXAMPLE)
+    record_options.add_options(c)
+    _reach(c, cell=None)
+
     c = command(
         "learn",
         "Learns a skill from demonstrations and judges it by leaving out one at a time. Where it would be unsafe, "
@@ -165,12 +171,22 @@ def parser() -> argparse.ArgumentParser:
         metavar="DEMO",
         nargs="+",
         type=Path,
-        help="MCAP files with hands/left, hands/right and tool/pose",
+        help="recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's "
+        "folder",
     )
+    for name in ("left", "right", "tool"):
+        c.add_argument(
+            f"--{name}",
+            metavar="TOPIC[:PART]",
+            help=f"where the {name}{' hand' * (name != 'tool')} is in recordings of others: poses, a PoseArray with an "
+            "index, or a TFMessage with a child frame" + "; or joint states" * (name == "tool"),
+        )
     c.add_argument("--output", metavar="FILE", type=Path, required=True, help="the skill, .npz")
     c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
-    c.add_argument("--config", metavar="FILE", type=Path, help="settings of the cell, for the arm's reach")
+    c.add_argument(
+        "--config", metavar="FILE", type=Path, help="settings of the cell: the tracker's axes and unit, the arm"
+    )
     c.add_argument(
         "--places",
         metavar="FILE",
@@ -197,11 +213,12 @@ def parser() -> argparse.ArgumentParser:
     a = actions.add_parser(
         "add", help="teach via-points, all or nothing", formatter_class=FORMATTER,
         epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
-        "--radius .03 --follow left --std .001",
+        "--radius .03 --follow left --std .001\n  thirdhand via-points add glass --here",
     )  # fmt: skip
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
     for hand in ("left", "right", "tool"):
         a.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     a.add_argument(
         "--std",
@@ -257,7 +274,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command("cells", "The daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447")
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
-    _reach(c, cell=False)
+    _reach(c, one=False)
 
     c = command(
         "certificates",
@@ -314,7 +331,7 @@ def _positive(given: str) -> float:
     raise argparse.ArgumentTypeError(f"{given} given, 0.001 to 10000 needed")
 
 
-def _reach(sub: argparse.ArgumentParser, *, cell: bool = True) -> None:
+def _reach(sub: argparse.ArgumentParser, cell: str | None = "thirdhand", *, one: bool = True) -> None:
     sub.add_argument(
         "--connect",
         metavar="EP",
@@ -322,9 +339,9 @@ def _reach(sub: argparse.ArgumentParser, *, cell: bool = True) -> None:
         help="Zenoh endpoint of the daemon or of a router; of several the first that answers "
         f"(default: {channels.ENDPOINT})",
     )
-    if cell:
+    if one:
         sub.add_argument(
-            "--cell", metavar="NAME", default="thirdhand", help="prefix of all keys (default: %(default)s)"
+            "--cell", metavar="NAME", default=cell, help=f"prefix of all keys (default: {cell or 'as configured'})"
         )
     sub.add_argument(
         "--certificate",

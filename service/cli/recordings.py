@@ -22,6 +22,7 @@ from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.mcap_file import ends_early
+from service.recorder.pose_streams import SIDES, Source
 from service.recorder.replay import replay as replayed
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
@@ -92,13 +93,20 @@ def replay(args: argparse.Namespace) -> int:
 
 def learn(args: argparse.Namespace) -> int:
     """Exit code 0 once the skill is written; 1, and nothing written, where it would be unsafe."""
-    for path in filter(None, (args.output, args.plot)):
-        check_writable(path)
+    for path, suffix, what in ((args.output, ".npz", "a skill"), (args.plot, ".png", "a picture")):
+        if path is not None:
+            if path.suffix != suffix:
+                raise UsageError(f"{path}: {what} is written as {suffix}: {path.with_suffix(suffix).name}, say")
+            check_writable(path)
+    settings = load(args.config) if args.config else None
+    sources = {name: Source.parsed(text) for name in SIDES if (text := getattr(args, name))}
     told = requests.decode_request(args.places.read_bytes(), requests.Add) if args.places else None
     places = told.points if told else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
-        demonstration = read_demonstration(path, say=lambda line: print(line, file=sys.stderr, flush=True))
+        demonstration = read_demonstration(
+            path, sources=sources, settings=settings, say=lambda line: print(line, file=sys.stderr, flush=True)
+        )
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
@@ -113,7 +121,7 @@ def learn(args: argparse.Namespace) -> int:
         ell=args.ell,
         penalty=args.penalty,
         seed=args.seed,
-        reach=load(args.config).reach if args.config else None,
+        reach=settings.reach if settings else None,
         progress=lambda line: print(line, file=sys.stderr, flush=True),
         show=evidence.append,
     )

@@ -179,6 +179,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     hands_m: dict[str, Vector3] = {}  # as estimated at this tick, frame `base`; those that are seen
     demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of where each is known
     tool_m: Vector3 | None = None  # as commanded; None before the first tick
+    tool_measured_m: Vector3 | None = None  # by the joints that the arm told last; None: none lately
     target_m: Vector3 | None = None  # None where a hand is not seen
     setpoint_m: Vector3 | None = None
     std_m: float | None = None  # of the target, root mean square over the axes

@@ -13,6 +13,7 @@ DAEMON, ROUTER = "daemon", "router"
 SERVERS = (DAEMON, ROUTER)  # others connect to them
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
+TOOL = ("tool/pose",)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
 
@@ -23,15 +24,23 @@ class Role(NamedTuple):
     publishes: tuple[str, ...] = ()
     hears: bool = False  # all that the daemon publishes
     asks: bool = False  # any request; all roles may ask for the status, and which daemons are alive
+    hears_inputs: bool = False  # what trackers and the arm publish
 
 
 ROLES = {
-    "tracker": Role("may publish hands", HANDS),
-    "arm": Role("may publish joint states, and hears commands", ARM, hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM), hears=True),
+    "tracker": Role("may publish hands, and the tool in demonstrations", (*HANDS, *TOOL)),
+    "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
+    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
-    "observer": Role("hears all", hears=True),
-    ROUTER: Role("passes on what all others may do, and has to keep them apart", (*HANDS, *ARM), hears=True, asks=True),
+    "observer": Role("hears all that the daemon publishes", hears=True),
+    "recorder": Role("hears what trackers and the arm publish, for demonstrations", hears_inputs=True),
+    ROUTER: Role(
+        "passes on what all others may do, and has to keep them apart",
+        (*HANDS, *ARM, *TOOL),
+        hears=True,
+        asks=True,
+        hears_inputs=True,
+    ),
 }
 
 
@@ -61,6 +70,11 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
         return str(rule["id"])
 
     hear = [allow("hear", "ingress", ["declare_subscriber"], heard), allow("hear", "egress", ["put"], heard)]
+    told = keys((*HANDS, *ARM, *TOOL))
+    record = [
+        allow("record", "ingress", ["declare_subscriber"], told),
+        allow("record", "egress", ["put"], told),
+    ]
     ask = [
         allow("ask", "ingress", ["query"], asked),
         allow("ask", "egress", ["declare_queryable", "reply"], asked),
@@ -98,7 +112,8 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
                 publish.append(allow(f"{name} publish", "ingress", ["put"], published))
                 publish.append(allow(f"{name} publish", "egress", ["declare_subscriber"], published))
             through = (name == ROUTER) * neighbours
-            yield name, publish + see + role.hears * hear + role.asks * ask + through
+            heard_of = role.hears * hear + role.hears_inputs * record
+            yield name, publish + see + heard_of + role.asks * ask + through
         yield DAEMON, neighbours
 
     granted = [

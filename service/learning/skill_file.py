@@ -125,6 +125,9 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
     One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
     recording has checksums of its own.
     """
+    if not data.startswith(b"PK"):  # as every .npz
+        made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
+        raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):

@@ -1,27 +1,33 @@
-"""Demonstrations and hands in MCAP files, ours and others': which topics they are, and how they
-come to common stamps.
+"""Demonstrations and hands in recordings, ours and others': brought to frame `base` and to common
+stamps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from service.config import HandSettings, Settings
 from service.contract import cdr
 from service.contract.channels import POSE, STRING, key
-from service.contract.messages import BASE, PoseStamped, WireError, finite
-from service.contract.requests import RequestError, ViaPoint, decode_request, encode_json
+from service.contract.messages import BASE, PoseStamped
+from service.contract.requests import encode_json
+from service.core.frame import Vector
+from service.core.intake import FARTHEST_M, UNIT_M
+from service.core.rotation import rotation
 from service.learning.demonstration import Demonstration
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.recorder.mcap_reader import Messages, next_whole
+from service.recorder.pose_streams import ENDINGS, PLACES, Recorded, Source, Track, chosen
 
-_STREAMS = ("hands/left", "hands/right", "tool/pose")
-_PLACES = "places"
+_STREAMS = tuple(ENDINGS.values())
+LARGEST_DELAY_S = 0.2  # of one stream more than of another, from a stamp to its recording
 
 
 def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
@@ -46,74 +52,129 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
                 file.put(key(cell, name), POSE.type, data, stamp, i)
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
-            file.put(key(cell, _PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+            file.put(key(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
     finally:
         file.close()
 
 
-def read_demonstration(path: str | Path, *, say: Callable[[str], None] = lambda line: None) -> Demonstration:
-    """The demonstration in an MCAP file: the hands and the tool at the tool's stamps, as far as all
-    three reach. Raises RecordingError, also where there is damage: what it took may lie amid a
-    motion. A file that was cut ends early, and that is told to `say`.
+def read_demonstration(
+    path: str | Path,
+    *,
+    sources: Mapping[str, Source] | None = None,
+    settings: Settings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Demonstration:
+    """The demonstration in a recording: the hands and the tool in frame `base` at the tool's
+    stamps, as far as all three reach.
 
-    Topics are found by their ends, whatever the cell. Where the streams have stamps of their own,
-    the hands are interpolated linearly.
+    MCAP files, ours and others', and bags. Topics are those in `sources` (by left, right, tool),
+    else they are found by their ends, whatever the cell, or by what can be meant alone. Hands are
+    brought to `base` as the daemon does it, by the `settings`, by default those in the file. Where
+    the streams have stamps of their own, the hands are interpolated linearly; where these are of
+    clocks that differ, the times count at which they were recorded.
+
+    Raises RecordingError, also where there is damage: what it took may lie amid a motion. A file
+    that was cut ends early; that, and what was found or assumed, is told to `say`.
     """
-    path = existing(path)
-    streams = PoseStreams(path, _STREAMS)
-    rows: dict[str, list[PoseStamped]] = {name: [] for name in _STREAMS}
-    messages = Messages(path)
-    places: tuple[ViaPoint, ...] = ()
-    for schema, channel, message in messages:
-        name = streams.name(schema, channel)
-        if f"/{channel.topic}".endswith(f"/{_PLACES}") and schema is not None and schema.name == STRING.type:
-            places = _places(path, message.data)
-        elif name:
-            try:
-                pose = cdr.decode_pose(message.data)
-            except WireError as error:
-                raise RecordingError(f"{path}: {channel.topic}: {error}") from None
-            if not finite(pose.position + pose.orientation):
-                raise RecordingError(f"{path}: {channel.topic}: a pose that is not finite, at stamp {pose.stamp_ns} ns")
-            rows[name].append(pose)
-    there = ", ".join(f"{len(poses)} poses on {name}" for name, poses in rows.items())
-    faults = "; ".join(map(str, messages.faults))
-    if any(not fault.cut for fault in messages.faults):
+    recorded = Recorded.open(path)
+    settings = settings or recorded.settings or Settings()
+    if any(not fault.cut for fault in recorded.faults):
+        there = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        faults = "; ".join(map(str, recorded.faults))
         raise RecordingError(f"{path}: {faults}; {there} can be read; nothing is learned from it")
-    if faults:
-        say(f"{path}: {faults}; {there} are there")
-    tracks = []
-    for name, poses in rows.items():
-        if not poses:
-            raise streams.missing(name)
-        stamps, first = np.unique(np.array([pose.stamp_ns for pose in poses], np.int64), return_index=True)
+    tracks, said = chosen(recorded, sources or {}, settings)
+    for fault in recorded.faults:
+        say(f"{path}: {fault}; {', '.join(f'{len(track.poses)} poses on {track.name}' for track in tracks)} are there")
+    count = sum(len(track.poses) for track in tracks)
+    if recorded.is_ours:  # what the daemon rejects, too
+        tracks = [_kept(track, _is_pose(track.poses)) for track in tracks]
+    tracks, mapped = in_base(path, tracks, settings.hands)
+    if recorded.is_ours:
+        tracks = [_kept(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
+        if left_out := count - sum(len(track.poses) for track in tracks):
+            said.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
+    if said or mapped:
+        say(f"{path}: {'; '.join([*said, *mapped])}")
+    tracks, clocks = _by_one_clock(tracks)
+    if clocks:
+        say(f"{path}: {clocks}")
+    rows = []
+    for track in tracks:
+        stamps, first = np.unique(track.stamps_ns, return_index=True)
         if len(stamps) < 2:
-            raise RecordingError(f"{path}: {len(poses)} poses on {name} with {len(stamps)} different stamps, 2 needed")
-        tracks.append((stamps, np.array([poses[i].position + poses[i].orientation for i in first])))
-    frames = {name: poses[0].frame_id for name, poses in rows.items()}
-    if len(set(frames.values())) > 1:
-        raise RecordingError(
-            f"{path}: poses in different frames: {', '.join(f'{name} in {frame!r}' for name, frame in frames.items())}"
-        )
-    stamps = tracks[2][0]
-    start, end = max(track[0][0] for track in tracks), min(track[0][-1] for track in tracks)
+            raise RecordingError(
+                f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+            )
+        rows.append((stamps, track.poses[first]))
+    stamps = rows[2][0]
+    start, end = max(row[0][0] for row in rows), min(row[0][-1] for row in rows)
     stamps = stamps[(stamps >= start) & (stamps <= end)]
     if len(stamps) < 2:
         raise RecordingError(
             f"{path}: hands and tool have less than two stamps of the tool in common: "
             "by which clocks were they stamped?"
         )
-    left, right, tool = (_resampled(stamps, *track) for track in tracks)
+    left, right, tool = (_resampled(stamps, *row) for row in rows)
     stamps.setflags(write=False)
-    return Demonstration(stamps, left, right, tool, next(iter(frames.values())), places)
+    return Demonstration(stamps, left, right, tool, BASE, recorded.places)
 
 
-def _places(path: Path, data: bytes) -> tuple[ViaPoint, ...]:
-    try:
-        found: tuple[ViaPoint, ...] = decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])
-    except (WireError, RequestError) as error:
-        raise RecordingError(f"{path}: {_PLACES}: {error}") from None
-    return found
+def _is_pose(poses: Vector) -> NDArray[np.bool_]:
+    """Which of the poses (N, 7) are finite, with a quaternion of norm 1."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.isfinite(poses).all(axis=1) & (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) <= 0.01))
+
+
+def _kept(track: Track, mask: NDArray[np.bool_]) -> Track:
+    """The track with some of its poses."""
+    return track._replace(stamps_ns=track.stamps_ns[mask], logged_ns=track.logged_ns[mask], poses=track.poses[mask])
+
+
+def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
+    """Tracks of left hand, right hand and tool in frame `base`, and in words which were brought
+    there.
+
+    The hands' as the daemon takes what comes in: all but what is in `base` where the tracker has a
+    frame of its own. The tool's only where it names that frame. Raises RecordingError for others.
+    """
+    for track in tracks:
+        if track.frame not in ("", BASE, hands.frame):
+            known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
+            raise RecordingError(
+                f"{path}: {track.name} is in frame {track.frame!r}: {BASE!r}{known} needed, or a configuration "
+                "(--config) whose [hands] frame names it and says by base_from_tracker where it is"
+            )
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
+        return list(tracks), []
+    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
+    by_tracker = [
+        track.frame not in ("", BASE) or (track.name != ENDINGS["tool"] and track.frame in of_hands) for track in tracks
+    ]
+    if not any(by_tracker):
+        return list(tracks), []
+    turn, out = Rotation.from_matrix(axes), []
+    for track, is_mapped in zip(tracks, by_tracker, strict=True):
+        if is_mapped:
+            at = UNIT_M[hands.unit] * track.poses[:, :3] @ axes.T + origin
+            turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
+            track = track._replace(poses=np.hstack([at, turns]), frame=BASE)  # noqa: PLW2901
+        out.append(track)
+    names = ", ".join(track.name for track, is_mapped in zip(tracks, by_tracker, strict=True) if is_mapped)
+    return out, [f"{names} brought to frame {BASE} by [hands] unit and base_from_tracker"]
+
+
+def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
+    """Tracks with stamps of one clock, and in words why they are not their own; empty: they are."""
+    if not all(len(track.poses) for track in tracks):
+        return list(tracks), ""
+    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
+    if max(ahead_s) - min(ahead_s) <= LARGEST_DELAY_S or any(not np.ptp(track.logged_ns) for track in tracks):
+        return list(tracks), ""
+    clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
+    return [track._replace(stamps_ns=track.logged_ns) for track in tracks], (
+        f"stamps are of different clocks (against the recorder's {clocks}): the times of recording count instead"
+    )
 
 
 def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -44,6 +44,7 @@ from service.shell.clock import (
     run_beside_real_time,
 )
 from service.shell.door import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
+from service.shell.measured_tool import MeasuredTool
 from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.sources import Sources
@@ -101,6 +102,7 @@ class Daemon:
         finally:
             slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
+        self._measured_tool = MeasuredTool(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
@@ -303,6 +305,7 @@ class Daemon:
             command_heard=self._streams.is_followed,
             endpoints=self.endpoints,
             version=self._version,
+            tool_measured_m=self._measured_tool.told(state),
         )
 
 

@@ -133,7 +133,7 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
     )
     start, end = chunks(path.read_bytes())[0]
     path.write_bytes(flipped(path.read_bytes(), (start + end) // 2))
-    with pytest.raises(RecordingError, match=r"damage at byte .* poses on tool/pose can be read; nothing is learned"):
+    with pytest.raises(RecordingError, match=r"damage at byte .* no poses can be read; nothing is learned"):
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
         list(iter_hands(path))

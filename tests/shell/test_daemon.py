@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -17,14 +18,22 @@ import msgspec
 import numpy as np
 import pytest
 from cell import LEFT, RIGHT, Tracker, serving, thirdhand
+from in_process import arm
 from tests_paths import RECORDINGS, ROOT
 from wam import JOINT_NAMES
 from zenoh.handlers import FifoChannel
 
+from service.cli.main import main
 from service.client import RefusedError
+from service.config import Settings, robot_description
 from service.contract import cdr, requests
+from service.core.arm import Arm
+from service.core.controller import Controller
+from service.core.frame import Tick
+from service.core.skill import Skill
 from service.recorder.recording import Recording
 from service.recorder.replay import replay
+from service.shell.measured_tool import MeasuredTool
 
 HANDOVER = requests.ViaPoint(
     "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
@@ -194,6 +203,45 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
 
 
+def test_a_place_is_taught_from_where_hands_and_tool_are(
+    shared_daemon: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
+    shared_daemon.until(lambda s: not any(age < 300 for age in s["hand_age_ms"].values()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+        assert main(add) == 1
+    said = capsys.readouterr().err
+    assert re.search(r"nothing taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
+    shared_daemon.client.ask("hold")
+    with Tracker(shared_daemon.session):
+        status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
+        assert main(add) == 0
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+            assert main(add) == 1
+    assert "nothing taught: hands or tool did not hold still" in capsys.readouterr().err
+    (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
+    assert point["name"] == "glass"
+    np.testing.assert_allclose(point["left"], LEFT, atol=1e-3)
+    np.testing.assert_allclose(point["right"], RIGHT, atol=1e-3)
+    np.testing.assert_allclose(point["tool"], status["tool_m"], atol=1e-3)
+    shared_daemon.client.ask("via_points", {"op": "clear"})
+    shared_daemon.client.ask("resume")
+
+
+def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
+    settings, urdf = Settings(), robot_description(Settings())
+    controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
+    tool, wanted = MeasuredTool(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
+    controller.step(Tick(0))
+    assert tool.told(controller.state) is None
+    controller.step(Tick(1, (arm(joints, 1),)))
+    np.testing.assert_allclose(tool.told(controller.state), wanted, atol=1e-4)
+    controller.step(Tick(200))
+    assert tool.told(controller.state) is None
+
+
 def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
     played = thirdhand(
         "play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "10", "--connect", shared_daemon.endpoint
@@ -268,6 +316,7 @@ def test_bad_usage_and_failures_are_told_on_standard_error(
         "resume",
         "reset",
         "cells",
+        "record",
         "view",
         "certificates",
     ],

@@ -28,7 +28,7 @@ from service.launch import launched
 from service.shell.door import BOUNDS
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state")
+INPUTS = ("hands/left", "hands/right", "joints/state", "tool/pose")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2
@@ -63,9 +63,7 @@ class Guarded:
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
         self.asked: set[str] = set()
-        self._declared = [
-            self.session.declare_subscriber(key, lambda s: self.taken.add(str(s.key_expr))) for key in keys(INPUTS)
-        ]
+        self._declared = [self.session.declare_subscriber(key, self._take) for key in keys(INPUTS)]
         self._publishers = [self.session.declare_publisher(key) for key in keys(OUTPUTS)]
         own = str(self.session.zid())
         topics = ros2.tokens(DOMAIN, CELL, own, ros2.HEARD).values()
@@ -73,6 +71,10 @@ class Guarded:
             self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, own), *topics)
         ]
         self._answering = [self.session.declare_queryable(channels.key(CELL, key), self._answer) for key in REQUESTS]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if bytes(sample.payload) != b"from the bench":
+            self.taken.add(str(sample.key_expr))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
@@ -115,12 +117,15 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         open_session(connect=[guarded.endpoint], certificate=secrets / name) as session,
         open_session(connect=[guarded.endpoint], certificate=secrets / "operator") as operator,
         open_session(connect=[guarded.endpoint], certificate=secrets / "observer") as observer,
+        open_session(connect=[guarded.endpoint], certificate=secrets / "bench") as bench,
     ):
         got: set[str] = set()
+        passed_on: set[str] = set()
         forged: list[str] = []
 
         def hear(sample: zenoh.Sample) -> None:  # its own words it hears too
             got.update([str(sample.key_expr)] if bytes(sample.payload) == b"out" else [])
+            passed_on.update([str(sample.key_expr)] if bytes(sample.payload) == b"from the bench" else [])
 
         def observe(sample: zenoh.Sample) -> None:
             forged.extend([str(sample.key_expr)] if bytes(sample.payload) != b"out" else [])
@@ -135,6 +140,8 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         while time.monotonic() < end:
             for key in streams:  # every input, and every output in the daemon's place
                 session.put(key, b"from a client")
+            for key in INPUTS:
+                bench.put(channels.key(CELL, key), b"from the bench")
             guarded.publish()
             time.sleep(0.05)
         own = {str(guarded.session.zid())}
@@ -149,6 +156,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
             declared.undeclare()
     assert guarded.taken == keys(role.publishes)
     assert got == (keys(OUTPUTS) if role.hears else set())
+    assert passed_on == ({channels.key(CELL, key) for key in INPUTS} if role.hears_inputs else set())
     assert forged == []
     assert answered == (len(REQUESTS) if role.asks else 1)  # the status is for all
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
@@ -194,8 +202,8 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    hands = {full["hands/left"], full["hands/right"]}
-    assert {key for key, names in said.items() if b"tracker" in names} == hands
+    tracked = {full["hands/left"], full["hands/right"], full["tool/pose"]}
+    assert {key for key, names in said.items() if b"tracker" in names} == tracked
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}

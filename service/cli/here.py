@@ -1,0 +1,62 @@
+"""`thirdhand via-points add NAME --here`: hands and tool as a running daemon sees them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from typing import Any
+
+from service.cli.usage import CONNECT_TIMEOUT_S
+from service.client import Client, open_session
+from service.contract.channels import ENDPOINT
+from service.contract.explain import ExplainedError
+from service.contract.records import SIDES
+
+STILL_S, STILL_M = 1.0, 0.015  # so long they move no more than that
+OLDEST_MS, TIMEOUT_S, POLL_S = 200.0, 30.0, 0.05
+
+
+class NotHereError(ExplainedError, RuntimeError):
+    """Hands or tool cannot be taken as they are now."""
+
+
+def still(args: argparse.Namespace) -> dict[str, list[float]]:
+    """Where hands and tool are [m] once they hold still, but for what the arguments say: the tool
+    as measured where the arm tells its joints, else as commanded.
+
+    Raises NotHereError where they are not seen, or move, for too long.
+    """
+    wanted = [name for name in (*SIDES, "tool") if not getattr(args, name)]
+    print(f"waiting until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s", file=sys.stderr, flush=True)
+    seen: list[tuple[float, dict[str, list[float]]]] = []
+    with open_session(
+        connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
+    ) as session:
+        client, begun_s = Client(session, args.cell), time.monotonic()
+        while True:
+            now, at_s = client.ask("status"), time.monotonic()
+            lacking = _not_seen(now, wanted)
+            if lacking:
+                seen.clear()
+            else:
+                places = {**now["hands_m"], "tool": now["tool_measured_m"] or now["tool_m"]}
+                seen.append((at_s, {name: places[name] for name in wanted}))
+                while any(math.dist(seen[0][1][name], seen[-1][1][name]) > STILL_M for name in wanted):
+                    seen.pop(0)
+                if at_s - seen[0][0] >= STILL_S:
+                    return seen[-1][1]
+            if at_s - begun_s > TIMEOUT_S:
+                raise NotHereError(f"nothing taught: {lacking or 'hands or tool did not hold still'}")
+            time.sleep(POLL_S)
+
+
+def _not_seen(status: dict[str, Any], wanted: list[str]) -> str:
+    """What of the hands and the tool is not known now, in words; empty: all is."""
+    for side in (side for side in SIDES if side in wanted):
+        age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
+        if age_ms is None or age_ms > OLDEST_MS:
+            ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
+            return f"the {side} hand {ago}; --{side} X Y Z says where it would be"
+    return "where the tool is is not known before the first tick" if status["tick"] < 0 else ""

@@ -1,0 +1,139 @@
+"""`thirdhand record`: takes demonstrations from a running cell; shows, trims and deletes them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+from pathlib import Path
+
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
+from service.client import UnreachableError, open_session
+from service.config import Settings, load
+from service.contract.channels import ENDPOINT
+from service.recorder.mcap_file import RecordingError
+from service.recorder.takes import Summary, TakeNameError, draw, path_of, summary, table, takes, there, trim
+from service.recorder.taking import take
+
+
+def record(args: argparse.Namespace) -> int:
+    """Exit code 0 once a demonstration is written, or what was asked is done with those there."""
+    if args.list == (args.name is not None):
+        raise UsageError("a take's name needed, or --list")
+    settings = load(args.config) if args.config else None
+    if args.plot is not None:
+        if args.plot.suffix != ".png":
+            raise UsageError(f"{args.plot}: a picture is written as .png: {args.plot.with_suffix('.png').name}, say")
+        check_writable(args.plot)
+    if args.list:
+        return _list(args.folder, settings)
+    if args.delete:
+        path = there(args.folder, args.name)
+        path.unlink()
+        print(f"{path} deleted")
+        return 0
+    if args.trim is not None:
+        start_s, end_s = args.trim
+        if not 0 <= start_s < end_s:
+            raise UsageError(
+                f"--trim {start_s:g} {end_s:g}: seconds from the start, the first below the second, needed"
+            )
+        trim(there(args.folder, args.name), start_s, end_s)
+    elif not args.show:
+        _take(args, settings or Settings())
+    found = summary(there(args.folder, args.name), settings=settings)
+    _show(found, args.plot)
+    return 0
+
+
+def _list(folder: Path, settings: Settings | None) -> int:
+    """Exit code 1 where one of the takes cannot be learned from."""
+    paths, unusable = takes(folder), 0
+    for path in paths:
+        try:
+            found = summary(path, settings=settings)
+        except RecordingError as error:
+            unusable += 1
+            print(f"{path.stem:<20} {error}")
+            continue
+        rates = ", ".join(f"{one.name} {one.rate_hz:.0f} Hz" for one in found.streams)
+        gap = f"longest gap {1e3 * max(one.gap_s for one in found.streams):.0f} ms"
+        print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}")
+    print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
+    return 1 if unusable else 0
+
+
+def _show(found: Summary, plot: Path | None) -> None:
+    print(table(found))
+    if plot is not None:
+        draw(found, plot)
+        print(f"{plot} drawn", file=sys.stderr)
+
+
+def _take(args: argparse.Namespace, settings: Settings) -> None:
+    for name, low, high in (("seconds", 1, 3600), ("wait", 0, 3600), ("rest", 0.2, 60)):
+        if not low <= getattr(args, name) <= high:
+            raise UsageError(f"--{name} {getattr(args, name):g}: {low:g} to {high:g} s accepted")
+    path = path_of(args.folder, args.name)
+    if path.exists():
+        raise TakeNameError(f"{path} is there already: another name needed, or --delete it first")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
+    cell, ended = args.cell or settings.cell, _Ended()
+    listen = [args.listen] if args.listen else []
+    try:
+        session = open_session(
+            connect=args.connect or ([] if listen else [ENDPOINT]),
+            listen=listen,
+            timeout_s=CONNECT_TIMEOUT_S,
+            certificate=args.certificate,
+            more={} if listen else {"mode": "client"},  # to clients a daemon passes on what others publish
+        )
+    except UnreachableError as error:
+        hint = "" if listen else f" Where no daemon runs, --listen {ENDPOINT} takes its place"
+        raise UnreachableError(f"{error}{hint}") from None
+    with session:
+        if args.until == "key":
+            print("Enter or Ctrl-C ends it", file=sys.stderr, flush=True)
+        taken = take(
+            session,
+            cell,
+            settings,
+            until=args.until,
+            rest_s=args.rest,
+            is_ended=ended,
+            wait_s=args.wait,
+            longest_s=args.seconds,
+            progress=_progress if sys.stderr.isatty() else lambda line: None,
+            say=lambda line: print(f"\r{line}", file=sys.stderr, flush=True),
+        )
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    taken.write(path)
+    for key, count in taken.malformed.items():
+        print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
+
+
+def _progress(line: str) -> None:
+    print(f"\r{line}", end="", file=sys.stderr, flush=True)
+
+
+class _Ended:
+    """Whether Enter was pressed; standard input that ends, or is another's, says nothing."""
+
+    def __init__(self) -> None:
+        self._listens = True
+
+    def __call__(self) -> bool:
+        try:
+            if not self._listens or not select.select([sys.stdin], [], [], 0)[0]:
+                return False
+            if sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
+                return False
+            if sys.stdin.readline():
+                return True
+        except (OSError, ValueError):
+            pass
+        self._listens = False
+        return False

@@ -1,0 +1,89 @@
+"""The tutorial's commands, run in order as they stand: demonstrations recorded, learned from, and
+followed. But for the place where they meet, and haste: the person is ten times as fast.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from tests_paths import ROOT
+
+from service.cli.main import main
+from service.cli.usage import free_port
+from service.contract.channels import ENDPOINT
+from service.learning.skill_file import decoded
+from sim import teach
+
+BLOCKS = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL)
+SPEED, REST_S = "10", "0.4"
+
+
+class Shell:
+    """Runs the tutorial's lines; what ends with `&` beside the others, the daemon as a process."""
+
+    def __init__(self) -> None:
+        self.at = f"tcp/127.0.0.1:{free_port()}"
+        self.teachers: list[threading.Thread] = []
+        self.daemon: subprocess.Popen[str] | None = None
+        self.codes: list[int] = []
+
+    def run(self, line: str) -> None:
+        words = shlex.split(line.replace(ENDPOINT, self.at).replace("--rest 2", f"--rest {REST_S}"))
+        words = [found for word in words for found in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
+        match words:
+            case ["python", "-m", "sim.teach", *rest, "&"]:
+                rest += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
+                self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(rest)), daemon=True))
+                self.teachers[-1].start()
+            case ["thirdhand", "serve", *rest, "&"]:
+                command = [sys.executable, "-m", "service", "serve", *rest, "--listen", self.at]
+                self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+                assert self.daemon.stdout is not None
+                assert self.daemon.stdout.readline().startswith("listening on ")
+            case ["thirdhand", "via-points" | "status", *_]:
+                assert main([*words[1:], "--connect", self.at]) == 0
+            case ["thirdhand", *rest]:
+                assert main(rest) == 0
+            case ["kill", "%1"]:
+                assert self.daemon is not None
+                self.daemon.terminate()
+            case _:
+                pytest.fail(f"a line that is not understood: {line}")
+
+    def close(self) -> None:
+        if self.daemon is not None:
+            self.daemon.kill()
+            self.daemon.communicate()
+
+
+@pytest.mark.timeout(300)  # it takes a quarter of a minute where nothing else runs
+def test_the_tutorial_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    shell = Shell()
+    try:
+        for block in BLOCKS:
+            for line in block.splitlines():
+                shell.run(line)
+        assert shell.daemon is not None
+        assert shell.daemon.wait(30) == 0
+        for teacher in shell.teachers:
+            teacher.join(30)
+    finally:
+        shell.close()
+    assert shell.codes[0] == 0
+    said = capsys.readouterr()
+    assert "3 takes in demonstrations" in said.err
+    assert re.search(r"^handover +tool .*missed by .* mm\n1 via-point in force", said.out, re.MULTILINE)
+    assert decoded((tmp_path / "skill.npz").read_bytes(), origin="skill").name == "skill"
+    for name in ("take-3.png", "skill.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
