@@ -13,7 +13,8 @@ from tests_paths import ROOT
 
 from service.config import Settings, robot_description
 from service.contract import incidents, requests
-from service.contract.records import Cause, Flag, Mode, Reason
+from service.contract.channels import CHANNELS, topic
+from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.core.arm import Arm
 from service.recorder.client import Scribe
 
@@ -94,3 +95,24 @@ def test_each_fault_has_the_figures_that_were_measured() -> None:
     for name, one in MEASURED.items():
         figures = (one.get(key) for key in ("hold_ms", "rest_ms", "travelled_mm", "lost_ticks"))
         assert rows[name] == ["-" if value is None else f"{value:.0f}" for value in figures], name
+
+
+def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() -> None:
+    layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text(encoding="utf-8"))
+    fields = {
+        topic("thirdhand", name): {field.name for field in fields}
+        for name, fields in (("frame", FRAME), ("timing", TIMING))
+    }
+    text = json.dumps(layout)
+    topics = {topic("thirdhand", channel.key) for channel in CHANNELS if channel.recorded}
+    shown = set(layout["configById"]["3D!scene"]["topics"])
+    assert {"/robot_description", "/thirdhand/objects", "/thirdhand/hands/left", "/thirdhand/tool/target"} <= shown
+    assert shown <= topics
+    named = re.findall(r'"(/thirdhand/\w+)\.(\w+)', text)
+    assert len(named) >= 8
+    assert all(field in fields.get(name, {"data"}) and name in topics for name, field in named)
+
+    def panels(part: object) -> set[str]:
+        return panels(part["first"]) | panels(part["second"]) if isinstance(part, dict) else {str(part)}
+
+    assert panels(layout["layout"]) == set(layout["configById"])

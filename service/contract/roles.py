@@ -12,6 +12,7 @@ from service.contract import channels
 DAEMON = "daemon"
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
+THINGS = ("objects",)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
 
@@ -25,9 +26,9 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "tracker": Role("may publish hands", HANDS),
+    "tracker": Role("may publish hands and things", (*HANDS, *THINGS)),
     "arm": Role("may publish joint states, and hears commands", ARM, hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM), hears=True),
+    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *THINGS), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
     "observer": Role("hears all", hears=True),
 }

@@ -51,6 +51,7 @@ from service.shell.requests import Requests
 from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.sources import Sources
 from service.shell.survey import Survey
+from service.shell.things import Things
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
@@ -124,6 +125,7 @@ class Daemon:
             if channel.direction == "in" and channel.event
             if channel.key != "joints/state" or settings.arm.source == "state"
         ]
+        self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
         self._publishers = {
             channel.key: self._session.declare_publisher(
                 channels.key(settings.cell, channel.key),
@@ -306,6 +308,7 @@ class Daemon:
             payload = self._status = encode_json(status)
             self._publishers["status"].put(payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
+            self._things.look()
             try:
                 self._scribe.supervise()
             except OSError as error:  # a want of descriptors or memory passes

@@ -28,7 +28,7 @@ from service.launch import launched
 from service.shell.door import BOUNDS
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state")
+INPUTS = ("hands/left", "hands/right", "joints/state", "objects")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 PATIENCE_S = 1.0  # what is refused is only seen by waiting
@@ -173,8 +173,8 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    hands = {full["hands/left"], full["hands/right"]}
-    assert {key for key, names in said.items() if b"tracker" in names} == hands
+    tracked = {full[key] for key in ("hands/left", "hands/right", "objects")}
+    assert {key for key, names in said.items() if b"tracker" in names} == tracked
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}
