@@ -119,9 +119,8 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
         assert bench.stderr is not None
         assert bench.stdout is not None
         for line in bench.stderr:
-            if not line.startswith("pybullet build time"):
-                said.append(line.rstrip())
-                say(f"  {said[-1]}")
+            said.append(line.rstrip())
+            say(f"  {said[-1]}")
         report = bench.stdout.read()
         if bench.wait() != 0:
             raise LaunchError(

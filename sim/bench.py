@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.config import Settings
+from service.contract.messages import BASE, Thing
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
@@ -101,7 +102,7 @@ class Bench:
         self.scene = script.scene
         self.period_s = 1.0 / rate_hz
         settings = Settings()
-        self.joint_names = settings.joints.names
+        self.joint_names, self._plate = settings.joints.names, settings.arm.plate
         self.world = World(self.scene, settings, posture=posture or settings.arm.posture, rate_hz=rate_hz)
         self.tick = 0
         self._ticks_since_begin = 0
@@ -263,6 +264,18 @@ class Bench:
         if third[0] <= script_s:
             carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
         self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
+
+    def things(self) -> tuple[Thing, ...]:
+        """What lies on the bench or is held, as viewers draw it: what the arm holds in the frame of
+        its plate, all else in base.
+        """
+        found = []
+        for name, (body, look) in self.world.things.items():
+            holder, grip = self._held.get(body, (None, None))
+            held = grip is not None and holder == self.world.arm
+            frame, pose = (self._plate, grip) if held and grip else (BASE, self.world.pose(body))
+            found.append(Thing(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
+        return tuple(found)
 
     def events(self) -> TaskEvents:
         """How the run went, so far as it went: an event that was not watched yet has an infinite

@@ -23,6 +23,7 @@ from sim.bench import Bench, Observation, TaskEvent, TaskEvents
 from sim.scene import Scene
 from sim.script import Array
 
+THINGS_HZ = 10
 STOP_S = 0.5  # between the last hands and the end
 
 
@@ -130,7 +131,7 @@ class Bridge:
             suffix: session.declare_publisher(
                 channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
             )
-            for suffix in ("hands/left", "hands/right", "joints/state")
+            for suffix in ("hands/left", "hands/right", "joints/state", "objects")
         }
         # A callback costs 20 µs on its own thread, stamps each command as it comes, and overwrites
         # the last: the newest wins.
@@ -151,6 +152,10 @@ class Bridge:
             message = messages.PoseStamped(stamp_ns, messages.BASE, tuple(values[:3]), tuple(values[3:]))
             self._publishers[f"hands/{hand}"].put(cdr.encode_pose(message))
         self.hands_sent += 1
+
+    def publish_things(self, bench: Bench) -> None:
+        """Tell what lies on the bench, for viewers."""
+        self._publishers["objects"].put(channels.BY_KEY["objects"].codec.encode(time.time_ns(), bench.things()))
 
     def close(self) -> None:
         """Take the channels back."""
@@ -190,6 +195,7 @@ def _play(
     commands, key = bridge.commands, channels.key(live.cell, "joints/command")
     rate_hz = round(1.0 / bench.period_s)
     hands_every = max(1, round(rate_hz / live.hands_hz))
+    things_every = max(1, round(rate_hz / THINGS_HZ))
     deadlines = Deadlines(rate_hz)
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running = False
@@ -207,6 +213,8 @@ def _play(
         if bench.tick % hands_every == 0:
             hidden = live.dropout.hand if live.dropout and running and live.dropout.at(seen.time_s) else None
             bridge.publish_hands(bench.script.sample(seen.time_s), hidden=hidden)
+        if bench.tick % things_every == 0:
+            bridge.publish_things(bench)
 
         if ready_s is None:
             if position is not None:

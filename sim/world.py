@@ -12,9 +12,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import pybullet
 
 from service.config import People, Settings, Table, urdf_path
+from sim.quiet import pybullet
 from sim.scene import HAND_ORIENTATION, Scene
 
 Floats = tuple[float, ...]
@@ -38,6 +38,14 @@ class Pose(NamedTuple):
 
 
 BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))  # held by its edge
+
+
+class Look(NamedTuple):
+    """How a thing looks: a `box` or a `cylinder` of a size x y z [m], and its colour."""
+
+    shape: str
+    size: Floats
+    colour: Floats
 
 
 class World:
@@ -75,12 +83,22 @@ class World:
         self._box((*table.half_size, TABLE_THICKNESS / 2), (x, y, top - TABLE_THICKNESS / 2), WOOD, solid=True)
         for at in (scene.soldering, scene.glass, scene.iron):  # what things rest on
             self._box((0.03, 0.03, at[2] / 2), (at[0], at[1], at[2] / 2), WOOD)
-        self.board = self._box((0.04, 0.025, 0.001), self.tool()[0].position, GREEN)
-        self.glass = self._cylinder(0.05, 0.006, scene.glass, STEEL)
-        self.iron = self._cylinder(0.008, 0.18, scene.iron, BLUE)
-        self.solder = self._cylinder(0.02, 0.03, scene.solder, STEEL)
+        self.things: dict[str, tuple[int, Look]] = {}  # by name, what lies on the bench and can be taken
+        self.board = self._thing("board", Look("box", (0.08, 0.05, 0.002), GREEN), self.tool()[0].position)
+        self.glass = self._thing("glass", Look("cylinder", (0.10, 0.10, 0.006), STEEL), scene.glass)
+        self.iron = self._thing("iron", Look("cylinder", (0.016, 0.016, 0.18), BLUE), scene.iron)
+        self.solder = self._thing("solder", Look("cylinder", (0.04, 0.04, 0.03), STEEL), scene.solder)
         self.left = self._hand(scene.left_start, people)
         self.right = self._hand(scene.right_start, people)
+
+    def _thing(self, name: str, look: Look, at: Floats) -> int:
+        x, y, z = look.size
+        if look.shape == "box":
+            body = self._box((x / 2, y / 2, z / 2), at, look.colour)
+        else:
+            body = self._cylinder(x / 2, z, at, look.colour)
+        self.things[name] = body, look
+        return body
 
     def _box(self, half: Floats, at: Floats, colour: Floats, *, solid: bool = False) -> int:
         look = pybullet.createVisualShape(

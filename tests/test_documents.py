@@ -14,8 +14,8 @@ from tests_paths import ROOT
 
 from service.config import Settings, robot_description
 from service.contract import incidents, requests, ros2
-from service.contract.channels import CHANNELS, Channel
-from service.contract.records import Cause, Flag, Mode, Reason
+from service.contract.channels import CHANNELS, Channel, topic
+from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm import Arm
 from service.recorder.client import Scribe
@@ -130,3 +130,24 @@ def test_the_table_of_topics_is_what_ros2_is_told() -> None:
         f"{does[channel in ros2.HEARD]} |"
         for channel in (*ros2.HEARD, *ros2.SAID)
     ]
+
+
+def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() -> None:
+    layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text(encoding="utf-8"))
+    fields = {
+        topic("thirdhand", name): {field.name for field in fields}
+        for name, fields in (("frame", FRAME), ("timing", TIMING))
+    }
+    text = json.dumps(layout)
+    topics = {topic("thirdhand", channel.key) for channel in CHANNELS if channel.recorded}
+    shown = set(layout["configById"]["3D!scene"]["topics"])
+    assert {"/robot_description", "/thirdhand/objects", "/thirdhand/hands/left", "/thirdhand/tool/target"} <= shown
+    assert shown <= topics
+    named = re.findall(r'"(/thirdhand/\w+)\.(\w+)', text)
+    assert len(named) >= 8
+    assert all(field in fields.get(name, {"data"}) and name in topics for name, field in named)
+
+    def panels(part: object) -> set[str]:
+        return panels(part["first"]) | panels(part["second"]) if isinstance(part, dict) else {str(part)}
+
+    assert panels(layout["layout"]) == set(layout["configById"])

@@ -300,6 +300,16 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)"
     )
+    c.add_argument(
+        "--web",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const="127.0.0.1:0",
+        help="with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)",
+    )
+    c.add_argument(
+        "--tab", choices=("task", "timing", "learning"), default="task", help="of the picture (default: %(default)s)"
+    )
     return top
 
 

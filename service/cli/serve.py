@@ -11,10 +11,11 @@ from typing import Any
 
 import msgspec
 
-from service.cli.usage import SHIPPED_SKILL, UsageError, recordings
+from service.cli.usage import SHIPPED_SKILL, UsageError
 from service.config import Settings, converted, load
 from service.described_arm import SettingsError
 from service.recorder.client import Scribe
+from service.recorder.folder import skills_folder
 from service.shell import daemon
 
 
@@ -25,7 +26,7 @@ def serve(args: argparse.Namespace) -> int:
     os.umask(0o077)  # what it writes is its user's
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(load(args.config) if args.config else Settings(), args)
-    skills = Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
+    skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     scribe = Scribe(settings, folder=folder, live_port=args.live)
 

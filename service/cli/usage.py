@@ -58,9 +58,9 @@ def check_writable(path: Path) -> None:
 
 def recordings() -> Path:
     """The folder of the shipped recordings and their skill."""
-    service = Path(__file__).parents[1]
-    folders = (service / "recordings", service.parent / "recordings")
-    return next((folder for folder in folders if folder.is_dir()), folders[1])
+    from service.recorder.folder import shipped_folder  # heavy
+
+    return shipped_folder()
 
 
 def shipped() -> Skill:

@@ -1,40 +1,57 @@
-"""`thirdhand view`: a recording drawn into a Rerun file, the Rerun viewer opened on it, or a
-picture taken without a screen.
+"""`thirdhand view`: a recording drawn into a Rerun file, the Rerun viewer opened on it or on the
+running daemon, in a window or a browser, or a picture taken without a screen.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import io
+import math
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
+from PIL import Image
 
 from service.cli.clients import ask
-from service.cli.usage import UsageError, free_port
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, free_port
+from service.client import Client, open_session
+from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
-from service.recorder.recording import Recording
+from service.network_settings import is_local
+from service.recorder.arrangement import TABS, TIMELINE
+from service.recorder.recording import THINGS, Recording
 from service.recorder.sinks import Viewer, ViewerError
 from service.recorder.steps import Gap
+
+TITLE_BAR, TINT = 30, 40  # pixels that a window's bar has at least; differences of colour that are none
+FRESH_S, FRESH_TIMEOUT_S = 1.0, 10.0  # a picture of a live view that is older says so
 
 
 def view(args: argparse.Namespace) -> int:
     """The viewer's exit code once it is closed; 0 once a picture is written."""
+    check_usage(args)
     if args.file == "live":
-        url = ask(args, "status")["scribe"].get("live")
-        if not url:
+        now = ask(args, "status")
+        print(_line(now), file=sys.stderr, flush=True)
+        if not (url := now["scribe"].get("live")):
             raise UsageError("this daemon serves no live view; start it with --live PORT")
-        return _show(url, args)
+        return _serve(args, url) if args.web else _show(url, args)
     path = Path(args.file)
     if not path.exists():
         raise ExplainedError(f"no such file: {path}")
+    if path.is_dir():
+        raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     if path.suffix == ".rrd":
         return _show(str(path), args)
     with tempfile.TemporaryDirectory() as folder:
@@ -43,10 +60,65 @@ def view(args: argparse.Namespace) -> int:
         return _show(str(drawn), args)
 
 
+def check_usage(args: argparse.Namespace) -> None:
+    """Raises UsageError for what cannot be meant, before anything is drawn."""
+    if args.screenshot:
+        check_writable(args.screenshot)
+        if args.screenshot.suffix.lower() != ".png":
+            raise UsageError(f"--screenshot {args.screenshot}: a name that ends in .png needed")
+    if args.time is not None and not (args.screenshot and math.isfinite(args.time) and args.time >= 0):
+        raise UsageError(f"--time {args.time:g}: seconds from 0 on, of a --screenshot, needed")
+    if args.web and (args.file != "live" or args.screenshot):
+        raise UsageError("--web shows the running daemon in a browser: `thirdhand view live --web`")
+
+
+def _line(status: dict[str, Any]) -> str:
+    """Mode and reason, at once."""
+    reason = f": {status['reason'].replace('_', ' ')}" if status["reason"] else ""
+    return f"{status['cell']}: {status['mode']}{reason}"
+
+
+def _serve(args: argparse.Namespace, url: str) -> int:
+    """Serves the page until it is interrupted."""
+    from service.cli.live_page import Address, Latest, LivePage, web_viewer
+
+    listen = _address(args.web)
+    stream = urlsplit(url.removeprefix("rerun+"))
+    with (
+        open_session(
+            connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
+        ) as session,
+        web_viewer(executable(), url, free_port()) as viewer,
+    ):
+        client = Client(session, args.cell)
+        latest = Latest(session, args.cell, client.ask("status"))
+        to = Address(str(stream.hostname), int(stream.port or 0))
+        try:
+            page = LivePage(Address(*listen), client=client, latest=latest, cell=args.cell, stream=to, viewer=viewer)
+        except OSError as error:
+            where = Address(*listen)
+            raise UsageError(f"--web {where}: {error.strerror or error}; another port, or 0 for any, needed") from None
+        print(f"http://{page.address}/", flush=True)
+        if not is_local(f"tcp/{page.address}"):
+            print("whoever reaches this address can hold, resume and reset the arm", file=sys.stderr, flush=True)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: threading.Thread(target=page.close).start())
+        page.serve()
+    return 0
+
+
+def _address(given: str) -> tuple[str, int]:
+    """Host and port of `PORT` or `HOST:PORT`. Raises UsageError."""
+    host, _, port = given.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"--web {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
 def _show(source: str, args: argparse.Namespace) -> int:
     if args.screenshot:
-        screenshot(source, args.screenshot, time=args.time)
-        print(args.screenshot)
+        age_s = screenshot(source, args.screenshot, time=args.time, tab=args.tab)
+        print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
         return 0
     return int(show(source))
 
@@ -61,8 +133,8 @@ def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[
     with tempfile.TemporaryDirectory() as folder:
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
-        viewer = Viewer(urdf=urdf, settings=recording.settings, rrd=Path(rrd_path))
-        notes = recording.notes("requests", "log")
+        viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
+        notes = recording.notes("requests", "log", THINGS)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
@@ -78,9 +150,11 @@ def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[
                 viewer.log(str(gap), "WARN", time_ns)
             unshown = len(gaps)
             while note is not None and note[2] <= time_ns:
-                viewer.log(note[1], "INFO" if note[0] == "requests" else "WARN", note[2])
+                viewer.note(*note)
                 note = next(notes, None)
-            viewer.add(step.frame, time_ns, step.timing)
+            if step.skill is not None:
+                viewer.learn(step.skill)
+            viewer.add(step.frame, time_ns, step.timing, step.events)
             count += 1
         missing = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
         for text in missing[unshown:]:
@@ -95,16 +169,16 @@ def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[
     return count
 
 
-def screenshot(source: str | Path, png: str | Path, *, time: float | None = None) -> None:
-    """Saves a picture of a Rerun file or live view, `time` [s] after its start or at its end.
-
-    Raises ViewerError.
+def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
+    """Saves a picture of one tab of a Rerun file or live view, `time` [s] after its start or at its
+    end. How old the newest in it is [s], for a live view. Raises ViewerError.
     """
     from rerun.experimental import ViewerClient
 
-    if "://" not in str(source) and not Path(source).is_file():
+    live = "://" in str(source)
+    if not live and not Path(source).is_file():
         raise ViewerError(f"nothing to picture: there is no {source}")
-    if "://" not in str(source):
+    if not live:
         with Path(source).open("rb") as file:
             if file.read(4) != b"RRF2":
                 raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
@@ -114,23 +188,65 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
         with ViewerClient.spawn(
             headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(executable())
         ) as client:
-            client.open(str(source if "://" in str(source) else Path(source).absolute()))
-            _wait(lambda: _extent(client) is not None and ("://" in str(source) or not client.get_state().loading))
+            client.open(str(source if live else Path(source).absolute()))
+            _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
             extent = _extent(client)
             if extent is None:
                 raise ViewerError(f"no picture of {source}: it holds nothing yet")
+            _arrange(client, tab)
             start, end = extent
             at = end if time is None else min(end, start + round(time * 1e9))
-            if time is None and "://" in str(source):
-                client.set_time("time", play_state="following")
+            if time is None and live:
+                client.set_time(TIMELINE, play_state="following")
             else:
-                client.set_time("time", timestamp=np.datetime64(at, "ns"), play_state="paused")
-            _settled(client, Path(png).absolute())
+                client.set_time(TIMELINE, duration=np.timedelta64(at, "ns"), play_state="paused")
+            if not live:
+                _settled(client, Path(png).absolute())
+                return None
+            return _fresh(client, Path(png).absolute())
     except ViewerError:
         raise
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
         hint = "drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers"
         raise ViewerError(f"no picture of {source}: {error} ({hint})") from error
+
+
+def _arrange(client: Any, tab: str) -> None:
+    """Brings one of the three tabs to the front."""
+
+    def arranged() -> bool:
+        told = client.get_blueprint().blueprint
+        root = told.get("/viewport", {}).get("ViewportBlueprint", {}).get("root_container", "")
+        for path, parts in told.items():
+            container = parts.get("ContainerBlueprint", {})
+            if container.get("container_kind") == "Tabs" and (path == root or path.endswith(f"/{root}")):
+                container["active_tab"] = container["contents"][TABS.index(tab)]
+                client.set_blueprint(told, of="recording")
+                return True
+        return False
+
+    if tab != TABS[0]:
+        _wait(arranged)
+
+
+def _picture(client: Any, png: Path) -> None:
+    """Saves what the viewer shows, without the empty bar above it."""
+    with Image.open(io.BytesIO(client.take_screenshot())) as image:
+        pixels = np.asarray(image.convert("RGB"))
+        bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
+        Image.fromarray(pixels[bar if bar < 2 * TITLE_BAR else 0 :]).save(png)
+
+
+def _fresh(client: Any, png: Path) -> float:
+    """Saves a picture of a live view, again until what it shows is recent; how old that is [s]."""
+    until, age_s = clock.monotonic() + FRESH_TIMEOUT_S, 0.0
+    while True:
+        newest = _extent(client, "time")
+        _picture(client, png)
+        age_s = clock.time() - (newest[1] if newest else 0) / 1e9
+        if age_s <= FRESH_S or clock.monotonic() > until:
+            return age_s
+        clock.sleep(0.3)
 
 
 def show(source: str | Path) -> int:
@@ -142,9 +258,11 @@ def show(source: str | Path) -> int:
     return subprocess.run([executable(), "--bind", "127.0.0.1", str(source)], check=False).returncode
 
 
-def _extent(client: Any) -> tuple[int, int] | None:
+def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
     """Start and end [ns] of what is loaded, None before there is anything."""
-    lines = [line for recording in client.get_state().recordings for line in recording.timelines if line.name == "time"]
+    lines = [
+        line for recording in client.get_state().recordings for line in recording.timelines if line.name == timeline
+    ]
     return next(((line.start, line.end) for line in lines if line.start is not None and line.end is not None), None)
 
 
@@ -153,7 +271,7 @@ def _settled(client: Any, png: Path) -> None:
     seen: list[bytes] = []
 
     def same() -> bool:
-        client.save_screenshot(str(png))
+        _picture(client, png)
         seen.append(png.read_bytes())
         return len(seen) >= 8 and seen[-1] == seen[-2] == seen[-3]
 

@@ -65,6 +65,28 @@ def _put_doubles(out: bytearray, values: tuple[float, ...]) -> None:
         out += struct.pack(f"<{len(values)}d", *values)
 
 
+class Writer:
+    """CDR bytes, put together piece by piece; for what the loop does not send."""
+
+    def __init__(self) -> None:
+        self._out = bytearray(CDR_HEADER)
+
+    def pack(self, layout: struct.Struct, *values: Any, align: int) -> None:
+        _align(self._out, align)
+        self._out += layout.pack(*values)
+
+    def string(self, text: str) -> None:
+        _put_string(self._out, text)
+
+    def header(self, stamp_ns: int, frame: str) -> None:
+        _align(self._out, 4)
+        self._out += _stamp(stamp_ns)
+        self.string(frame)
+
+    def bytes(self) -> bytes:
+        return bytes(self._out)
+
+
 def encode_pose(message: PoseStamped) -> bytes:
     """CDR bytes of a PoseStamped."""
     out = _header(message.stamp_ns, message.frame_id)
@@ -170,7 +192,7 @@ def _stamp_ns(sec: int, nanosec: int) -> int:
     return sec * _NS + nanosec
 
 
-class _Reader:
+class Reader:
     """A cursor over CDR bytes; every read is checked against the end."""
 
     def __init__(self, data: bytes, most: int | None = None) -> None:
@@ -208,6 +230,11 @@ class _Reader:
         count = self.length()
         return self.unpack(struct.Struct(f"<{count}d"), 8) if count else ()
 
+    def skip(self, layout: struct.Struct, align: int) -> None:
+        """Passes over a sequence of items of one layout."""
+        if count := self.length():
+            self.unpack(struct.Struct(f"{count * layout.size}x"), align)
+
     def header(self) -> tuple[int, str]:
         return _stamp_ns(*self.unpack(_STAMP, 4)), self.string()
 
@@ -218,7 +245,7 @@ class _Reader:
 
 def decode_pose(data: bytes) -> PoseStamped:
     """The PoseStamped in CDR bytes. Raises WireError."""
-    reader = _Reader(data, _LONGEST)
+    reader = Reader(data, _LONGEST)
     stamp, frame = reader.header()
     values = reader.unpack(_POSE, 8)
     reader.end()
@@ -227,7 +254,7 @@ def decode_pose(data: bytes) -> PoseStamped:
 
 def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     """The PoseWithCovarianceStamped in CDR bytes. Raises WireError."""
-    reader = _Reader(data, _LONGEST)
+    reader = Reader(data, _LONGEST)
     stamp, frame = reader.header()
     values = reader.unpack(_POSE, 8)
     covariance = reader.unpack(_COVARIANCE, 8)
@@ -266,7 +293,7 @@ def decode_joints(data: bytes) -> JointState:
                 numbers[v + 1 :],
                 known.frame_id,
             )
-    reader = _Reader(data, _LONGEST)
+    reader = Reader(data, _LONGEST)
     stamp, frame = reader.header()
     names = tuple(reader.string() for _ in range(reader.length()))
     position, velocity, effort = reader.doubles(), reader.doubles(), reader.doubles()
@@ -289,7 +316,7 @@ def _learn_layout(message: JointState, data: bytes) -> None:
 
 def decode_string(data: bytes) -> str:
     """The text of a `std_msgs/msg/String`. Raises WireError."""
-    return _Reader(data).string()
+    return Reader(data).string()
 
 
 def decode_transforms(data: bytes) -> tuple[int, list[Transform]]:
@@ -297,7 +324,7 @@ def decode_transforms(data: bytes) -> tuple[int, list[Transform]]:
 
     Raises WireError.
     """
-    reader, stamp, found = _Reader(data), 0, []
+    reader, stamp, found = Reader(data), 0, []
     for _ in range(reader.length()):
         stamp, parent = reader.header()
         child, values = reader.string(), reader.unpack(_POSE, 8)

@@ -10,11 +10,11 @@ only recorded, a hash in `ros2`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-from service.contract import cdr, requests
+from service.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
 LARGEST_REQUEST = 256 * 1024  # bytes
@@ -45,6 +45,7 @@ POSE_WITH_COVARIANCE = Codec(
 JOINTS = Codec("sensor_msgs/msg/JointState", "cdr", cdr.encode_joints, cdr.decode_joints)
 STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_string)
 TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
+THINGS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_things, markers.decode_things)
 TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
 SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
 FRAME, TIMING, STATE = (
@@ -62,7 +63,7 @@ class EventKind(NamedTuple):
 class Channel(NamedTuple):
     """One line of the table."""
 
-    key: str  # below the cell, unless it begins with a slash; also the topic in a recording, and the kind of an event
+    key: str  # below the cell, unless it begins with a slash; behind one a recording's topic; the kind of an event
     codec: Codec
     direction: Literal["in", "out", "request", "recording"]
     about: str
@@ -93,6 +94,8 @@ CHANNELS = (
             rate="every 5th tick", every=5),
     Channel("tool/setpoint", POSE, "out", "the target after smoothing", rate="every 5th tick", every=5),
     Channel("tool/pose", POSE, "in", "the tool as measured, in demonstrations", rate="teaching", recorded=False),
+    Channel("objects", THINGS, "in", "things on the bench, for viewers: boxes, balls, cylinders",
+            rate="1 - 30 Hz"),
     Channel("status", _request(requests.Nothing), "out", "mode, reason, flags, rates, latency percentiles, counters",
             rate="10 Hz, and on request", queryable=True),
     Channel("via_points", _request(requests.ViaPointsRequest), "request", "add, remove, clear and list via-points",
@@ -122,13 +125,25 @@ EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
 def key(cell: str, suffix: str) -> str:
-    """The key expression of one channel of a cell; also its topic in a recording."""
+    """The key expression of one channel of a cell."""
     return suffix if suffix.startswith("/") else f"{cell}/{suffix}"
 
 
 def presence(cell: str, session: str = "*") -> str:
     """The key of the liveliness token by which the daemon of a Zenoh session serves a cell."""
     return key(cell, f"{PRESENCE}/{session}")
+
+
+def topic(cell: str, suffix: str) -> str:
+    """The topic of one channel in a recording: with a leading slash, as ROS 2 has them."""
+    return f"/{key(cell, suffix)}" if not suffix.startswith("/") else suffix
+
+
+def keys_by_topic(cell: str, suffixes: Iterable[str]) -> dict[str, str]:
+    """The channels' keys by their topics, with and without the slash that earlier recordings
+    lack.
+    """
+    return {name: suffix for suffix in suffixes for name in (topic(cell, suffix), key(cell, suffix))}
 
 
 def sent_by_the_loop(tick: int) -> tuple[Channel, ...]:

@@ -60,6 +60,20 @@ class Transform(NamedTuple):
     rotation: Quaternion
 
 
+class Thing(NamedTuple):
+    """Something on the bench, as viewers draw it: a `box`, `ball` or `cylinder` (along z) of a size
+    x y z [m], where it is in a frame, and its colour: red, green, blue and opacity, 0 to 1.
+    """
+
+    name: str
+    shape: str
+    frame_id: str
+    position: Vector3
+    orientation: Quaternion
+    size: Vector3
+    colour: tuple[float, float, float, float]
+
+
 class Attachment(NamedTuple):
     """What rides with every output: tick index, publish time [ns], stamp of the newest hand sample
     it answers [ns] (0: none).

@@ -13,7 +13,8 @@ DAEMON, ROUTER = "daemon", "router"
 SERVERS = (DAEMON, ROUTER)  # others connect to them
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state",)
-TOOL = ("tool/pose",)
+TOOL, THINGS = ("tool/pose",), ("objects",)
+TOPICS = (*ros2.HEARD, *ros2.SAID)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
 
@@ -28,15 +29,15 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "tracker": Role("may publish hands, and the tool in demonstrations", (*HANDS, *TOOL)),
+    "tracker": Role("may publish hands, things, and the tool in demonstrations", (*HANDS, *TOOL, *THINGS)),
     "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL), hears=True),
+    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL, *THINGS), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
     "observer": Role("hears all that the daemon publishes", hears=True),
     "recorder": Role("hears what trackers and the arm publish, for demonstrations", hears_inputs=True),
     ROUTER: Role(
         "passes on what all others may do, and has to keep them apart",
-        (*HANDS, *ARM, *TOOL),
+        (*HANDS, *ARM, *TOOL, *THINGS),
         hears=True,
         asks=True,
         hears_inputs=True,
@@ -57,7 +58,8 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
     def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
         found = [channels.key(cell, suffix) for suffix in suffixes]
         if topics and ros2_domain is not None:
-            found += [ros2.key(ros2_domain, cell, channels.BY_KEY[suffix]) for suffix in suffixes]
+            known = (channels.BY_KEY[suffix] for suffix in suffixes)
+            found += [ros2.key(ros2_domain, cell, channel) for channel in known if channel in TOPICS]
         return found
 
     heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)

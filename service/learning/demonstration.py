@@ -4,6 +4,8 @@ into phase.
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +46,12 @@ class Demonstration(NamedTuple):
         """The demonstration with one sample of so many."""
         stamps_ns, left, right, tool = self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step]
         return self._replace(stamps_ns=stamps_ns, left=left, right=right, tool=tool)
+
+
+def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
+    """The hash by which a skill knows what it was learned from."""
+    parts = (part.tobytes() for one in demonstrations for part in (one.hands, one.tool))
+    return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
 
 
 def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:

@@ -7,7 +7,6 @@ regression at sampled inputs, a KMP of that with parameters as given.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ from service.core.places import Task
 from service.core.skill import LearnedBetween, Skill
 from service.learning.between import learned, task_of
 from service.learning.choice import Choice
-from service.learning.demonstration import Demonstration, in_phase
+from service.learning.demonstration import Demonstration, fingerprint, in_phase
 from service.learning.gate import deviations, gate
 from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.skill_file import SkillError, with_file
@@ -126,9 +125,7 @@ def learn(
         orientation=mean_orientation(tools[:, 3:]),
         workspace=np.stack([tools[:, :3].min(axis=0) - MARGIN_M, tools[:, :3].max(axis=0) + MARGIN_M]),
         threshold=found.threshold,
-        learned_from=hashlib.blake2b(
-            b"".join(d.hands.tobytes() + d.tool.tobytes() for d in demonstrations), digest_size=16
-        ).hexdigest(),
+        learned_from=fingerprint(demonstrations),
         components=components or 0,
         between=by_places,
         figures=msgspec.json.encode(judged).decode(),

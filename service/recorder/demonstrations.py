@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from service.config import HandSettings, Settings
 from service.contract import cdr
-from service.contract.channels import POSE, STRING, key
+from service.contract.channels import POSE, STRING, topic
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import encode_json
 from service.core.frame import Vector
@@ -42,17 +42,17 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             raise ValueError(
                 f"{name}: shape {stream.shape} given, finite numbers of shape ({len(stamps_ns)}, 7) needed"
             )
-    file = McapFile(Path(path), joints=0)
+    file = McapFile(Path(path), joints=0, attached=False)
     try:
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
         ):
             for name, row in zip(_STREAMS, rows, strict=True):
                 data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
-                file.put(key(cell, name), POSE.type, data, stamp, i)
+                file.put(topic(cell, name), POSE.type, data, stamp, i)
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
-            file.put(key(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+            file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
     finally:
         file.close()
 

@@ -97,3 +97,15 @@ class Places:
             cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
             self._ours[path.stem] = cell == self._settings.cell
         return self._ours[path.stem]
+
+
+def shipped_folder() -> Path:
+    """The folder of the shipped recordings and their skill."""
+    service = Path(__file__).parents[1]
+    folders = (service / "recordings", service.parent / "recordings")
+    return next((folder for folder in folders if folder.is_dir()), folders[1])
+
+
+def skills_folder(settings: Settings) -> Path:
+    """Where the skills of a cell are, and the demonstrations that they were learned from."""
+    return Path(settings.files.skills).expanduser() if settings.files.skills else shipped_folder()

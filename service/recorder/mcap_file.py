@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import MCAP0_MAGIC, IndexType, Writer
 
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
@@ -96,11 +96,16 @@ class McapFile:
     together. Errors of the file system are raised; then the file holds what was written before.
     """
 
-    def __init__(self, path: Path, *, joints: int) -> None:
-        """`joints` is how many the arm has: the layouts of what is recorded of it depend on it."""
+    def __init__(self, path: Path, *, joints: int, attached: bool = True) -> None:
+        """`joints` is how many the arm has: the layouts of what is recorded of it depend on it.
+
+        One to which attachments and metadata are not `attached` has no index of them: the summary
+        would tell of groups that are not there.
+        """
         self.path = path
         self._stream = _WholeWrites(path)
-        self.writer = Writer(self._stream, chunk_size=1 << 62, enable_data_crcs=True)  # type: ignore[arg-type]
+        kinds = IndexType.ALL if attached else IndexType.CHUNK | IndexType.MESSAGE
+        self.writer = Writer(self._stream, chunk_size=1 << 62, index_types=kinds, enable_data_crcs=True)  # type: ignore[arg-type]
         self._joints = joints
         self._pending = 0  # bytes
         self._schemas: dict[str, int] = {}

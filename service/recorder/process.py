@@ -120,7 +120,8 @@ class ScribeProcess:
             from service.recorder.sinks import Viewer  # half a second that a scribe without viewer need not spend
 
             urdf = urdf_path(task.settings)
-            self._drawing = DrawingThread(Viewer(urdf=urdf, live_port=task.live_port, settings=task.settings))
+            viewer = Viewer(urdf=urdf, live_port=task.live_port, settings=task.settings, skill=skill)
+            self._drawing = DrawingThread(viewer)
         places = Places(task.settings, task.folder, task.recording, task.rrd, attempt=task.attempt)
         self._segments = Segments(task.settings, places, say=self._errors.append, draw=self._draw_into)
         state = None if task.state is None else np.frombuffer(task.state, state_layout(self._joints))[0]
@@ -136,7 +137,7 @@ class ScribeProcess:
         viewer = None if self._drawing is None else self._drawing.viewer
         while viewer is not None and viewer.problems:
             self._errors.append(viewer.problems.pop(0))
-        if self._drawing is not None and self._drawing.dropped > self._said_dropped:
+        if self._drawing is not None and self._drawing.dropped > 2 * self._said_dropped:
             self._said_dropped = self._drawing.dropped
             self._errors.append(f"the drawing cannot keep up: {self._said_dropped} of its entries dropped")
         segments = self._segments
@@ -168,16 +169,19 @@ class ScribeProcess:
         if (note := unpack_note(message)) is not None:
             key, text, time_ns = note
             self._segments.note(key, text, time_ns)
-            if key != "status":
-                self._show(text, "WARN" if key == "log" else "INFO", time_ns)
+            if key != "status" and self._drawing is not None:
+                viewer = self._drawing.viewer
+                self._drawing.put(lambda: viewer.note(key, text, time_ns))
             return
         told = unpack(message, skills, joints=self._joints)
         time_ns = int(told.timing["time_ns"])
         if missing := self._segments.write(told):
             self._show(f"{missing} ticks before tick {told.tick.index} are not recorded", "WARN", time_ns)
         if self._drawing is not None:
-            viewer = self._drawing.viewer
-            self._drawing.put(lambda: viewer.add(told.frame, time_ns, told.timing))
+            viewer, events = self._drawing.viewer, [(event.kind, event.payload) for event in told.tick.inbox]
+            if (skill := told.skill) is not None:
+                self._drawing.put(lambda: viewer.learn(skill))
+            self._drawing.put(lambda: viewer.add(told.frame, time_ns, told.timing, events))
 
     def _show(self, text: str, level: str, time_ns: int) -> None:
         if self._drawing is not None:

@@ -18,15 +18,17 @@ import msgspec
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Transform, Vector3
+from service.contract.messages import BASE, Thing, Transform, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Record, Tick, encode
 from service.core.outputs import outgoing
+from service.recorder.balls import with_balls
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recorder.mcap_reader import Fault, Messages
 from service.recorder.steps import REPLAYED, Gap, Step, steps
 from service.urdf import Urdf
 
+THINGS = "objects"
 FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
 _LATCHED = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
@@ -57,7 +59,7 @@ class Recorder:
         self._begun, self._sequence = False, 0
         self._links = Urdf(self._urdf)
         self._topics = {
-            channel.key: channels.key(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
+            channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
         }
         self._file = McapFile(Path(path), joints=len(settings.joints.names))
         self.path = self._file.path
@@ -93,7 +95,7 @@ class Recorder:
         A reader's time line starts there.
         """
         self._begun = True
-        self._put("/robot_description", cdr.encode_string(self._urdf), time_ns, qos=_LATCHED)
+        self._put("/robot_description", cdr.encode_string(with_balls(self._urdf)), time_ns, qos=_LATCHED)
         if self._state is not None:
             self._put("state", encode(self._state), time_ns)
 
@@ -166,15 +168,19 @@ class Recorder:
         return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`; replay ignores
-        it.
+        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or things given
+        as JSON under `objects`; replay ignores it.
         """
         if key in REPLAYED:
             raise ValueError(f"a note under {key!r}: that topic holds what a replay needs")
         if not self._begun:
             self._begin(time_ns)
-        topic = channels.key(self._settings.cell, key)
+        if key == THINGS:
+            things = msgspec.json.decode(text, type=tuple[Thing, ...])
+            return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, things), time_ns)
+        topic = channels.topic(self._settings.cell, key)
         self._file.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
+        return None
 
     def flush(self) -> None:
         """Ends the chunk in progress: what was written so far survives a kill of the process."""
@@ -273,8 +279,12 @@ class Recording:
         return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in said]
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
-        """Key, text and time [ns] of the notes under the keys, in order."""
-        topics = {channels.key(self.settings.cell, key): key for key in keys}
+        """Key, text and time [ns] of the notes under the keys, in order; things as JSON."""
+        topics = channels.keys_by_topic(self.settings.cell, keys)
         for _, channel, message in Messages(self.path):
-            if channel.topic in topics:
-                yield topics[channel.topic], cdr.decode_string(message.data), message.log_time
+            key = topics.get(channel.topic)
+            if key == THINGS:
+                things = channels.BY_KEY[key].codec.decode(message.data)
+                yield key, msgspec.json.encode(things).decode(), message.log_time
+            elif key is not None:
+                yield key, cdr.decode_string(message.data), message.log_time

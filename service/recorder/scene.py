@@ -1,327 +1,194 @@
-"""What the viewer shows and how: the arrangement of the views, what never changes, and frames as
-chunks of columns.
+"""What the viewer shows and never changes: the arm and its ghost, table, reach, names and colours.
 
-The scene is drawn at about 100 Hz, the curves at the full rate. Millimetres, microseconds and
-colours are chosen here and nowhere else.
+Millimetres, microseconds and degrees of transparency are chosen here, in `chunks` and
+`arrangement`, and nowhere else.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from service.config import Settings
-from service.contract.records import SIDES, Mode, Reason
-from service.core.frame import TIMING, Record
+from service.config import Reach, Settings
+from service.contract.records import SIDES, STAGES, Mode, Reason
+from service.recorder import palette
+from service.recorder.arrangement import EYE, LOOK_AT, UP
+from service.recorder.banner import HEIGHT, WIDTH
 
-SCENE_HZ = 100
-TRAIL_S, TRAIL_HZ = 3.0, 20
-LIVE_WINDOW_S = 20.0
-BLUE, ORANGE, GREEN, MAGENTA, GREY = (58, 134, 255), (255, 146, 43), (64, 192, 87), (214, 51, 132), (150, 155, 163)
-PALETTE = [
-    (58, 134, 255),
-    (255, 146, 43),
-    (64, 192, 87),
-    (230, 73, 128),
-    (151, 117, 250),
-    (59, 201, 219),
-    (250, 204, 21),
-]
-MODE_COLOURS = {Mode.HOLD: 0xF0A000FF, Mode.FOLLOW: 0x40C057FF, Mode.FAULT: 0xE03131FF}
-Batch = list[tuple[Record, int, Record | None]]
+GHOST = "measured/"  # before the names of its frames
+ARC_STEPS = 48
+BANNER_AT, BANNER_WIDTH = (-0.55, 0.88, -0.6), 1.0  # [m] right of, above and before where the camera looks
+_SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 
 
-def blueprint(*, live: bool) -> rrb.Blueprint:
-    """The arrangement of the views: the scene large, curves at the right, mode and log below."""
-    window = None
-    if live:
-        start = rrb.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S)
-        window = rrb.VisibleTimeRanges(
-            rr.VisibleTimeRange("time", start=start, end=rrb.TimeRangeBoundary.cursor_relative())
+class Trees:
+    """The arm as commanded and as measured: the same URDF twice, under names of their own."""
+
+    def __init__(self, urdf: Path) -> None:
+        self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+        self.measured = rr.urdf.UrdfTree.from_file_path(
+            urdf, entity_path_prefix="measured", frame_prefix=GHOST, static_transform_entity_path="/measured/tf_static"
         )
 
-    def curves(origin: str, name: str, **more: Any) -> rrb.TimeSeriesView:
-        legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=more.pop("legend", True))
-        return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend, time_ranges=window, **more)
 
-    scene = rrb.Spatial3DView(
-        origin="/",
-        name="Bench",
-        contents=["+ /scene/**", "+ /arm/**"],
-        background=rrb.Background(color=(24, 27, 33)),
-        line_grid=rrb.LineGrid3D(
-            spacing=0.1, plane=rr.components.Plane3D.XY.with_distance(-0.02), stroke_width=0.5, color=(70, 76, 86, 90)
-        ),
-        eye_controls=rrb.EyeControls3D(
-            position=(1.90, -1.25, 1.00), look_target=(0.46, 0.0, 0.30), eye_up=(0.0, 0.0, 1.0)
-        ),
-    )
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(
-                scene,
-                rrb.Vertical(
-                    curves("/accuracy", "Target: how sure, how closely followed [mm]"),
-                    rrb.Tabs(
-                        curves("/speed", "Speed [m/s]"),
-                        curves("/separation", "Nearest hand: distance [m], speed allowed toward it [m/s]"),
-                        active_tab=0,
-                    ),
-                    rrb.Tabs(
-                        curves("/joints/velocity", "Joint velocities [rad/s]"),
-                        curves("/joints/position", "Joint positions [rad]"),
-                        curves("/joints/acceleration", "Joint accelerations [rad/s²]"),
-                    ),
-                    rrb.Tabs(curves("/latency", "Hand to command [ms]"), curves("/timing", "Time of a tick [µs]")),
-                    row_shares=[3, 3, 4, 3],
-                ),
-                column_shares=[3, 2],
-            ),
-            rrb.Horizontal(
-                rrb.StateTimelineView(origin="/mode", name="Mode"),
-                rrb.TextLogView(
-                    origin="/log",
-                    name="Log",
-                    columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["LogLevel", "Body"]),
-                ),
-                column_shares=[3, 2],
-            ),
-            row_shares=[5, 1],
-        ),
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="following" if live else None),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
-        auto_layout=False,
-    )
-
-
-def log_fixed(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, settings: Settings) -> None:
-    """Logs what never changes: the arm's shapes, the table, names and colours."""
+def log_fixed(stream: rr.RecordingStream, trees: Trees, settings: Settings) -> None:
+    """Logs what never changes."""
 
     def fix(path: str, *what: Any) -> None:
         stream.log(path, *what, static=True)
 
+    _log_arm(stream, trees.commanded, "/arm", ghost=False)
+    _log_arm(stream, trees.measured, "/measured", ghost=True)
+    fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=trees.commanded.root_link().name))
+    fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + trees.measured.root_link().name))
+    _log_surroundings(fix, settings)
+    fix("/scene/tool", rr.TransformAxes3D(0.07))
+    for name, colour, radius in (
+        ("left_hand", palette.LEFT, 0.022),
+        ("right_hand", palette.RIGHT, 0.022),
+        ("setpoint", palette.TOOL, 0.008),
+    ):
+        words = [name.replace("_", " ")]
+        ball = rr.Points3D.from_fields(colors=[colour], radii=[radius], labels=words, show_labels=radius > 0.01)
+        fix(f"/scene/{name}", ball)
+    wires = rr.components.FillMode.TransparentFillMajorWireframe
+    region = rr.Ellipsoids3D.from_fields(
+        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wires, labels=["target, 2 sigma"], show_labels=False
+    )
+    fix("/scene/target", region)
+    for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
+        fix(f"/scene/{name}_trail", rr.LineStrips3D.from_fields(colors=[colour], radii=[0.002]))
+    fix("/scene/nearest", rr.LineStrips3D.from_fields(colors=[palette.NEAREST], radii=[0.0015], show_labels=True))
+    _log_names(fix, settings)
+
+
+def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, ghost: bool) -> None:
+    """The shapes of the arm: solid, or as a ghost that one sees through."""
+    fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
+    colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
-        if "/collision_geometries/" not in chunk.entity_path:
-            stream.send_chunks(chunk)
-            for shape in (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D):
-                if any(name.startswith(f"{shape.__name__}:") for name in chunk.to_record_batch().schema.names):
-                    fix(chunk.entity_path, shape.from_fields(fill_mode=rr.components.FillMode.Solid))
+        if "/collision_geometries/" in chunk.entity_path:
+            continue
+        stream.send_chunks(chunk)
+        names = chunk.to_record_batch().schema.names
+        for shape in _SHAPES:
+            if any(name.startswith(f"{shape.__name__}:") for name in names):
+                lines = "radii" if shape is rr.Boxes3D else "line_radii"
+                look: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
+                stream.log(chunk.entity_path, shape.from_fields(fill_mode=fill, **look), static=True)
+        if ghost and any(name.startswith("Asset3D:") for name in names):
+            stream.log(chunk.entity_path, rr.Asset3D.from_fields(albedo_factor=colour), static=True)
     for joint in tree.joints():
         if joint.joint_type == "fixed":
-            fix(f"/arm/joints/{joint.child_link}", joint.compute_transform(0.0))
-    fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=tree.root_link().name))
+            stream.log(f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True)
+
+
+def _log_surroundings(fix: Any, settings: Settings) -> None:
+    """Table, boxes, and how far the arm reaches."""
     (x, y, top), (half_x, half_y) = settings.table.centre, settings.table.half_size
+    solid = rr.components.FillMode.Solid
+    half = [(half_x, half_y, 0.0095)]
     fix(
         "/scene/table",
-        rr.Boxes3D(
-            centers=[(x, y, top - 0.01)],
-            half_sizes=[(half_x, half_y, 0.0095)],
-            colors=[(58, 63, 72)],
-            fill_mode=rr.components.FillMode.Solid,
-        ),
+        rr.Boxes3D(centers=[(x, y, top - 0.01)], half_sizes=half, colors=[palette.TABLE], fill_mode=solid),
     )
     edge = [(x + a * half_x, y + b * half_y, top) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
-    fix("/scene/table/edge", rr.LineStrips3D([edge], colors=[GREY], radii=[0.0015]))
-    fix("/scene/tool", rr.TransformAxes3D(0.07))
-    for name, colour, radius in (("left_hand", BLUE, 0.022), ("right_hand", ORANGE, 0.022), ("setpoint", GREEN, 0.008)):
+    fix("/scene/table/edge", rr.LineStrips3D([edge], colors=[palette.GREY], radii=[0.0015]))
+    if boxes := settings.obstacles.boxes:
         fix(
-            f"/scene/{name}",
-            rr.Points3D.from_fields(
-                colors=[colour], radii=[radius], labels=[name.replace("_", " ")], show_labels=radius > 0.01
+            "/scene/obstacles",
+            rr.Boxes3D(
+                centers=[box.centre for box in boxes],
+                half_sizes=[box.half_size for box in boxes],
+                colors=[palette.TABLE],
+                fill_mode=solid,
             ),
         )
-    wires = rr.components.FillMode.TransparentFillMajorWireframe
-    fix(
-        "/scene/target",
-        rr.Ellipsoids3D.from_fields(
-            colors=[MAGENTA], line_radii=[0.0006], fill_mode=wires, labels=["target, 2 sigma"], show_labels=False
-        ),
-    )
-    for name, colour in (("left", BLUE), ("right", ORANGE), ("tool", GREEN)):
-        fix(f"/scene/{name}_trail", rr.LineStrips3D.from_fields(colors=[colour], radii=[0.002]))
-    names = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
-    for what in ("position", "velocity", "acceleration"):
-        fix(
-            f"/joints/{what}",
-            rr.SeriesLines(
-                names=names, colors=[PALETTE[i % len(PALETTE)] for i in range(len(names))], widths=[1.5] * len(names)
-            ),
-        )
-    for path, name, colour in (
-        ("/accuracy/deviation", "standard deviation of the target", MAGENTA),
-        ("/accuracy/error", "tool to target", GREEN),
-        ("/speed/tool", "tool", GREEN),
-        ("/speed/left", "left hand", BLUE),
-        ("/speed/right", "right hand", ORANGE),
-        ("/separation/distance", "nearest hand's distance", BLUE),
-        ("/separation/limit", "speed allowed toward it", MAGENTA),
-        ("/latency/hand", "hand's stamp to command", MAGENTA),
-        ("/timing/lateness", "late by", ORANGE),
-        ("/timing/work", "work", BLUE),
-    ):
-        fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5))
-    for path, names, colours in (
-        ("/mode/mode", [mode.name.lower() for mode in Mode], [MODE_COLOURS[mode] for mode in Mode]),
-        ("/mode/reason", [reason.name.lower() for reason in Reason], [0x868E96FF] * len(Reason)),
-    ):
-        labels = [name.replace("_", " ") for name in names]
-        fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours, np.uint32)))
+    faint = palette.faint(palette.GREY, 0.08)
+    fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=[0.001]))
 
 
-class Chunks:
-    """Batches of frames as chunks of columns; remembers what the next batch continues."""
+def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
+    """Lines (P, 3) [m] on the outer shell of the reach: around at two heights, and up and down at
+    three bearings.
+    """
+    centre = np.array(reach.centre)
+    lowest = max(np.arcsin(np.clip((reach.min_z - centre[2]) / reach.outer, -1.0, 1.0)), -np.pi / 2)
+    around, up = np.linspace(-np.pi / 2, np.pi / 2, ARC_STEPS), np.linspace(lowest, np.pi / 2, ARC_STEPS)
+    arcs = [(around, np.full(ARC_STEPS, height)) for height in (lowest, 0.0)]
+    arcs += [(np.full(ARC_STEPS, bearing), up) for bearing in (-np.pi / 3, 0.0, np.pi / 3)]
+    for bearing, height in arcs:
+        way = np.stack([np.cos(bearing) * np.cos(height), np.sin(bearing) * np.cos(height), np.sin(height)], axis=1)
+        points = centre + reach.outer * way
+        points = points[points[:, 0] >= reach.min_x]
+        if len(points) > 1:
+            yield points
 
-    def __init__(self, tree: rr.urdf.UrdfTree, settings: Settings) -> None:
-        rate_hz = settings.rate_hz
-        self._joints = [tree.get_joint_by_name(name) for name in settings.joints.names]
-        self._every = max(1, round(rate_hz / SCENE_HZ))
-        self._trail_every = max(1, round(rate_hz / TRAIL_HZ))
-        self._trails: dict[str, deque[NDArray[np.float32]]] = {
-            name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
+
+def _log_names(fix: Any, settings: Settings) -> None:
+    """Names, units and colours of the curves, and the words and colours of the modes."""
+    joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
+    several: list[tuple[str, list[str], str, tuple[palette.Colour, ...]]] = [
+        (f"/joints/{what}", joints, unit, palette.JOINTS)
+        for what, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
+    ]
+    several += [
+        ("/timing/stages", list(STAGES), "µs", palette.JOINTS),
+        ("/age", [f"{side} hand" for side in SIDES], "ms", (palette.LEFT, palette.RIGHT)),
+    ]
+    for path, names, unit, colours in several:
+        look: dict[str, Any] = {
+            "colors": [colours[i % len(colours)] for i in range(len(names))],
+            "widths": [1.5] * len(names),
         }
-        self._shown: tuple[int, int] | None = None
-        self._missed = 0
-        self._scene_at = self._trail_at = -1
+        fix(path, rr.SeriesLines(names=[f"{name} [{unit}]" for name in names], **look, **_drawn_as(path)))
+    for path, name, colour in (
+        ("/error/target", "tool to target [mm]", palette.TOOL),
+        ("/deviation/target", "standard deviation [mm]", palette.TARGET),
+        ("/deviation/gate", "holds above [mm]", palette.VERMILLION),
+        ("/speed/tool", "tool [m/s]", palette.TOOL),
+        ("/speed/left", "left hand [m/s]", palette.LEFT),
+        ("/speed/right", "right hand [m/s]", palette.RIGHT),
+        ("/separation/distance", "distance [m]", palette.NEAREST),
+        ("/separation/limit", "allowed [m/s]", palette.SKY),
+        ("/joints/error", "largest [rad]", palette.MEASURED),
+        ("/latency/hand", "hand's stamp to command [ms]", palette.PURPLE),
+        ("/timing/lateness", "late by [µs]", palette.ORANGE),
+        ("/timing/work", "work [µs]", palette.SKY),
+    ):
+        fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_drawn_as(path)))
+    for path, words, numbers in (
+        ("/mode/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
+        ("/mode/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
+    ):
+        labels = [word.replace("_", " ") for word in words]
+        fix(path, rr.StateConfiguration(values=words, labels=labels, colors=np.array(numbers, np.uint32)))
+    fix("/scene/banner", _sign())
 
-    def begin_anew(self) -> None:
-        """What comes goes into another file: the mode in force is said again."""
-        self._shown = None
 
-    def of(self, batch: Batch) -> Iterator[rr.chunk.Chunk]:
-        """The chunks that show a batch."""
-        frames = np.array([frame for frame, _, _ in batch])
-        times = np.array([time_ns for _, time_ns, _ in batch], np.int64)
-        ticks = frames["tick"]
-        timed = [i for i, (_, _, timing) in enumerate(batch) if timing is not None]
+def _drawn_as(path: str) -> dict[str, Any]:
+    """Where a curve has more values than the screen has dots, the worst of them count."""
+    worst = path.startswith(("/timing", "/latency", "/age"))
+    return {"aggregation_policy": rr.components.AggregationPolicy.Max} if worst else {}
 
-        def columns(path: str, rows: Any, *what: Any) -> rr.chunk.Chunk:
-            index = [
-                rr.TimeColumn("tick", sequence=ticks[rows]),
-                rr.TimeColumn("time", timestamp=times[rows].view("datetime64[ns]")),
-            ]
-            return rr.chunk.Chunk.from_columns(path, index, [column for part in what for column in part])
 
-        def scalars(path: str, rows: Any, values: NDArray[Any]) -> rr.chunk.Chunk:
-            flat = rr.Scalars.columns(scalars=values[rows].ravel())
-            return columns(
-                path, rows, flat.partition([values.shape[1]] * len(ticks[rows])) if values.ndim > 1 else flat
-            )
-
-        every = slice(None)
-        yield scalars("/joints/position", every, frames["joints"])
-        yield scalars("/joints/velocity", every, frames["joint_velocities"])
-        yield scalars("/joints/acceleration", every, frames["joint_accelerations"])
-        yield scalars("/speed/tool", every, np.linalg.norm(frames["setpoint_velocity"], axis=1))
-        seen = frames["hand_ages"] >= 0
-        for side, name in enumerate(SIDES):
-            rows = np.flatnonzero(seen[:, side])
-            if len(rows):
-                yield scalars(f"/speed/{name}", rows, np.linalg.norm(frames["hand_velocities"][:, side], axis=1))
-        near = np.flatnonzero(seen.any(axis=1))
-        if len(near):
-            yield scalars("/separation/distance", near, frames["hand_distance"])
-            yield scalars("/separation/limit", near, frames["hand_limit"])
-        aimed = np.flatnonzero(seen.all(axis=1))
-        if len(aimed):
-            yield scalars("/accuracy/deviation", aimed, frames["deviation"] * 1e3)
-            yield scalars("/accuracy/error", aimed, np.linalg.norm(frames["target"] - frames["tool"], axis=1) * 1e3)
-        if timed:
-            timings = np.zeros(len(batch), TIMING)
-            timings[timed] = [batch[i][2] for i in timed]
-            yield scalars("/timing/lateness", timed, timings["lateness_us"])
-            yield scalars("/timing/work", timed, timings["work_us"])
-            answered = np.flatnonzero(timings["latency_us"] > 0)
-            if len(answered):
-                yield scalars("/latency/hand", answered, timings["latency_us"] / 1e3)
-            missed = int(timings["missed"][timed[-1]])
-            if missed > self._missed:
-                fresh = missed - self._missed
-                text = f"{fresh} deadline{'s' * (fresh > 1)} missed before tick {ticks[timed[-1]]}"
-                yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
-            self._missed = missed
-        yield from self._modes(frames, columns)
-        drawn = np.flatnonzero(ticks // self._every != np.concatenate([[self._scene_at], ticks[:-1] // self._every]))
-        self._scene_at = int(ticks[-1]) // self._every
-        if len(drawn):
-            yield from self._scene(frames, drawn, seen, columns)
-        corners = np.flatnonzero(
-            ticks // self._trail_every != np.concatenate([[self._trail_at], ticks[:-1] // self._trail_every])
-        )
-        self._trail_at = int(ticks[-1]) // self._trail_every
-        if len(corners):
-            yield from self._trail(frames, corners, seen, columns)
-
-    def _modes(self, frames: NDArray[Any], columns: Callable[..., rr.chunk.Chunk]) -> Iterator[rr.chunk.Chunk]:
-        rows = []
-        for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), strict=True)):
-            if now != self._shown:
-                rows.append(i)
-                self._shown = now
-        if rows:
-            modes = [Mode(value).name.lower() for value in frames["mode"][rows]]
-            reasons = [Reason(value).name.lower() if value else "" for value in frames["reason"][rows]]
-            yield columns("/mode/mode", rows, rr.StateChange.columns(state=modes))
-            yield columns("/mode/reason", rows, rr.StateChange.columns(state=reasons))
-            for row, mode, reason in zip(
-                rows, modes, reasons, strict=True
-            ):  # apart: the viewer shows one level for all rows of a chunk
-                text = f"{mode}: {reason.replace('_', ' ')}" if reason else mode
-                yield columns(
-                    "/log", [row], rr.TextLog.columns(text=[text], level=["ERROR" if mode == "fault" else "INFO"])
-                )
-
-    def _scene(
-        self, frames: NDArray[Any], rows: Any, seen: Any, columns: Callable[..., rr.chunk.Chunk]
-    ) -> Iterator[rr.chunk.Chunk]:
-        for i, joint in enumerate(self._joints):
-            if joint is not None:
-                yield columns(
-                    f"/arm/joints/{i}",
-                    rows,
-                    joint.compute_transform_columns(frames["joints"][rows, i].tolist(), clamp=False),
-                )
-        yield columns(
-            "/scene/tool",
-            rows,
-            rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["orientation"][rows]),
-        )
-        yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
-        for side, name in enumerate(SIDES):
-            shown = rows[seen[rows, side]]
-            if len(shown):
-                yield columns(f"/scene/{name}_hand", shown, rr.Points3D.columns(positions=frames["hands"][shown, side]))
-        shown = rows[seen[rows].all(axis=1)]
-        if len(shown):
-            variances, axes = np.linalg.eigh(frames["covariance"][shown])
-            axes[:, :, 0] *= np.linalg.det(axes)[:, None]
-            half = np.clip(2.0 * np.sqrt(np.maximum(variances, 0.0)), 1e-4, 0.3)
-            turned = Rotation.from_matrix(axes).as_quat()
-            yield columns(
-                "/scene/target",
-                shown,
-                rr.Ellipsoids3D.columns(half_sizes=half, centers=frames["target"][shown], quaternions=turned),
-            )
-
-    def _trail(
-        self, frames: NDArray[Any], rows: Any, seen: Any, columns: Callable[..., rr.chunk.Chunk]
-    ) -> Iterator[rr.chunk.Chunk]:
-        tracks = [(name, frames["hands"][:, side], seen[:, side]) for side, name in enumerate(SIDES)]
-        for name, positions, there in (*tracks, ("tool", frames["tool"], np.ones(len(frames), np.bool_))):
-            trail, shown, strips = self._trails[name], [], []
-            for i in rows[there[rows]]:
-                trail.append(positions[i].astype(np.float32))
-                if len(trail) > 1:
-                    shown.append(i)
-                    strips.append(np.array(trail))
-            if shown:
-                yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
+def _sign() -> rr.Mesh3D:
+    """The board behind the arm on which mode and reason are written: it faces the camera."""
+    toward = np.subtract(EYE, LOOK_AT) / np.linalg.norm(np.subtract(EYE, LOOK_AT))
+    right = np.cross(UP, toward) / np.linalg.norm(np.cross(UP, toward))
+    up = np.cross(toward, right)
+    centre = LOOK_AT + np.stack([right, up, toward], axis=1) @ BANNER_AT
+    right, up = 0.5 * BANNER_WIDTH * right, 0.5 * BANNER_WIDTH * HEIGHT / WIDTH * up
+    corners = [centre - right - up, centre + right - up, centre + right + up, centre - right + up]
+    return rr.Mesh3D(
+        vertex_positions=corners,
+        triangle_indices=[(0, 1, 2), (0, 2, 3)],
+        vertex_texcoords=[(0, 1), (1, 1), (1, 0), (0, 0)],
+        vertex_normals=[(0, 0, 0)] * 4,
+    )

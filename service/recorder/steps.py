@@ -63,7 +63,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
     """Every tick that is whole, in order, after the initial state if there is one; without
     `outputs` only what went in. Raises RecordingError on what is not understood.
     """
-    names = {channels.key(settings.cell, name): name for name in REPLAYED}
+    names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
     layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
     step: dict[str, Any] | None = None

@@ -50,6 +50,7 @@ from service.shell.saved_via_points import SavedViaPoints, state_folder
 from service.shell.sources import Sources
 from service.shell.streams import Streams
 from service.shell.survey import Survey
+from service.shell.things import Things
 from service.shell.workshop import Workshop
 
 log = logging.getLogger("thirdhand")
@@ -119,6 +120,7 @@ class Daemon:
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         lock.tell(self.endpoints)
         self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
+        self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._survey())
         self._requests = Requests(
@@ -273,6 +275,7 @@ class Daemon:
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
+            self._things.look()
             try:
                 self._scribe.supervise()
             except OSError as error:  # a want of descriptors or memory passes

@@ -49,9 +49,10 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
             for _, channel, _, _ in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
         }
     assert {
-        "thirdhand/joints/command",
-        "thirdhand/tool/target",
-        "thirdhand/frame",
+        "/thirdhand/joints/command",
+        "/thirdhand/tool/target",
+        "/thirdhand/frame",
+        "/thirdhand/objects",
         "/tf",
         "/robot_description",
     } <= decoded

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 from typing import Any
 
@@ -78,6 +79,57 @@ def test_joint_states_are_the_bytes_of_another_implementation(
         channels.JOINTS.type, _header(stamp_ns, frame), names, *(np.array(value, np.float64) for value in values)
     )
     assert cdr.decode_joints(encoded) == message
+
+
+sizes = st.tuples(*[st.floats(1e-3, 10.0)] * 3)
+shares = st.floats(0.0, 1.0, width=32)
+turns = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda turn: math.hypot(*turn) > 0.1)
+
+
+@st.composite
+def a_thing(draw: st.DrawFn) -> messages.Thing:
+    turn = draw(turns)
+    return messages.Thing(
+        draw(st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=20)),
+        draw(st.sampled_from(("box", "ball", "cylinder"))),
+        draw(st.sampled_from(FRAMES)),
+        draw(st.tuples(*[st.floats(-10.0, 10.0)] * 3)),
+        tuple(value / math.hypot(*turn) for value in turn),
+        draw(sizes),
+        draw(st.tuples(*[shares] * 4)),
+    )
+
+
+@given(stamps, st.lists(a_thing(), max_size=5, unique_by=lambda thing: thing.name))
+def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.Thing]) -> None:
+    data = channels.THINGS.encode(stamp_ns, things)
+    read = ROS.deserialize_cdr(data, channels.THINGS.type)
+    assert bytes(ROS.serialize_cdr(read, channels.THINGS.type)) == data
+    assert [(item.ns, item.header.frame_id, item.scale.x) for item in read.markers] == [
+        (thing.name, thing.frame_id, thing.size[0]) for thing in things
+    ]
+    assert channels.THINGS.decode(data) == tuple(things)
+    if things:
+        with pytest.raises(messages.WireError):
+            channels.THINGS.decode(data[: len(data) // 2])
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"size": (0.1, 0.0, 0.1)}, "no size"),
+        ({"position": (math.nan, 0.0, 0.0)}, "beyond 10 m"),
+        ({"orientation": (0.0, 0.0, 0.0, 0.0)}, "norm 1"),
+        ({"name": ""}, "1 to 64"),
+        ({"colour": (2.0, 0.0, 0.0, 1.0)}, "0 to 1 each"),
+    ],
+)
+def test_a_thing_that_cannot_be_is_refused_in_words(change: dict[str, Any], error: str) -> None:
+    thing = messages.Thing("board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1))
+    with pytest.raises(messages.WireError, match=error):
+        channels.THINGS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
+    with pytest.raises(messages.WireError, match="a name of its own"):
+        channels.THINGS.decode(channels.THINGS.encode(1, [thing, thing]))
 
 
 @given(stamps, st.lists(finite, min_size=14, max_size=14))
@@ -242,10 +294,11 @@ def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
     assert all(
         channel.codec.encoding == "json" or schema(channel.codec.type, joints=7) for channel in channels.CHANNELS
     )
-    assert {channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded} < set(
-        EVENT_NUMBERS
-    )
+    entering = {channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded}
+    assert entering - {"objects"} < set(EVENT_NUMBERS)
     assert channels.key("hall/bench", "hands/left") == "hall/bench/hands/left"
+    assert channels.topic("hall/bench", "hands/left") == "/hall/bench/hands/left"
+    assert channels.topic("hall/bench", "/tf") == "/tf"
 
 
 @given(st.binary(max_size=64), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1))

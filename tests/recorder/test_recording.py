@@ -5,26 +5,32 @@
 from __future__ import annotations
 
 import re
+import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from wam import FRAME, JOINT_NAMES, STATE
 
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract import cdr, channels, messages
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
 from service.core.frame import TIMING, Event, Record, Tick, blank, encode
 from service.learning.demonstration import Demonstration
+from service.recorder.balls import with_balls
 from service.recorder.demonstrations import write_demonstration
 from service.recorder.mcap_file import McapFile, RecordingError
 from service.recorder.recording import Recorder, Recording
+from service.urdf import Urdf
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 2_000_000
@@ -232,10 +238,10 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
         ]
     topics = {topic for topic, _ in decoded}
     assert {"/tf", "/robot_description"} < topics
-    now_and_then = {"skill_in_force", "requests", "log"}
+    now_and_then = {"skill_in_force", "requests", "log", "objects"}
     always = [channel.key for channel in channels.CHANNELS if channel.recorded and channel.key not in now_and_then]
-    assert {channels.key("hall/bench-1", key) for key in always} == topics
-    frames = [message for topic, message in decoded if topic == "hall/bench-1/frame"]
+    assert {channels.topic("hall/bench-1", key) for key in always} == topics
+    frames = [message for topic, message in decoded if topic == "/hall/bench-1/frame"]
     assert list(frames[-1].joints) == told[-1][1]["joints"].tolist()
     assert frames[-1].mode == 1
     with warnings.catch_warnings(), AnyReader([tmp_path / "a.mcap"]) as reader:
@@ -280,3 +286,67 @@ def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
     told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
     needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
     assert needed == told
+
+
+def test_rerun_by_itself_draws_hands_and_target_as_balls_in_frames_that_move(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 120)
+    balls: dict[str, set[str]] = {}
+    frames: set[str] = set()
+    for chunk in rr.chunk.McapReader(tmp_path / "a.mcap").stream():
+        columns = chunk.to_record_batch().to_pydict()
+        for name in ("left_hand", "right_hand", "target", "setpoint"):
+            if f"/visual_geometries/{name}/" in chunk.entity_path:
+                told = [frame for found in columns.get("CoordinateFrame:frame", ()) for frame in found or ()]
+                balls.setdefault(name, set()).update(told)
+        for found in columns.get("Transform3D:child_frame", ()) if chunk.entity_path == "/tf" else ():
+            frames |= set(found or ())
+    assert balls.keys() == {"left_hand", "right_hand", "target", "setpoint"}
+    assert all(frame == {name} for name, frame in balls.items())
+    assert balls.keys() <= frames
+
+
+def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
+    text = '<robot name="a"><link name="base"/><link name="target"/></robot>'
+    assert with_balls(text) == text
+    assert with_balls("no robot") == "no robot"
+    assert Urdf(with_balls(robot_description(Settings()))).chain("left_hand")[0].parent == "base"
+
+
+def test_recordings_with_topics_as_earlier_versions_wrote_them_are_read(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap", 40)
+    with (tmp_path / "a.mcap").open("rb") as source, (tmp_path / "b.mcap").open("wb") as stream:
+        reader, writer = make_reader(source), Writer(stream)
+        writer.start(profile="ros2", library="thirdhand")
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        for found in reader.iter_attachments():
+            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+        known: dict[str, int] = {}
+        for about, channel, message in reader.iter_messages(log_time_order=False):
+            name = channel.topic if channel.topic in ("/tf", "/robot_description") else channel.topic[1:]
+            if name not in known:
+                number = writer.register_schema(about.name, about.encoding, about.data) if about else 0
+                known[name] = writer.register_channel(name, channel.message_encoding, number)
+            writer.add_message(known[name], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    steps = [step for step in Recording.open(tmp_path / "b.mcap").steps() if step.frame is not None]
+    assert [step.tick for step in steps] == [tick.index for tick, *_ in told]
+    assert "hall/bench-1/frame" in known
+
+
+def test_the_summary_of_every_file_tells_only_of_groups_that_are_there(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 40)
+    poses = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (5, 1))
+    write_demonstration(tmp_path / "b.mcap", Demonstration(np.arange(5) * 10_000_000, poses, poses, poses))
+    for name in ("a.mcap", "b.mcap"):
+        data = (tmp_path / name).read_bytes()
+        start, at = struct.unpack_from("<QQ", data, len(data) - 28)
+        groups = []
+        while data[at] == Opcode.SUMMARY_OFFSET:
+            kind, first, length = struct.unpack_from("<BQQ", data, at + 9)
+            groups.append(kind)
+            assert length > 0
+            assert data[first] == kind
+            assert start <= first
+            at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        assert len(groups) == (6 if name == "a.mcap" else 4)

@@ -4,8 +4,10 @@ drawing.
 
 from __future__ import annotations
 
+import re
 import socket
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,18 @@ import rerun as rr
 from test_recording import at_ns, ticks, write
 from wam import JOINT_NAMES
 
+from service.cli.main import main
 from service.cli.view import convert, screenshot
 from service.config import WAM, Settings
+from service.contract import cdr
+from service.contract.messages import JointState, Thing
+from service.contract.records import Mode, Reason
+from service.contract.requests import ViaPoint, encode_json
+from service.core.skill import Skill
+from service.learning.skill_file import with_file
+from service.recorder.banner import banner
 from service.recorder.mcap_file import RecordingError
+from service.recorder.sentences import sentence
 from service.recorder.sinks import Viewer, ViewerError
 
 
@@ -27,6 +38,14 @@ def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
     for chunk in rr.chunk.RrdReader(path).stream():
         rows.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
     return rows
+
+
+def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
+    """What of a column was logged, in order."""
+    return [row[column] for row in rows if row.get(column) is not None]
+
+
+TEXT = "TextLog:text"
 
 
 def viewer(**where: Any) -> Viewer:
@@ -79,6 +98,135 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
     links = {path.split("/")[4] for path in rows if path.startswith("/arm/wam/visual_geometries/")}
     assert {"base", "upper_arm", "palm"} <= links
     assert not [path for path in rows if "collision" in path]
+
+
+def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(300):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    seconds = [moment.total_seconds() for moment in values(rows["/joints/position"], "seconds")]
+    assert seconds == pytest.approx(np.arange(300) / 500)
+    names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
+    told = [name for found in names.values() for several in found for name in several]
+    assert len(told) > 30
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²)\]$", name) for name in told)
+
+
+def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(900):
+        if 300 <= tick.index < 600:  # away, and then back elsewhere
+            frame["hand_ages"][0] = tick.index - 300
+        if tick.index >= 600:
+            frame["hands"][0] += 0.5
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    strips = [found[0] for found in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")]
+    corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
+    assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
+    steps = [np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips]
+    assert max(step.max() for step in steps if len(step)) < 0.1
+    assert any(len(strip) == 0 for strip in strips)
+
+
+def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"] = 1
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told)), ("hold", b"")])
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
+    assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
+
+
+def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
+    tmp_path: Path, skill: Skill
+) -> None:
+    place = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    told = list(ticks(40))
+    for tick, frame, timing in told[:20]:
+        one.add(frame, at_ns(tick.index), timing)
+    one.learn(with_file(replace(skill, via_points=(place,))).file)
+    for tick, frame, timing in told[20:]:
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
+    assert len(lines) >= 5
+    assert all(len(line) > 50 for line in lines)
+    before, after = (rows["/skill/places/tool"][at].get("Points3D:labels") or [] for at in (0, -1))
+    assert "vise" not in before
+    assert "vise" in after
+    half = dict(zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True))
+    assert half["vise"] == pytest.approx([0.03] * 3)
+    assert "vise" in values(rows["/about/skill"], "TextDocument:text")[-1][0]
+    (gate,) = set(np.ravel(values(rows["/deviation/gate"], "Scalars:scalars")))
+    assert gate == pytest.approx(1000 * skill.threshold)
+
+
+def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    assert len(values(rows["/joints/position"], "tick")) == 30
+    assert any(text.startswith("a skill of which nothing can be drawn") for (text,) in values(rows["/log"], TEXT))
+
+
+def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
+    board = Thing("board", "box", "tool_plate", (0, 0, 0.05), (0, 0, 0, 1), (0.08, 0.05, 0.002), (0, 0.5, 0, 1))
+    glass = Thing("glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1))
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(60):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index in (10, 40):
+            found = (board, glass)[: 1 if tick.index == 40 else 2]
+            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
+    one.note("requests", 'via_points {"op": "clear"}', at_ns(50))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {"tool_plate"}
+    assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx([0.04, 0.025, 0.001])
+    assert values(rows["/scene/things/glass"], "Cylinders3D:radii")[0] == pytest.approx([0.05])
+    assert values(rows["/scene/things/glass"], "Clear:is_recursive") == [[True]]
+    assert ["All that was taught is forgotten."] in values(rows["/log"], "TextLog:text")
+
+
+@pytest.mark.parametrize(
+    ("note", "said"),
+    [
+        ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
+        ('via_points {"op": "remove", "names": ["a"]}', "Forgotten: a."),
+        ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: $.points[0].left: 2 numbers"),
+        ('skill {"name": "soldering"}', "Skill soldering is in force."),
+        ("hold {}", "An operator stopped the arm; it stays until resumed."),
+        ("reset failed: OSError()", "A request to reset failed: OSError()"),
+        ("hold what", "hold what"),
+        ("3 ticks before tick 7 are not recorded", "3 ticks before tick 7 are not recorded"),
+    ],
+)
+def test_the_log_speaks_in_sentences(note: str, said: str) -> None:
+    assert sentence(note) == said
+
+
+def test_each_mode_has_a_banner_of_its_own_colour_that_holds_its_words() -> None:
+    assert banner(Mode.HOLD, Reason.FAR_FROM_DEMONSTRATIONS).shape == banner(Mode.FOLLOW, Reason.NONE).shape
+    corners = {tuple(banner(mode, Reason.NONE)[0, 0].tolist()) for mode in Mode}
+    assert len(corners) == len(Mode)
+    for reason in Reason:
+        picture = banner(Mode.FAULT, reason)
+        assert (picture[:, -4:] == picture[0, 0]).all()  # no letter is cut off
+        assert not (picture == picture[0, 0]).all()
 
 
 def test_missed_deadlines_stand_in_the_log(tmp_path: Path) -> None:
@@ -138,3 +286,31 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
         convert(tmp_path / "a.mcap", tmp_path / "a.rrd")
     with pytest.raises(ViewerError, match=r"there is no .*a\.rrd"):
         screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["a.rrd", "--screenshot", "."], "is a folder, the name of a file needed"),
+        (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
+        (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
+        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
+        (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
+        (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
+        ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_in_words(
+    arguments: list[str],
+    error: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", *arguments]) in (1, 2)
+    said = capsys.readouterr().err
+    assert re.search(error, said)
+    assert said.startswith("thirdhand view: ")
+    assert len(said.splitlines()) == 1

@@ -23,12 +23,12 @@ from service.cli.main import main
 from service.client import Client, UnreachableError, endpoints, living, open_session
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
-from service.contract.roles import ROLES, ROUTER, access_control, names
+from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.launch import launched
 from service.shell.door import BOUNDS
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state", "tool/pose")
+INPUTS = ("hands/left", "hands/right", "joints/state", "tool/pose", "objects")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2
@@ -48,7 +48,9 @@ def secrets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def keys(suffixes: Iterable[str]) -> set[str]:
     """The keys of streams, in the cell and in the ROS 2 domain."""
     plain = {channels.key(CELL, suffix) for suffix in suffixes}
-    return plain | {ros2.key(DOMAIN, CELL, channels.BY_KEY[suffix]) for suffix in suffixes}
+    return plain | {
+        ros2.key(DOMAIN, CELL, channels.BY_KEY[suffix]) for suffix in suffixes if channels.BY_KEY[suffix] in TOPICS
+    }
 
 
 class Guarded:
@@ -202,7 +204,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    tracked = {full["hands/left"], full["hands/right"], full["tool/pose"]}
+    tracked = {full[key] for key in ("hands/left", "hands/right", "tool/pose", "objects")}
     assert {key for key, names in said.items() if b"tracker" in names} == tracked
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()

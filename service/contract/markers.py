@@ -1,0 +1,95 @@
+"""Things on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
+Foxglove draw as it is. Of a marker, what a thing needs is kept: boxes, balls and cylinders.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+
+from service.contract import cdr
+from service.contract.messages import Thing, WireError
+
+SHAPES = {1: "box", 2: "ball", 3: "cylinder"}  # and the numbers of a Marker's type
+NUMBERS = {shape: number for number, shape in SHAPES.items()}
+LARGEST = 16_384  # bytes
+MOST_THINGS = 32
+LARGEST_M, LONGEST_NAME = 10.0, 64
+_ADD = 0  # or change; other actions take away
+_KIND, _COLOUR = struct.Struct("<iii"), struct.Struct("<4f")
+_PLACED, _POINT = struct.Struct("<10d"), struct.Struct("<3d")
+_UV, _COUNT, _BYTE = struct.Struct("<2f"), struct.Struct("<I"), struct.Struct("<B")
+_LIFETIME = struct.Struct("<II")
+
+
+def encode_things(stamp_ns: int, things: Sequence[Thing]) -> bytes:
+    """CDR bytes of a MarkerArray, one marker for each thing."""
+    out = cdr.Writer()
+    out.pack(_COUNT, len(things), align=4)
+    for thing in things:
+        out.header(stamp_ns, thing.frame_id)
+        out.string(thing.name)
+        out.pack(_KIND, 0, NUMBERS[thing.shape], _ADD, align=4)
+        out.pack(_PLACED, *thing.position, *thing.orientation, *thing.size, align=8)
+        out.pack(_COLOUR, *thing.colour, align=4)
+        out.pack(_LIFETIME, 0, 0, align=4)  # for good
+        out.pack(_BYTE, 0, align=1)  # placed anew only when said so
+        out.pack(_COUNT, 0, align=4)  # points
+        out.pack(_COUNT, 0, align=4)  # their colours
+        out.string("")  # texture
+        out.header(0, "")
+        out.string("")
+        out.pack(_COUNT, 0, align=4)
+        out.pack(_COUNT, 0, align=4)  # and where it lies
+        out.string("")  # text
+        out.string("")  # mesh
+        out.string("")
+        out.pack(_COUNT, 0, align=4)
+        out.pack(_BYTE, 0, align=1)
+    return out.bytes()
+
+
+def decode_things(data: bytes) -> tuple[Thing, ...]:
+    """The things in the CDR bytes of a MarkerArray; markers of other kinds are passed over.
+
+    Raises WireError.
+    """
+    reader, found = cdr.Reader(data, LARGEST), []
+    for _ in range(reader.length()):
+        _, frame = reader.header()
+        name = reader.string()
+        _, kind, action = reader.unpack(_KIND, 4)
+        placed, colour = reader.unpack(_PLACED, 8), reader.unpack(_COLOUR, 4)
+        reader.unpack(_LIFETIME, 4)
+        reader.unpack(_BYTE, 1)
+        reader.skip(_POINT, 8)
+        reader.skip(_COLOUR, 4)
+        reader.string()
+        reader.header()
+        reader.string()
+        reader.skip(_BYTE, 1)
+        reader.skip(_UV, 4)
+        for _ in range(3):
+            reader.string()
+        reader.skip(_BYTE, 1)
+        reader.unpack(_BYTE, 1)
+        if action == _ADD and kind in SHAPES:
+            found.append(_checked(Thing(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
+    reader.end()
+    if len(found) > MOST_THINGS or len({thing.name for thing in found}) < len(found):
+        raise WireError(f"{len(found)} things; up to {MOST_THINGS}, each with a name of its own, accepted")
+    return tuple(found)
+
+
+def _checked(thing: Thing) -> Thing:
+    numbers = (*thing.position, *thing.size)
+    if not all(math.isfinite(value) and abs(value) <= LARGEST_M for value in numbers) or min(thing.size) <= 0:
+        raise WireError(f"thing {thing.name[:LONGEST_NAME]!r}: a position or size beyond {LARGEST_M:g} m, or no size")
+    if not abs(math.hypot(*thing.orientation) - 1.0) < 1e-2:
+        raise WireError(f"thing {thing.name[:LONGEST_NAME]!r}: a quaternion of norm 1 needed")
+    if not 0 < len(thing.name) <= LONGEST_NAME:
+        raise WireError(f"a thing with a name of {len(thing.name)} letters, 1 to {LONGEST_NAME} accepted")
+    if not all(0.0 <= value <= 1.0 for value in thing.colour):
+        raise WireError(f"thing {thing.name!r}: a colour of red, green, blue and opacity, 0 to 1 each, needed")
+    return thing

@@ -1,0 +1,35 @@
+"""The arm's description as a recording shows it: with a ball each for hands and target.
+
+Rerun, Foxglove and RViz draw a description by the frames in `/tf`, where hands and target are: so
+they show these too, without a plug-in or a setting.
+"""
+
+from __future__ import annotations
+
+from service.contract.messages import BASE
+from service.recorder import palette
+
+BALLS = (
+    ("left_hand", palette.LEFT, 0.03),
+    ("right_hand", palette.RIGHT, 0.03),
+    ("target", palette.TARGET, 0.015),
+    ("setpoint", palette.TOOL, 0.01),
+)  # frame, colour, radius [m]
+
+
+def with_balls(urdf: str) -> str:
+    """The URDF with a link for each ball, which moves freely; as it was where it has no such end or
+    links of these names.
+    """
+    head, end, tail = urdf.rpartition("</robot>")
+    if not end or any(f'name="{frame}"' in urdf for frame, _, _ in BALLS):
+        return urdf
+    links = []
+    for frame, colour, radius in BALLS:
+        red, green, blue = (value / 255 for value in colour)
+        links.append(
+            f'  <link name="{frame}"><visual><geometry><sphere radius="{radius}"/></geometry>'
+            f'<material name="{frame}"><color rgba="{red:.3f} {green:.3f} {blue:.3f} 1"/></material></visual></link>\n'
+            f'  <joint name="{frame}_at" type="floating"><parent link="{BASE}"/><child link="{frame}"/></joint>\n'
+        )
+    return f"{head}{''.join(links)}{end}{tail}"

@@ -1,0 +1,32 @@
+"""The banner in the scene: mode and reason in large letters on the mode's colour."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from service.contract.records import Mode, Reason
+from service.recorder import palette
+
+WIDTH, HEIGHT = 640, 80  # pixels
+LETTERS, MARGIN = 44, 24
+
+
+def title(mode: int, reason: int) -> str:
+    """Mode and reason in words: `hold: no hands`."""
+    said = Mode(mode).name.lower()
+    return f"{said}: {Reason(reason).name.lower().replace('_', ' ')}" if reason else said
+
+
+@functools.cache
+def banner(mode: int, reason: int) -> NDArray[np.uint8]:
+    """The picture (HEIGHT, WIDTH, 3) that says mode and reason."""
+    image = Image.new("RGB", (WIDTH, HEIGHT), palette.MODES[Mode(mode)])
+    draw, text, size = ImageDraw.Draw(image), title(mode, reason), LETTERS
+    while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:
+        size -= 1
+    draw.text((MARGIN, HEIGHT / 2), text, fill=(0, 0, 0), anchor="lm", font=ImageFont.load_default(size))
+    return np.asarray(image)

@@ -1,0 +1,26 @@
+"""The colours of the viewer: those of Okabe and Ito, which people of every colour vision tell
+apart; each thing has one, in the scene and in the curves alike.
+"""
+
+from __future__ import annotations
+
+from service.contract.records import Mode
+
+Colour = tuple[int, int, int]
+ORANGE, SKY, GREEN, YELLOW = (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66)
+BLUE, VERMILLION, PURPLE, GREY = (0, 114, 178), (213, 94, 0), (204, 121, 167), (160, 165, 173)
+LEFT, RIGHT, TOOL, TARGET, MEASURED, NEAREST, PLACE = SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, GREY
+JOINTS = (SKY, ORANGE, GREEN, PURPLE, YELLOW, BLUE, VERMILLION)
+MODES: dict[Mode, Colour] = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: VERMILLION}
+BACKGROUND, TABLE, GRID = (24, 27, 33), (58, 63, 72), (70, 76, 86)
+
+
+def faint(colour: Colour, opacity: float) -> tuple[int, int, int, int]:
+    """A colour that lets through what is behind it."""
+    return (*colour, round(255 * opacity))
+
+
+def packed(colour: Colour) -> int:
+    """A colour as one number, red first."""
+    red, green, blue = colour
+    return red << 24 | green << 16 | blue << 8 | 0xFF

@@ -1,0 +1,18 @@
+"""PyBullet, without the line that it prints to standard error where it is imported."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+__all__ = ["pybullet"]
+
+sys.stderr.flush()
+_shown, _nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+os.dup2(_nowhere, 2)
+try:
+    import pybullet
+finally:
+    os.dup2(_shown, 2)
+    os.close(_shown)
+    os.close(_nowhere)

@@ -1,0 +1,92 @@
+"""A headless Chromium, driven over its debugging pipe: opens a page, asks it, pictures it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser")
+_OPTIONS = (
+    "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--ignore-gpu-blocklist --no-first-run --remote-debugging-pipe"
+)
+
+
+class Tab:
+    """A page in a browser."""
+
+    def __init__(self, to: int, source: int, url: str, timeout_s: float) -> None:
+        self._to, self._source, self._rest, self._number = to, source, b"", 0
+        self._until = time.monotonic() + timeout_s
+        target = self._call("Target.createTarget", {"url": url})["targetId"]
+        self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True})["sessionId"]
+
+    def _call(self, method: str, params: dict[str, Any], session: str = "") -> Any:
+        self._number += 1
+        message = {
+            "id": self._number,
+            "method": method,
+            "params": params,
+            **({"sessionId": session} if session else {}),
+        }
+        os.write(self._to, json.dumps(message).encode() + b"\0")
+        while True:
+            while b"\0" not in self._rest:
+                left_s = self._until - time.monotonic()
+                assert left_s > 0, f"no answer to {method}"
+                assert select.select([self._source], [], [], left_s)[0], f"no answer to {method}"
+                self._rest += os.read(self._source, 1 << 20)
+            said, _, self._rest = self._rest.partition(b"\0")
+            answer = json.loads(said)
+            if answer.get("id") == self._number:
+                return answer.get("result", {})  # nothing where the page is not there yet
+
+    def ask(self, expression: str) -> Any:
+        """The value of an expression of JavaScript in the page."""
+        found = self._call("Runtime.evaluate", {"expression": expression, "awaitPromise": True}, self._session)
+        return found.get("result", {}).get("value")
+
+    def until(self, expression: str) -> Any:
+        """The first value of an expression that is true."""
+        while not (value := self.ask(expression)):
+            assert time.monotonic() < self._until, expression
+            time.sleep(0.1)
+        return value
+
+    def picture(self, path: Path) -> None:
+        """Saves what the page shows as PNG."""
+        found = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
+        path.write_bytes(base64.b64decode(found["data"]))
+
+
+@contextlib.contextmanager
+def opened(url: str, folder: Path, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0) -> Iterator[Tab]:
+    """A page of a browser of its own, whose files are in a folder."""
+    (told, to), (source, tell) = os.pipe(), os.pipe()
+    arguments = [str(PROGRAM), str(folder / "profile")]
+    command = f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{told} 4>&{tell}'
+    with (folder / "chromium.log").open("wb") as log:
+        browser = subprocess.Popen(
+            ["bash", "-c", command, *arguments],
+            pass_fds=(told, tell),
+            stderr=log,
+            stdout=log,
+        )
+    os.close(told)
+    os.close(tell)
+    try:
+        yield Tab(to, source, url, timeout_s)
+    finally:
+        browser.kill()
+        browser.wait()
+        os.close(to)
+        os.close(source)

@@ -1,0 +1,135 @@
+"""The running daemon in a browser: mode and reason at once, the arm held by a button, the scene
+drawn; and nobody but the page may ask.
+"""
+
+from __future__ import annotations
+
+import http.client
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import chromium
+import numpy as np
+import pytest
+from cell import Daemon, Tracker, serving
+from PIL import Image
+from tests_paths import ROOT
+
+from service.cli.live_page import STREAM
+from service.cli.view import FRESH_S, screenshot
+
+TIMEOUT_S = 90
+EMPTY_GRPC = b"\0\0\0\0\0"  # a message without fields
+
+
+class Page:
+    """The page of a running daemon, and requests to it."""
+
+    def __init__(self, daemon: Daemon, url: str) -> None:
+        self.daemon, self.url = daemon, url
+        self.host = urlsplit(url).netloc
+
+    def ask(self, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, str]:
+        """The code and the text of an answer."""
+        connection = http.client.HTTPConnection(self.host, timeout=TIMEOUT_S)
+        try:
+            connection.request(method, path, body or None, {name.replace("_", "-"): v for name, v in headers.items()})
+            answer = connection.getresponse()
+            return answer.status, answer.read().decode(errors="replace")
+        finally:
+            connection.close()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A page beside a daemon that has a live view and sees two hands."""
+    with serving(tmp_path_factory.mktemp("cell"), "--arm", "assumed", "--live", "0") as daemon, Tracker(daemon.session):
+        daemon.until(lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S)
+        command = [sys.executable, "-m", "service", "view", "live", "--web", "--connect", daemon.endpoint]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
+            clock = threading.Timer(TIMEOUT_S, server.kill)
+            clock.start()
+            try:
+                assert server.stdout is not None
+                assert server.stderr is not None
+                assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
+                yield Page(daemon, server.stdout.readline().strip())
+                server.terminate()
+                assert server.wait(TIMEOUT_S) == 0
+            finally:
+                clock.cancel()
+                server.kill()
+
+
+def token_in(text: str) -> str:
+    """The token that a page holds."""
+    return text.split('const token = "')[1].split('"', maxsplit=1)[0]
+
+
+def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
+    code, text = page.ask("GET", "/")
+    assert code == 200
+    assert page.ask("POST", "/hold")[0] == 403
+    assert page.ask("POST", "/hold", X_Thirdhand_Token="guessed")[0] == 403
+    token = token_in(text)
+    assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin="http://elsewhere.example")[0] == 403
+    assert page.ask("GET", "/", Host="elsewhere.example")[0] == 403  # a name that was made to point here
+    assert page.ask("POST", "/shutdown", X_Thirdhand_Token=token)[0] == 404
+    assert page.ask("POST", "/hold", bytes(10_000), X_Thirdhand_Token=token)[0] == 413
+    assert page.daemon.client.status()["mode"] == "follow"
+    code, text = page.ask("POST", "/hold", X_Thirdhand_Token=token)
+    assert (code, text.split(" ")[0]) == (200, "hold")
+    assert page.daemon.until(lambda status: status["mode"] == "hold")["reason"] == "operator"
+    assert page.ask("POST", "/resume", X_Thirdhand_Token=token)[0] == 200
+    page.daemon.until(lambda status: status["mode"] == "follow")
+
+
+def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere(page: Page) -> None:
+    code, text = page.ask("GET", "/viewer/?url=x")
+    assert code == 200
+    assert "re_viewer.js" in text
+    assert "<link" in text
+    assert "fonts.g" not in text
+    assert page.ask("GET", "/viewer/re_viewer.js")[0] == 200
+    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+    connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
+    answer = connection.getresponse()
+    assert answer.status == 200
+    assert len(answer.read(200_000)) == 200_000  # what was drawn before this client came
+    connection.close()
+
+
+def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scene_to_who_comes_late(
+    page: Page, tmp_path: Path
+) -> None:
+    age_s = screenshot(page.daemon.client.status()["scribe"]["live"], tmp_path / "live.png")
+    assert age_s is not None
+    assert age_s > 0
+    assert FRESH_S == 1.0
+    with Image.open(tmp_path / "live.png") as image:
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
+    follow = np.abs(pixels - (0, 158, 115)).max(axis=1) < 12  # the banner
+    assert follow.sum() > 2000
+
+
+@pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
+def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
+    with chromium.opened(page.url, tmp_path, timeout_s=TIMEOUT_S) as tab:
+
+        def click(name: str, *, until: str) -> Any:
+            tab.ask(f"document.getElementById('{name}').click()")
+            return tab.until(f"document.getElementById('mode').textContent == '{until}'")
+
+        assert tab.until("document.getElementById('mode').className == 'follow'")
+        click("hold", until="hold: operator")
+        assert tab.until("document.getElementById('answer').textContent").startswith("hold in force since tick ")
+        click("resume", until="follow")
+        assert "/viewer/" in tab.ask("document.querySelector('iframe').src")
+        tab.picture(tmp_path / "page.png")
+    with Image.open(tmp_path / "page.png") as image:
+        assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # beside the word
