@@ -15,8 +15,7 @@ import msgspec
 
 from service.client import endpoints, open_session
 from service.contract.channels import ENDPOINT
-from sim.bench import Bench
-from sim.network import BenchError, Dropout, Live, RunReport, run
+from service.launch import LaunchError, check_bench
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 
@@ -127,6 +126,14 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted")
     if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
         p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
+    try:
+        check_bench()
+    except LaunchError as error:
+        print(f"python -m sim: {error}", file=sys.stderr)
+        return 1
+    from sim.bench import Bench  # PyBullet, which may not be there
+    from sim.network import BenchError, Dropout, Live, RunReport, run
+
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

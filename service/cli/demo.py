@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from service.child import python
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.core.frame import TIMING
-from service.launch import launched, played
+from service.launch import check_bench, launched, played
 from service.recorder.recording import Recording
 
 START_TIMEOUT_S = 60.0
@@ -42,7 +43,8 @@ def demo(args: argparse.Namespace) -> int:
 def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
     out.mkdir(parents=True, exist_ok=True)
-    request = _output([sys.executable, "-m", "sim.scene", *([str(scene)] if scene else [])])
+    check_bench()
+    request = _output("sim.scene", *([str(scene)] if scene else []))
     add = decode_request(request.encode(), Add)
     with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
         say(f"service at {service.endpoint}")
@@ -121,8 +123,11 @@ def _shown(path: str) -> str:
     return path
 
 
-def _output(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False)
+def _output(module: str, *arguments: str) -> str:
+    command, environment = python("-m", module, *arguments)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False, env=environment
+    )
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
     return done.stdout
