@@ -86,7 +86,10 @@ class _Shown:
         wait_s = self._after_s
         while not self._ended.wait(wait_s):
             wait_s = self._every_s
-            passed = f"{time.monotonic() - self._begun:.0f} s"
+            passed_s = time.monotonic() - self._begun
+            if passed_s < self._after_s:  # a new step, which was printed as it began
+                continue
+            passed = f"{passed_s:.0f} s"
             if self._total:
                 passed = f"{100 * self._count / self._total:.0f} % of {self._total} {self._unit}, {passed}"
             elif self._count:

@@ -19,7 +19,9 @@ from service.recorder.report import Report
 # Colours of Okabe and Ito, which the colour-blind tell apart.
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
 MODE_COLOURS = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: RED}
+WIDE = 0.011  # of the width of a plot has a letter
 POINTS = 1500  # of a curve at most, the least and the greatest of each stretch
+LEAST_US = 10.0  # less is not shown
 MOST = 99.5  # per cent of the values that an axis holds; the rest is cut off, and said
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fff; max-width: 62rem;
@@ -88,7 +90,7 @@ def _over_time(report: Report) -> Figure:
         if span.mode is not Mode.FOLLOW:
             for axes in others:
                 axes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, alpha=0.15, lw=0)
-        if span.lasts_s > 0.08 * report.lasts_s:
+        if span.lasts_s > WIDE * max(map(len, span.doing.split(": "))) * report.lasts_s:
             modes.text(span.start_s + span.lasts_s / 2, 0.5, span.doing.replace(": ", "\n"), ha="center", va="center",
                        color="white", fontsize=8)  # fmt: skip
     modes.set(yticks=[], ylim=(0, 1), xlim=(0, max(report.lasts_s, 1e-3)))
@@ -115,10 +117,13 @@ def _over_time(report: Report) -> Figure:
 
     for late in others[3:]:
         at = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
-        _curve(late, at, np.maximum(timing["work_us"], 1.0), BLUE, "work of a tick")
-        _curve(late, at, np.maximum(timing["lateness_us"], 1.0), ORANGE, "later than its deadline")
-        answers = timing["latency_us"] > 0
-        _curve(late, at[answers], timing["latency_us"][answers], GREEN, "hand stamped to command published")
+        for name, colour, label in (
+            ("latency_us", GREEN, "hand stamped to command published"),
+            ("work_us", BLUE, "work of a tick"),
+            ("lateness_us", ORANGE, "later than its deadline"),
+        ):
+            told = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
+            late.plot(*thinned(at, told), ".", color=colour, ms=2, label=label)
         late.set(yscale="log", ylabel="[µs]")
     others[-1].set(xlabel="since the first tick [s]")
     for axes in (modes, *others):

@@ -46,7 +46,7 @@ def what_led(columns: Columns, begin: int) -> list[str]:
     lines += filter(None, (_rejected(columns, before, begin + 1), _unseen(columns, before, begin + 1, only_stale=True)))
     lines += filter(None, (_late(columns, int(columns.frames["tick"][before]), tick),))
     asked = _asked(columns, begin, ("hold", "resume", "reset"))
-    return [*lines, *([f"before it: {asked}"] if asked else [])]
+    return [*lines, *([asked] if asked else [])]
 
 
 def _cause(columns: Columns, begin: int, reason: Reason, measured: list[Measured]) -> Iterator[str]:
@@ -105,7 +105,7 @@ def _was_doing(columns: Columns, begin: int) -> str:
     flags = ", ".join(str(flag.name).lower() for flag in Flag if int(before["flags"]) & flag)
     near = float(before["hand_distance"])
     distance = f", the nearest hand {100 * near:.0f} cm from the arm" if (before["hand_ages"] >= 0).any() else ""
-    return f"before it: {doing} for {lasts_s:.1f} s{f' with {flags}' if flags else ''}{distance}"
+    return f"before it: {doing} for {lasts_s:.2f} s{f' with {flags}' if flags else ''}{distance}"
 
 
 def _unseen(columns: Columns, begin: int, end: int, *, only_stale: bool = False) -> str:
@@ -143,9 +143,12 @@ def _late(columns: Columns, first: int, last: int) -> str:
 
 def _asked(columns: Columns, begin: int, kinds: tuple[str, ...]) -> str:
     """What was asked for at frame `begin` or within the second before."""
-    last = int(columns.frames["tick"][begin])
-    asked = [one for one in columns.orders if one.kind in kinds and last - _ticks(columns) <= one.tick <= last]
-    return ", ".join(f"`{one.kind}` was asked for at {columns.seconds(one.tick):.2f} s" for one in asked)
+    last, said = int(columns.frames["tick"][begin]), []
+    for one in columns.orders:
+        ago_s = (last - one.tick) * columns.period_s
+        if one.kind in kinds and 0.0 <= ago_s <= BEFORE_S:
+            said.append(f"`{one.kind}` was asked for{f' {ago_s:.2f} s before' if ago_s > 0.005 else ''}")
+    return ", ".join(said)
 
 
 def _threshold(columns: Columns, begin: int) -> str:

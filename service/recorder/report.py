@@ -306,21 +306,23 @@ def _flat(value: Any, path: str) -> dict[str, Any]:
     return {path: value}
 
 
-def why_missed(found: Report, start_s: float, end_s: float, place: str) -> str:
-    """In one sentence, what kept the tool from a place between two times [s]."""
+def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end_s: float) -> str:
+    """In one sentence, what kept the tool from a place between two times [s] since `begun_s` of the
+    recording, since which times are told.
+    """
+    begin_s, until_s = begun_s + start_s, begun_s + end_s
     stops = [
         span
         for span in found.spans
-        if span.mode is not Mode.FOLLOW and span.start_s < end_s and span.start_s + span.lasts_s > start_s
+        if span.mode is not Mode.FOLLOW and span.start_s < until_s and span.start_s + span.lasts_s > begin_s
     ]
     if stops:
         worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
         led = next((fault.led[0] for fault in found.faults if fault.span is worst), worst.why)
         what = "was at fault" if worst.mode is Mode.FAULT else "held"
-        return (
-            f"the arm {what} ({str(worst.reason.name).lower()}) from {worst.start_s:.1f} s, for {worst.lasts_s:.1f} s"
-            f"{f': {led}' if led else ''}"
-        )
+        name, at_s = str(worst.reason.name).lower(), worst.start_s - begun_s
+        since = f"from {at_s:.1f} s on" if at_s > 0 else "from before the script began"
+        return f"the arm {what} ({name}) {since}, for {worst.lasts_s:.1f} s{f': {led}' if led else ''}"
     hands_m = [one.hands_m for one in found.places if one.name == place]
     if not hands_m:
         return f"no place {place!r} was taught"
