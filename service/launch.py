@@ -36,7 +36,11 @@ class LaunchError(ExplainedError, RuntimeError):
 
 def check_bench() -> None:
     """Raises LaunchError where the bench cannot run here."""
-    if importlib.util.find_spec("pybullet") is None:
+    try:
+        found = importlib.util.find_spec("pybullet")
+    except ValueError:  # as it says of a module that was put away on purpose
+        found = None
+    if found is None:
         raise LaunchError(NO_BENCH)
 
 

@@ -46,8 +46,8 @@ def demo(args: argparse.Namespace) -> int:
 
 def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
-    out.mkdir(parents=True, exist_ok=True)
     check_bench()
+    out.mkdir(parents=True, exist_ok=True)
     request = _output("sim.scene", *([str(scene)] if scene else []))
     add = decode_request(request.encode(), Add)
     with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
