@@ -21,7 +21,7 @@ html_copy_source = False
 LINK = re.compile(r"(!?\[[^]]*\])\(([^)\s]+)\)")
 # The order of the navigation; pages that are named nowhere come last, under "More".
 GROUPS = {
-    "How to": ("install", "tutorial", "places", "viewing", "reports", "hardware", "ros2", "access"),
+    "How to": ("install", "tutorial", "places", "recordings", "reports", "viewing", "hardware", "network", "ros2", "access"),
     "Reference": ("settings", "wire", "incidents", "glossary"),
     "Background": ("how-it-works", "faults", "bounds", "timing", "experiments"),
 }

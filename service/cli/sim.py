@@ -13,7 +13,7 @@ from service.launch import check_bench
 
 def sim(args: argparse.Namespace) -> NoReturn:
     """Becomes `python -m sim` with the same options: signals and exit code are its own."""
-    if not {"-h", "--help"} & set(args.options):
+    if not {"-h", "--help", "--via-points"} & set(args.options):
         check_bench()
     command, environment = python("-m", "sim", *args.options)
     sys.stdout.flush()
