@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -121,8 +122,9 @@ def _write_ticks(path: Path, one: Report) -> None:
     frames = one.columns.frames
     heads, formats, columns = ["time_s"], ["%.4f"], [one.columns.times[:, None]]
     for name in KEPT:
-        column = frames[name].reshape(len(frames), -1)
-        count, is_whole = column.shape[1], np.issubdtype(column.dtype, np.integer)
+        count = math.prod(frames.dtype[name].shape)
+        column = frames[name].reshape(len(frames), count)
+        is_whole = np.issubdtype(column.dtype, np.integer)
         heads += [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]
         formats += ["%d" if is_whole else "%.7g"] * count
         columns.append(column.astype(np.float64))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from service.recorder.report import Figure, Percentiles, Report, differing_settings
 
 NONE = "-"
+NOTHING_MISSING = "Nothing is missing in it."
 
 
 class Table(NamedTuple):
@@ -122,7 +123,7 @@ def summary(report: Report) -> list[str]:
     hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
     return [
         f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
-        "Nothing is missing in it." if not report.lacks else f"Something is missing in it, {len(report.lacks)} times.",
+        f"Something is missing in it, {_times_in_words(len(report.lacks))}." if report.lacks else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
         _counted(len(report.faults), "fault"),
     ]
@@ -166,6 +167,10 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> str:
         return NONE
     text = f"{other - one:+.{figure.digits}f}"
     return "same" if float(text) == 0.0 else text
+
+
+def _times_in_words(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def _counted(count: int, what: str) -> str:

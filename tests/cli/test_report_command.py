@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests_paths import RECORDINGS, ROOT
+from wam import STATE
 
 from service.cli.main import main
 from service.cli.report_page import thinned
-from service.recorder.recording import Recording
+from service.config import Settings
+from service.core.frame import blank
+from service.recorder.recording import Recorder, Recording
 
 GOLDEN = RECORDINGS / "golden.mcap"
 
@@ -57,6 +60,24 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     row = dict(zip(heads, ticks[5000], strict=True))
     assert int(row["tick"]) == int(frames[5000]["tick"])
     assert float(row["tool[2]"]) == pytest.approx(float(frames[5000]["tool"][2]), rel=1e-6)
+
+
+def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty, cut = tmp_path / "empty.mcap", tmp_path / "cut.mcap"
+    with Recorder(empty, settings=Settings(), skill=(RECORDINGS / "soldering.npz").read_bytes(), state=blank(STATE)):
+        pass
+    whole = GOLDEN.read_bytes()
+    cut.write_bytes(whole[: len(whole) // 8])
+    page = tmp_path / "page.html"
+    assert main(["report", str(empty), str(cut), "--html", str(page), "--csv", str(tmp_path / "tables")]) == 0
+    said = capsys.readouterr().out
+    assert "never: it holds no tick" in said
+    assert "Something is missing in it, once." in said
+    assert "cut at byte" in said
+    assert "<svg" in page.read_text(encoding="utf-8")
+    assert len(rows(tmp_path / "tables" / "empty" / "ticks.csv")) == 1
 
 
 @pytest.mark.parametrize(
