@@ -23,7 +23,7 @@ LINK = re.compile(r"(!?\[[^]]*\])\(([^)\s]+)\)")
 GROUPS = {
     "How to": ("install", "tutorial", "places", "recordings", "reports", "viewing", "hardware", "network", "ros2", "access"),
     "Reference": ("settings", "wire", "incidents", "glossary"),
-    "Background": ("how-it-works", "faults", "bounds", "timing", "experiments"),
+    "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments"),
 }
 
 

@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from service.recorder.report import Figure, Percentiles, Report, differing_settings
+from service.contract.incidents import remedy
+from service.recorder.report import Fault, Figure, Percentiles, Report, differing_settings
 
 NONE = "-"
 NOTHING_MISSING = "Nothing is missing in it."
@@ -40,10 +41,8 @@ def _tables(report: Report) -> Iterator[Table]:
     yield Table(
         "faults",
         "Faults, and what led to them",
-        ("at [s]", "reason", "what led to it"),
-        tuple(
-            (_s(f.span.start_s), str(f.span.reason.name).lower(), "\n".join((*f.led, f.ended))) for f in report.faults
-        ),
+        ("at [s]", "reason", "what led to it, and what to do"),
+        tuple(_fault(fault) for fault in report.faults),
         numbers=0,
     )
     yield Table(
@@ -106,9 +105,15 @@ def _tables(report: Report) -> Iterator[Table]:
     yield Table(
         "rejections",
         "Rejected samples",
-        ("cause", "count", "first at [s]"),
-        tuple((one.cause, str(one.samples), _s(one.first_s)) for one in report.rejections),
+        ("cause", "count [samples]", "first at [s]", "what to do"),
+        tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
+        numbers=0,
     )
+
+
+def _fault(fault: Fault) -> tuple[str, str, str]:
+    reason = str(fault.span.reason.name).lower()
+    return _s(fault.span.start_s), reason, "\n".join((*fault.led, fault.ended, f"what to do: {remedy(reason)}"))
 
 
 def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from service.contract.incidents import REASONS
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.core.frame import Vector
 from service.recorder.causes import what_led, why_held
@@ -222,7 +223,9 @@ def _spans(columns: Columns) -> Iterator[Span]:
     pieces[columns.breaks] = 1
     for begin, end in runs((np.cumsum(pieces) * 256 + frames["mode"]) * 256 + frames["reason"]):
         mode, reason = Mode(int(frames["mode"][begin])), Reason(int(frames["reason"][begin]))
-        why = why_held(columns, begin, end) if mode is Mode.HOLD else ""
+        why = ""
+        if mode is Mode.HOLD:
+            why = why_held(columns, begin, end) or REASONS[str(reason.name).lower()].about
         whole = end == len(frames) or end in columns.breaks
         until = float(times[end - 1]) + period_s if whole else float(times[end])
         yield Span(float(times[begin]), until - float(times[begin]), mode, reason, why)
