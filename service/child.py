@@ -29,21 +29,29 @@ class Child(NamedTuple):
     socket: socket.socket
 
 
+def python(*arguments: str) -> tuple[list[str], dict[str, str]]:
+    """Command line and environment of a Python that finds the packages beside this one, whatever
+    the working directory holds.
+    """
+    root = str(Path(__file__).parents[1])
+    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    return [sys.executable, "-P", *arguments], os.environ | {"PYTHONPATH": path}
+
+
 def start(module: str, kind: socket.SocketKind) -> Child:
     """Starts `python -m module DESCRIPTOR`.
 
     A terminal's Ctrl-C is not for it: it ends when its socket closes.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, kind)
-    root = str(Path(__file__).parents[1])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    command, environment = python("-m", module, str(theirs.fileno()))
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, str(theirs.fileno())],
+            command,
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": path},
+            env=environment,
             start_new_session=True,
         )
     return Child(process, ours)

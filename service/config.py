@@ -47,16 +47,16 @@ class HandSettings(Section, frozen=True):
     """How a tracker's poses become hand positions in frame `base`."""
 
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` is taken too, as it is
-    unit: Literal["m", "cm", "mm"] = "m"
+    unit: Literal["m", "cm", "mm"] = "m"  # of the tracker's positions
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.05)] = 0.002  # each axis; a start, it is estimated
-    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
 
 
 class ToolSettings(Section, frozen=True):
     """The tool: where it sits on the tool plate, and how fast it may move."""
 
-    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # [m] the tool's point and turn, seen from the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
@@ -72,7 +72,7 @@ class ArmSettings(Section, frozen=True):
 
     urdf: str = ""  # a file; empty: the shipped Barrett WAM
     plate: str = "tool_plate"  # the link that carries the tool
-    source: Literal["state", "assumed"] = "state"
+    source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
     posture: PerJoint = (
         0.1761,
         0.8604,
@@ -83,8 +83,8 @@ class ArmSettings(Section, frozen=True):
         0.0,
     )  # [rad] the null space's and the assumed one
     link_radius: Positive = 0.07  # [m] of links whose shapes are meshes, which are not read
-    fault_error_rad: Positive = 0.1
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
+    fault_error_rad: Positive = 0.1  # between a joint as measured and as commanded
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without joint states: a fault while it moves
 
 
 class JointSettings(Section, frozen=True):
@@ -92,7 +92,7 @@ class JointSettings(Section, frozen=True):
     rad/s², rad/s³].
     """
 
-    names: tuple[str, ...] = (
+    names: tuple[str, ...] = (  # as `joints/state` and `joints/command` name them
         "wam/base_yaw_joint",
         "wam/shoulder_pitch_joint",
         "wam/shoulder_yaw_joint",
@@ -101,11 +101,11 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
-    lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)
-    upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)
-    velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)
-    acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)
-    jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)
+    lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
+    upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
+    velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
+    acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)  # [rad/s²]
+    jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)  # [rad/s³]
 
 
 class Reach(Section, frozen=True):
@@ -114,10 +114,10 @@ class Reach(Section, frozen=True):
     """
 
     centre: Point = (0.0, 0.0, 0.346)  # of the shell: where the arm's first axes meet
-    inner: Positive = 0.35
-    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88
-    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15
-    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02
+    inner: Positive = 0.35  # [m] radius of the shell
+    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] radius of the shell
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] in front of the base plate
+    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] above the table
 
 
 class People(Section, frozen=True):
@@ -148,8 +148,8 @@ class Box(Section, frozen=True):
 class Obstacles(Section, frozen=True):
     """What the arm keeps away from besides people: the table, itself, and boxes."""
 
-    boxes: tuple[Box, ...] = ()
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m]
+    boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them
     brake: Positive = 2.0  # [m/s²] toward them
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
@@ -159,19 +159,19 @@ class Table(Section, frozen=True):
     away from it and all below.
     """
 
-    centre: Point = (0.80, 0.0, 0.0)
-    half_size: tuple[Positive, Positive] = (0.45, 0.60)
+    centre: Point = (0.80, 0.0, 0.0)  # [m]
+    half_size: tuple[Positive, Positive] = (0.45, 0.60)  # [m] along x and y
 
 
 class Files(Section, frozen=True):
     """Where skills are read, and via-points, recordings and viewer files are written."""
 
     skills: str = ""  # a folder; empty: the shipped recordings
-    state: str = "~/.local/state/thirdhand"
+    state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # with each recording an .rrd file
     segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
-    segment_minutes: Positive = 10.0
+    segment_minutes: Positive = 10.0  # see `segment_mb`
     keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit
     keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # 0: no limit
 
@@ -179,8 +179,8 @@ class Files(Section, frozen=True):
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
-    cell: Cell = "thirdhand"
-    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500
+    cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # of the loop
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)

@@ -5,16 +5,17 @@ experiments and tests.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import select
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.child import python
 from service.contract.explain import ExplainedError
 from service.recorder.client import NOT_RECORDED
 
@@ -23,8 +24,24 @@ STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
 
 
+NO_BENCH = (
+    "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last that "
+    "PyBullet has wheels for (others compile it: pip install pybullet)"
+)
+
+
 class LaunchError(ExplainedError, RuntimeError):
     """A daemon that did not start or did not end; the message says what it said."""
+
+
+def check_bench() -> None:
+    """Raises LaunchError where the bench cannot run here."""
+    try:
+        found = importlib.util.find_spec("pybullet")
+    except ValueError:  # as it says of a module that was put away on purpose
+        found = None
+    if found is None:
+        raise LaunchError(NO_BENCH)
 
 
 @dataclass(frozen=True)
@@ -73,9 +90,9 @@ def launched(
         f"{network}[files]\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
-    command = [sys.executable, *program, "serve", "--config", str(config), *arguments]
+    command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
     try:
         yield Launched(process, _endpoint(process, log, say), log)
     finally:
@@ -110,24 +127,24 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
 
     Raises LaunchError.
     """
-    command = [sys.executable, "-m", "sim", "--connect", endpoint, "--once", "--json", "-", *arguments]
-    bench = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    clock = threading.Timer(BENCH_TIMEOUT_S, bench.kill)
+    command, environment = python("-m", "sim", "--connect", endpoint, "--once", "--json", "-", *arguments)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
     clock.start()
     said: list[str] = []
     try:
-        assert bench.stderr is not None
-        assert bench.stdout is not None
-        for line in bench.stderr:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        for line in process.stderr:
             said.append(line.rstrip())
             say(f"  {said[-1]}")
-        report = bench.stdout.read()
-        if bench.wait() != 0:
+        report = process.stdout.read()
+        if process.wait() != 0:
             raise LaunchError(
-                f"the bench ended with code {bench.returncode}: {said[-1] if said else 'it gave no reason'}"
+                f"the bench ended with code {process.returncode}: {said[-1] if said else 'it gave no reason'}"
             )
     finally:
         clock.cancel()
-        bench.kill()
-        bench.communicate()
+        process.kill()
+        process.communicate()
     return next((line for line in report.splitlines() if line.startswith("{")), "")

@@ -14,9 +14,9 @@ from pathlib import Path
 import msgspec
 
 from service.client import endpoints, open_session
+from service.contract import requests
 from service.contract.channels import ENDPOINT
-from sim.bench import Bench
-from sim.network import BenchError, Dropout, Live, RunReport, run
+from service.launch import LaunchError, check_bench
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 
@@ -51,6 +51,11 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         type=Path,
         help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+    )
+    p.add_argument(
+        "--via-points",
+        action="store_true",
+        help="only print the request that teaches the scene's places, for `thirdhand via-points add --file -`",
     )
     p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
     p.add_argument(
@@ -127,6 +132,18 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted")
     if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
         p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
+    try:
+        scene = Scene.load(args.scene) if args.scene else Scene()
+        if args.via_points:
+            print(requests.encode_json(requests.Add(scene.via_points())).decode())
+            return 0
+        check_bench()
+    except (SceneError, LaunchError) as error:
+        print(f"python -m sim: {error}", file=sys.stderr)
+        return 1
+    from sim.bench import Bench  # PyBullet, which may not be there
+    from sim.network import BenchError, Dropout, Live, RunReport, run
+
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -157,7 +174,6 @@ def main(arguments: list[str] | None = None) -> int:
                 file.write(line)
 
     try:
-        scene = Scene.load(args.scene) if args.scene else Scene()
         script = HandScript(
             scene,
             seed=scene.seed if args.seed is None else args.seed,
@@ -176,7 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
-    except (SceneError, BenchError, OSError) as error:
+    except (BenchError, OSError) as error:
         print(f"python -m sim: {error}", file=sys.stderr)
         return 1
     return 0

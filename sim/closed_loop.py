@@ -8,12 +8,15 @@ on the network.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Tick
-from sim.bench import Bench
+
+if TYPE_CHECKING:
+    from sim.bench import Bench  # PyBullet, which not all who make events have
 
 HANDS_HZ = 100  # also of the joint states
 START_NS = 1_000_000_000_000  # stamps begin there: 0 would mean that there is none

@@ -43,6 +43,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     rejected: int
     largest_gap_ms: float  # between commands received
     skipped: int  # periods that the bench itself missed
+    begun_ns: int  # the system clock's time at which the script began
     seed: int
     scene: Scene
 
@@ -199,7 +200,7 @@ def _play(
     deadlines = Deadlines(rate_hz)
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running = False
-    said = missed_before = sent_before = 0
+    said = missed_before = sent_before = begun_ns = 0
     say(
         f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
     )
@@ -231,6 +232,7 @@ def _play(
                 bench.begin()
                 commands.restart()
                 running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent
+                begun_ns = time.time_ns()
                 say("the script begins")
         else:
             for name in TaskEvents.__struct_fields__[said : bench.closed]:
@@ -239,7 +241,11 @@ def _play(
             if bench.finished:
                 report(
                     _report(
-                        bench, commands, hands=bridge.hands_sent - sent_before, skipped=deadlines.missed - missed_before
+                        bench,
+                        commands,
+                        hands=bridge.hands_sent - sent_before,
+                        skipped=deadlines.missed - missed_before,
+                        begun_ns=begun_ns,
                     )
                 )
                 if live.once:
@@ -259,7 +265,7 @@ def _let_stop(bench: Bench, bridge: Bridge, deadlines: Deadlines) -> None:
         bridge.publish_joints(bench.step(*bridge.commands.take()))
 
 
-def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int) -> RunReport:
+def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun_ns: int) -> RunReport:
     events = bench.events()
     latencies = list(commands.latencies_ms)
     percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
@@ -273,6 +279,7 @@ def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int) -> Ru
         rejected=commands.rejected,
         largest_gap_ms=round(commands.largest_gap_ms, 3),
         skipped=skipped,
+        begun_ns=begun_ns,
         seed=bench.script.seed,
         scene=bench.scene,
     )

@@ -15,14 +15,19 @@ from typing import Any
 
 import numpy as np
 
+from service.child import python
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
-from service.core.frame import TIMING
-from service.launch import launched, played
+from service.launch import check_bench, launched, played
+from service.recorder.columns import read
 from service.recorder.recording import Recording
+from service.recorder.report import Report, why_missed
+from service.recorder.report import report as report_of
 
 START_TIMEOUT_S = 60.0
+AFTER_S = 1.0  # that is looked at behind the nearest that the tool came
+PLACES = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # at which the events are to be
 EVENTS = {"handover": "board handed over", "grasp": "magnifying glass fetched", "carry": "glass held over the board"}
 
 
@@ -41,8 +46,9 @@ def demo(args: argparse.Namespace) -> int:
 
 def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
+    check_bench()
     out.mkdir(parents=True, exist_ok=True)
-    request = _output([sys.executable, "-m", "sim.scene", *([str(scene)] if scene else [])])
+    request = _output("sim.scene", *([str(scene)] if scene else []))
     add = decode_request(request.encode(), Add)
     with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
         say(f"service at {service.endpoint}")
@@ -65,15 +71,17 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
-    steps = [step.timing for step in Recording.open(recording).steps() if step.timing is not None]
-    timing = np.array(steps, TIMING)
-    span_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9
+    found = report_of(read(Recording.open(recording)))
+    timing = found.columns.timing
+    for name, event in report["events"].items():
+        if not event["reached"]:
+            event["why"] = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
     return {
         "success": report["success"],
         "events": report["events"],
         "ticks": len(timing),
-        "missed": int(timing["missed"][-1] - timing["missed"][0]),
-        "rate_hz": round((len(timing) - 1) / span_s, 3),
+        "missed": found.missed,
+        "rate_hz": round(found.rate_hz, 3),
         "latency_ms": report["latency_ms"],
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
@@ -81,6 +89,14 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         "recording": recording,
         "rrd": rrd,
     }
+
+
+def _why(found: Report, begun_s: float, events: dict[str, Any], name: str) -> str:
+    """Why an event was missed: what the recording tells from the event before it until after it."""
+    names = list(events)
+    before = [events[one]["time_s"] for one in names[: names.index(name)]]
+    until_s = events[name]["time_s"] + AFTER_S
+    return why_missed(found, PLACES[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
 
 
 def _percentiles(values: Any) -> dict[str, float]:
@@ -94,6 +110,8 @@ def text(report: dict[str, Any]) -> str:
         event = report["events"][name]
         outcome = "reached" if event["reached"] else "MISSED"
         lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
+        if why := event.get("why"):
+            lines.append(f"      because {why}")
     latency, late, work = report["latency_ms"], report["lateness_us"], report["work_us"]
     lines += [
         "",
@@ -106,6 +124,7 @@ def text(report: dict[str, Any]) -> str:
         "",
         f"  thirdhand replay {_shown(report['recording'])}",
         f"  thirdhand view {_shown(report['rrd'])}",
+        f"  thirdhand report {_shown(report['recording'])}",
         *([f"  The recording is not complete: {report['missing']}."] if report["missing"] else []),
         "",
         "The robot handed the board over, fetched the glass and held it over the board."
@@ -121,8 +140,11 @@ def _shown(path: str) -> str:
     return path
 
 
-def _output(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False)
+def _output(module: str, *arguments: str) -> str:
+    command, environment = python("-m", module, *arguments)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False, env=environment
+    )
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
     return done.stdout

@@ -40,9 +40,11 @@ RUN_BY = {
     "reset": "clients",
     "cells": "cells",
     "view": "view",
+    "report": "report",
     "certificates": "certificates",
     "bench": "bench",
 }
+SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
 PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
@@ -159,6 +161,16 @@ def parser() -> argparse.ArgumentParser:
     c = command("record", record_options.ABOUT, record_options.EXAMPLE)
     record_options.add_options(c)
     _reach(c, cell=None)
+
+    c = command(
+        "report",
+        "What recordings tell: what they lack, modes and reasons, faults and what led to them, promptness, closest "
+        "approach, places, limits, rejections. Several are set side by side.",
+        "thirdhand report thirdhand-demo/*.mcap --html report.html",
+    )
+    c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording (.mcap); of two their differences")
+    c.add_argument("--html", metavar="FILE", type=Path, help="all of it with plots as one page, too")
+    c.add_argument("--csv", metavar="DIR", type=Path, help="each table, and every tick, as CSV files there, too")
 
     c = command(
         "learn",
@@ -289,6 +301,11 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="of one more certificate")
     c.add_argument("--name", metavar="ROLE-N", help="of that one, like tracker-2 (default: the first that is free)")
     c.add_argument("--days", metavar="N", type=int, default=3650, help="that they are valid (default: %(default)s)")
+
+    # whatever follows is for `python -m sim`, so none of it is an option here, --help neither
+    c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
+    c.set_defaults(run="sim.sim")
+    c.add_argument("options", nargs="*")
 
     c = client(
         "view",

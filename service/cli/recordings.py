@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from service.cli.clients import reached
+from service.cli.progress import progress, steps
 from service.cli.usage import UsageError, check_writable
 from service.client import Client, Tracker
 from service.config import load
@@ -23,6 +24,7 @@ from service.learning.picture import draw
 from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.mcap_file import ends_early
 from service.recorder.pose_streams import SIDES, Source
+from service.recorder.recording import Recording
 from service.recorder.replay import replay as replayed
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
@@ -81,12 +83,10 @@ def replay(args: argparse.Namespace) -> int:
     there and identical.
     """
 
-    def progress(ticks: int) -> None:
-        print(f"\r{ticks} ticks", end="", file=sys.stderr, flush=True)
-
-    result = replayed(*args.files, after=args.after, progress=progress if sys.stderr.isatty() else None)
-    if sys.stderr.isatty():
-        print("\r", end="", file=sys.stderr)
+    held = [Recording.open(path).ticks() for path in args.files]
+    total = None if None in held or args.after is not None else sum(filter(None, held))
+    with progress("replaying", total=total) as done:
+        result = replayed(*args.files, after=args.after, progress=done)
     print(result.text())
     return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
 
@@ -112,19 +112,20 @@ def learn(args: argparse.Namespace) -> int:
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
         demonstrations.append(demonstration if demonstration.places else demonstration._replace(places=places))
     evidence: list[Evidence] = []
-    skill = learned(
-        demonstrations,
-        name=args.name or args.output.stem,
-        names=[path.stem for path in args.demonstrations],
-        components=args.components,
-        points=args.points,
-        ell=args.ell,
-        penalty=args.penalty,
-        seed=args.seed,
-        reach=settings.reach if settings else None,
-        progress=lambda line: print(line, file=sys.stderr, flush=True),
-        show=evidence.append,
-    )
+    with steps("learning") as doing:
+        skill = learned(
+            demonstrations,
+            name=args.name or args.output.stem,
+            names=[path.stem for path in args.demonstrations],
+            components=args.components,
+            points=args.points,
+            ell=args.ell,
+            penalty=args.penalty,
+            seed=args.seed,
+            reach=settings.reach if settings else None,
+            progress=doing,
+            show=evidence.append,
+        )
     figures = evidence[0].figures
     print(table(figures))
     if args.plot:

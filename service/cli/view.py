@@ -24,6 +24,7 @@ import numpy as np
 from PIL import Image
 
 from service.cli.clients import ask
+from service.cli.progress import progress
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, free_port
 from service.client import Client, open_session
 from service.contract.channels import ENDPOINT
@@ -56,7 +57,8 @@ def view(args: argparse.Namespace) -> int:
         return _show(str(path), args)
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / f"{path.stem}.rrd"
-        convert(path, drawn, say=lambda line: print(line, file=sys.stderr, flush=True))
+        with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
+            convert(path, drawn, say=lambda line: print(line, file=sys.stderr, flush=True), progress=done)
         return _show(str(drawn), args)
 
 
@@ -123,7 +125,13 @@ def _show(source: str, args: argparse.Namespace) -> int:
     return int(show(source))
 
 
-def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[str], None] = lambda line: None) -> int:
+def convert(
+    recording_path: str | Path,
+    rrd_path: str | Path,
+    *,
+    say: Callable[[str], None] = lambda line: None,
+    progress: Callable[[int], None] = lambda ticks: None,
+) -> int:
     """The number of ticks of a recording drawn into a Rerun file.
 
     What the recording lacks is told to `say`, and shown in the log where it is missing; all else is
@@ -156,6 +164,7 @@ def convert(recording_path: str | Path, rrd_path: str | Path, *, say: Callable[[
                 viewer.learn(step.skill)
             viewer.add(step.frame, time_ns, step.timing, step.events)
             count += 1
+            progress(count)
         missing = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
         for text in missing[unshown:]:
             viewer.log(text, "WARN", time_ns)

@@ -9,12 +9,16 @@ reading.
 
 from __future__ import annotations
 
+import contextlib
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
@@ -258,6 +262,18 @@ class Recording:
             raise RecordingError(f"the settings in {path} are not understood: {error}") from None
         urdf = parts.get("arm.urdf", b"").decode(errors="replace")
         return cls(path, settings, parts["skill.npz"], urdf, about, truncated=ends_early(path))
+
+    def ticks(self) -> int | None:
+        """How many ticks the file says that it holds; None where its end, which says so, is not
+        there.
+        """
+        topic = channels.key(self.settings.cell, "tick")
+        with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
+            told = make_reader(stream).get_summary()
+            if told is not None and told.statistics is not None:
+                numbers = [number for number, channel in told.channels.items() if channel.topic == topic]
+                return sum(told.statistics.channel_message_counts.get(number, 0) for number in numbers)
+        return None
 
     def steps(self, *, outputs: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.

@@ -1,0 +1,160 @@
+"""`python docs/settings_page.py` writes settings.md: every setting of `service/config.py`, with
+what is said beside it there.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import textwrap
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import inspect as types
+
+from service import config
+
+PAGE = Path(__file__).with_name("settings.md")
+HEAD = """# Settings
+
+<!-- Written by `python docs/settings_page.py` from service/config.py: change it there. -->
+
+The settings of a cell are one TOML file for `thirdhand serve --config cell.toml`. Each heading
+below is a table of it; what is not given has its default. A file is checked whole before anything
+starts, and all that is wrong with it is told at once, with what would be accepted.
+
+Units stand in the names (`_ms`, `_hz`, `_mb`) or in brackets; positions are in frame `base` unless
+said otherwise. Quaternions are x y z w. Paths of files and folders may begin with `~`; those of
+`[arm] urdf` and `[network] certificate` lie beside the configuration where they are relative.
+
+```toml
+cell = "hall/bench-1"
+rate_hz = 500
+
+[hands]
+unit = "mm"
+base_from_tracker = [0.80, 0.0, 0.02, 0.0, 0.0, 1.0, 0.0]
+
+[tool]
+max_speed = 0.5
+```
+
+Options of `thirdhand serve` go before the file's.
+"""
+
+
+def page() -> str:
+    """The text of the page."""
+    return (
+        HEAD
+        + "".join(_section(config.Settings, ""))
+        + "".join(
+            part
+            for field in types.type_info(config.Settings).fields  # type: ignore[attr-defined]
+            if isinstance(field.type, types.StructType)
+            for part in _section(field.type.cls, field.name)
+        )
+    )
+
+
+def _section(kind: Any, name: str) -> Iterator[str]:
+    """The heading, text and table of one table of the file; of the file itself without a name."""
+    comments = _comments(kind)
+    if name:
+        yield f"\n## [{name}]\n\n{_paragraphs(kind)}\n"
+    yield "\n| setting | default | accepted | what |\n|---|---|---|---|\n"
+    for field in types.type_info(kind).fields:  # type: ignore[attr-defined]
+        if not isinstance(field.type, types.StructType):
+            cells = (f"`{field.name}`", _value(_default(field)), _accepted(field.type), comments.get(field.name, ""))
+            yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
+
+
+def _paragraphs(kind: Any) -> str:
+    return "\n\n".join(textwrap.fill(" ".join(part.split()), 100) for part in inspect.getdoc(kind).split("\n\n"))
+
+
+def _comments(kind: Any) -> dict[str, str]:
+    """What is said beside each field of a class, in its source."""
+    source = textwrap.dedent(inspect.getsource(kind))
+    told: dict[int, str] = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            told[token.start[0]] = token.string.removeprefix("#").strip()
+    fields = [node for node in ast.parse(source).body[0].body if isinstance(node, ast.AnnAssign)]  # type: ignore[attr-defined]
+    return {
+        ast.unparse(node.target): " ".join(
+            told[line] for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in told
+        )
+        for node in fields
+    }
+
+
+def _default(field: types.Field) -> Any:
+    return field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
+
+
+def _value(value: Any) -> str:
+    """As TOML has it."""
+    if value is msgspec.NODEFAULT:
+        return "must be given"
+    return f"`{_toml(value)}`"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value)
+
+
+def _accepted(kind: Any) -> str:
+    """In words, what a setting takes."""
+    if isinstance(kind, types.Metadata):
+        told = (kind.extra or {}).get("accepted")
+        return str(told).rstrip(",") if told else _accepted(kind.type)
+    if isinstance(kind, types.LiteralType):
+        return ", ".join(f"`{_toml(value)}`" for value in kind.values)
+    if isinstance(kind, types.BoolType):
+        return "`true`, `false`"
+    if isinstance(kind, types.StrType):
+        return f"text, {kind.max_length} characters at most" if kind.max_length else "text"
+    if isinstance(kind, types.TupleType):
+        return f"{len(kind.item_types)} numbers{_each(kind.item_types[0])}"
+    if isinstance(kind, types.VarTupleType):
+        inner = kind.item_type
+        if isinstance(inner, types.StructType):
+            fields = "; ".join(f"`{field.name}`: {_accepted(field.type)}" for field in inner.fields)
+            return f"tables with {fields}"
+        return f"a list of {'texts' if isinstance(inner, types.StrType) else f'numbers{_each(inner)}'}"
+    return ", ".join(filter(None, ("whole number" if isinstance(kind, types.IntType) else "number", _range(kind))))
+
+
+def _each(kind: Any) -> str:
+    told = _range(kind)
+    return f", each {told}" if told else ""
+
+
+def _range(kind: Any) -> str:
+    """The bounds of a number, empty where it has none."""
+    bounds = [
+        f"{word} {bound:g}"
+        for word, bound in (
+            ("above", getattr(kind, "gt", None)),
+            ("from", getattr(kind, "ge", None)),
+            ("below", getattr(kind, "lt", None)),
+            ("up to", getattr(kind, "le", None)),
+        )
+        if bound is not None
+    ]
+    return ", ".join(bounds).replace(", up to", " up to")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,97 @@
+"""How far a command is, on standard error, once it takes longer than two seconds: a bar or a
+spinner on a terminal, a line now and then elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+AFTER_S, EVERY_S = 2.0, 10.0
+
+
+@contextlib.contextmanager
+def progress(
+    what: str, *, total: int | None = None, unit: str = "ticks", after_s: float = AFTER_S, every_s: float = EVERY_S
+) -> Iterator[Callable[[int], None]]:
+    """Takes how many are done, of `total` where that is known."""
+    shown = _Shown(what, total, unit, after_s, every_s)
+    try:
+        yield shown.done
+    finally:
+        shown.close()
+
+
+@contextlib.contextmanager
+def steps(what: str, *, after_s: float = AFTER_S, every_s: float = EVERY_S) -> Iterator[Callable[[str], None]]:
+    """Takes the name of each step as it begins, and prints it; one that lasts is told of again."""
+    shown = _Shown(what, None, "", after_s, every_s)
+    try:
+        yield shown.doing
+    finally:
+        shown.close()
+
+
+class _Shown:
+    """What is shown, from a thread of its own; so it goes on while the command computes."""
+
+    def __init__(self, what: str, total: int | None, unit: str, after_s: float, every_s: float) -> None:
+        self._what, self._total, self._unit = what, total, unit
+        self._after_s, self._every_s = after_s, every_s
+        self._count, self._begun = 0, time.monotonic()
+        self._ended = threading.Event()
+        tell = self._draw if sys.stderr.isatty() else self._print
+        self._thread = threading.Thread(target=tell, name="progress", daemon=True)
+        self._thread.start()
+
+    def done(self, count: int) -> None:
+        self._count = count
+
+    def doing(self, what: str) -> None:
+        self._what, self._begun = what, time.monotonic()
+        if not sys.stderr.isatty():
+            print(what, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _draw(self) -> None:
+        if self._ended.wait(self._after_s):
+            return
+        from rich.console import Console  # takes a while, and most commands are quicker
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        class Cursor(Console):
+            """Leaves the cursor: Ctrl-C ends at once, and nobody would show it again."""
+
+            def show_cursor(self, show: bool = True) -> bool:
+                return False
+
+        known = self._total is not None
+        columns = [BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()] if known else []
+        text = TextColumn("{task.description}", markup=False)
+        with Progress(
+            SpinnerColumn(), text, *columns, TimeElapsedColumn(), console=Cursor(stderr=True), transient=True
+        ) as bar:
+            task = bar.add_task(self._what, total=self._total)
+            bar.update(task, completed=self._count)
+            while not self._ended.wait(0.2):
+                bar.update(task, description=self._what, completed=self._count)
+
+    def _print(self) -> None:
+        wait_s = self._after_s
+        while not self._ended.wait(wait_s):
+            wait_s = self._every_s
+            passed_s = time.monotonic() - self._begun
+            if passed_s < self._after_s:  # a new step, which was printed as it began
+                continue
+            passed = f"{passed_s:.0f} s"
+            if self._total:
+                passed = f"{100 * self._count / self._total:.0f} % of {self._total} {self._unit}, {passed}"
+            elif self._count:
+                passed = f"{self._count} {self._unit}, {passed}"
+            print(f"{self._what}: {passed}", file=sys.stderr, flush=True)

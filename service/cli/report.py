@@ -1,0 +1,131 @@
+"""`thirdhand report`: what recordings tell, on the terminal, as one page or as tables in files."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from service.cli.progress import progress
+from service.cli.report_tables import Table, comparison, names_of, summary, tables
+from service.cli.usage import UsageError, check_writable
+from service.contract.records import Mode
+from service.recorder.columns import KEPT
+from service.recorder.recording import Recording
+from service.recorder.report import Report, reported
+
+BAR = 72  # characters of the line that shows the modes over the time
+MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
+MOST_ROWS = 40  # of a table on a terminal
+PLAIN_WIDTH = 120  # characters, where it is no terminal
+
+
+def report(args: argparse.Namespace) -> int:
+    """Exit code 0 once all recordings are told of, whatever they tell."""
+    if args.html:
+        check_writable(args.html)
+    if args.csv and args.csv.exists() and not args.csv.is_dir():
+        raise UsageError(f"--csv {args.csv} is a file, a folder needed")
+    reports = []
+    for path in args.files:
+        with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
+            reports.append(reported(path, progress=done))
+    console = Console(highlight=False, soft_wrap=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=PLAIN_WIDTH)
+    for one in reports:
+        _print(console, one)
+    if len(reports) > 1:
+        for table in comparison(reports):
+            _print_table(console, table)
+    if args.csv:
+        write_csv(reports, args.csv)
+        console.print(f"tables in {args.csv}")
+    if args.html:
+        from service.cli.report_page import page  # draws, which takes a while to import
+
+        with progress("drawing", unit="recordings", total=len(reports)) as done:
+            args.html.write_text(page(reports, progress=done), encoding="utf-8")
+        console.print(f"page {args.html}")
+    return 0
+
+
+def _print(console: Console, one: Report) -> None:
+    console.print(Text(str(one.path), style="bold"))
+    for line in summary(one):
+        console.print(Text(line))
+    console.print(_bar(one))
+    for table in tables(one):
+        _print_table(console, table)
+
+
+def _bar(one: Report) -> Text:
+    """The modes over the time, and what its marks mean."""
+    bar, cells = Text(), [one.lasts_s * (i + 0.5) / BAR for i in range(BAR)]
+    for at_s in cells if one.lasts_s else ():
+        modes = [span.mode for span in one.spans if span.start_s <= at_s < span.start_s + span.lasts_s]
+        mark, style = MARKS[modes[0]] if modes else (" ", "")
+        bar.append(mark, style)
+    shown = {span.mode for span in one.spans}
+    for mode, (mark, style) in MARKS.items():
+        if mode in shown:
+            bar.append("  ").append(mark, style).append(f" {str(mode.name).lower()} {one.seconds(mode):.1f} s")
+    return bar
+
+
+def _print_table(console: Console, table: Table) -> None:
+    drawn = RichTable(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for i, head in enumerate(table.heads):
+        drawn.add_column(escape(head), justify="right" if table.is_number(i) else "left", overflow="fold")
+    for row in table.rows[:MOST_ROWS]:
+        drawn.add_row(*map(escape, row))
+    console.print()
+    console.print(Text(table.title, style="bold"))
+    console.print(drawn)
+    if len(table.rows) > MOST_ROWS:
+        console.print(f"... and {len(table.rows) - MOST_ROWS} more; --csv and --html tell all")
+
+
+def write_csv(reports: Sequence[Report], folder: Path) -> None:
+    """Each table of each report as a file in a folder of the report's name, with what was decided
+    tick by tick in `ticks.csv`; for several reports a comparison beside these folders.
+    """
+    for name, one in zip(names_of(reports), reports, strict=True):
+        inside = folder / name
+        inside.mkdir(parents=True, exist_ok=True)
+        for table in tables(one):
+            _write(inside / f"{table.name}.csv", table)
+        _write_ticks(inside / "ticks.csv", one)
+    if len(reports) > 1:
+        for table in comparison(reports):
+            _write(folder / f"{table.name}.csv", table)
+
+
+def _write(path: Path, table: Table) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(table.heads)
+        writer.writerows(table.rows)
+
+
+def _write_ticks(path: Path, one: Report) -> None:
+    """Every field that a report is made of, a row each tick, in metres, radians and seconds."""
+    frames = one.columns.frames
+    heads, formats, columns = ["time_s"], ["%.4f"], [one.columns.times[:, None]]
+    for name in KEPT:
+        count = math.prod(frames.dtype[name].shape)
+        column = frames[name].reshape(len(frames), count)
+        is_whole = np.issubdtype(column.dtype, np.integer)
+        heads += [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]
+        formats += ["%d" if is_whole else "%.7g"] * count
+        columns.append(column.astype(np.float64))
+    np.savetxt(path, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(heads), comments="")

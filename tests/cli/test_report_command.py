@@ -1,0 +1,130 @@
+"""`thirdhand report`: one recording and two, on the terminal, as a page and as files."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests_paths import RECORDINGS, ROOT
+from wam import STATE
+
+from service.cli.main import main
+from service.cli.report_page import thinned
+from service.config import Settings
+from service.core.frame import blank
+from service.recorder.recording import Recorder, Recording
+
+GOLDEN = RECORDINGS / "golden.mcap"
+
+
+def rows(path: Path) -> list[list[str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, folder = tmp_path / "report.html", tmp_path / "tables"
+    assert main(["report", str(GOLDEN), str(GOLDEN), "--html", str(page), "--csv", str(folder)]) == 0
+    said = capsys.readouterr().out
+    for words in ("Nothing is missing in it.", "hold: stale_hand", "Side by side", "difference", "same"):
+        assert words in said
+    assert "Settings, versions" not in said  # one file twice: none differs
+
+    text = page.read_text(encoding="utf-8")
+    assert text.count("<svg") == text.count("</svg>") == 4
+    for drawn in re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL):
+        assert ET.fromstring(drawn) is not None
+    fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
+    assert [one for one in fetched if not one.startswith("#")] == []
+    assert "far_from_demonstrations" in text
+
+    assert {path.name for path in folder.iterdir()} == {"golden", "golden-2", "comparison.csv"}
+    comparison = rows(folder / "comparison.csv")
+    assert comparison[0] == ["figure", "golden", "golden-2", "difference"]
+    assert {row[3] for row in comparison[1:]} <= {"same", "-"}
+    modes = rows(folder / "golden" / "modes.csv")
+    assert modes[0] == ["from [s]", "for [s]", "mode", "why"]
+    assert float(modes[-1][0]) + float(modes[-1][1]) == pytest.approx(20.03, abs=0.02)
+
+    heads, *ticks = rows(folder / "golden" / "ticks.csv")
+    frames = [step.frame for step in Recording.open(GOLDEN).steps() if step.frame is not None]
+    assert len(ticks) == len(frames)
+    row = dict(zip(heads, ticks[5000], strict=True))
+    assert int(row["tick"]) == int(frames[5000]["tick"])
+    assert float(row["tool[2]"]) == pytest.approx(float(frames[5000]["tool"][2]), rel=1e-6)
+
+
+def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty, cut = tmp_path / "empty.mcap", tmp_path / "cut.mcap"
+    with Recorder(empty, settings=Settings(), skill=(RECORDINGS / "soldering.npz").read_bytes(), state=blank(STATE)):
+        pass
+    whole = GOLDEN.read_bytes()
+    cut.write_bytes(whole[: len(whole) // 8])
+    page = tmp_path / "page.html"
+    assert main(["report", str(empty), str(cut), "--html", str(page), "--csv", str(tmp_path / "tables")]) == 0
+    said = capsys.readouterr().out
+    assert "never: it holds no tick" in said
+    assert "Something is missing in it, once." in said
+    assert "cut at byte" in said
+    assert "<svg" in page.read_text(encoding="utf-8")
+    assert len(rows(tmp_path / "tables" / "empty" / "ticks.csv")) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["nowhere.mcap"], 1, "no recording nowhere.mcap"),
+        ([str(RECORDINGS / "demonstration-1.mcap")], 1, "not a recording of thirdhand"),
+        ([str(GOLDEN), "--html", "no/such/folder.html"], 2, "there is no folder no/such"),
+        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file, a folder needed"),
+    ],
+)
+def test_what_cannot_be_read_or_written_is_said_first(
+    arguments: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", *arguments]) == code
+    assert says in capsys.readouterr().err
+
+
+def test_a_thinned_curve_keeps_its_extremes_and_its_gaps() -> None:
+    x = np.arange(100_000.0)
+    y = np.sin(x / 3000)
+    y[77_777], y[40_000:45_000] = 9.0, np.nan
+    thin_x, thin_y = thinned(x, y, points=1000)
+    assert len(thin_x) <= 1000
+    assert np.nanmax(thin_y) == 9.0
+    assert thin_x[np.nanargmax(thin_y)] == 77_777
+    assert (np.diff(thin_x) >= 0).all()
+    assert np.isnan(thin_y[(thin_x > 40_200) & (thin_x < 44_800)]).all()
+
+
+def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_holds(tmp_path: Path) -> None:
+    (tmp_path / "sim.py").write_text("raise SystemExit('not this one')\n")
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "service", "sim", "--help"],
+        capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "--hands-rate HZ" in done.stdout
+
+
+@pytest.mark.parametrize("arguments", [["sim", "--once"], ["demo", "--out", "nowhere"]])
+def test_without_its_library_the_bench_says_so_in_one_line(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    assert main(arguments) == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"thirdhand {arguments[0]}: the bench needs PyBullet, which is not installed: pip install")
+    assert not Path("nowhere").exists()

@@ -1,0 +1,48 @@
+"""The wheel: it holds service, bench and the shipped recordings, and its page shows no picture and
+no link that leads nowhere there.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+from tests_paths import ROOT
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    [built] = WheelBuilder(str(ROOT)).build(directory=str(tmp_path_factory.mktemp("wheel")))
+    return Path(built)
+
+
+def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = set(archive.namelist())
+    sources = {
+        str(path.relative_to(ROOT)) for name in ("kmp", "service", "sim") for path in (ROOT / name).rglob("*.py")
+    }
+    assert sources <= held
+    assert {"service/arms/wam.urdf", "service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
+    assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"kmp", "service", "sim"}
+    assert "kmp/pyproject.toml" not in held
+
+
+def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
+    assert "Description-Content-Type: text/markdown" in page
+    assert "# thirdhand\n" in page
+    targets = re.findall(r"\]\(([^)\s]+)\)", page)
+    assert [target for target in targets if not target.startswith("https://")] == []
+
+
+def test_the_bench_is_wanted_only_where_its_library_has_wheels(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
+    wanted = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
+    assert wanted
+    assert all("python_version < '3.12'" in line and "extra ==" in line for line in wanted)
