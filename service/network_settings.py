@@ -34,8 +34,8 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     With a certificate all endpoints are TLS, and each role may do its own only.
     """
 
-    listen: tuple[str, ...] = (ENDPOINT,)
-    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = (ENDPOINT,)  # endpoints on which the daemon listens; port 0: a free one
+    connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
     certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
     revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
     zenoh_config: str = ""  # a file of Zenoh's own, for what is not set by the service; empty: none

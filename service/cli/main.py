@@ -17,12 +17,11 @@ from importlib import metadata
 from pathlib import Path
 
 from service import interrupt
-from service.cli import record_options
+from service.cli import record_options, via_point_options
 from service.cli.usage import Parser, UsageError, check_cell
 from service.config import RATES_HZ
 from service.contract import channels
 from service.contract.explain import ExplainedError
-from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 
 RUN_BY = {
@@ -228,37 +227,7 @@ def parser() -> argparse.ArgumentParser:
         "--radius .03 --follow left --std .001\n  thirdhand via-points add glass --here",
     )  # fmt: skip
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
-    for hand in ("left", "right", "tool"):
-        a.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
-    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
-    defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
-    a.add_argument(
-        "--std",
-        type=float,
-        default=defaults.std,
-        metavar="M",
-        help="how exactly the tool is to go there (default: %(default)s m)",
-    )
-    a.add_argument(
-        "--radius",
-        type=float,
-        default=defaults.radius,
-        metavar="M",
-        help="also for hands this far from there (default: %(default)s m)",
-    )
-    a.add_argument(
-        "--follow",
-        choices=("none", "left", "right"),
-        default="none",
-        help="within the radius the tool moves with this hand",
-    )
-    a.add_argument(
-        "--tolerance",
-        type=float,
-        metavar="M",
-        help=f"points learned nearer than this give way (default: {TOLERANCE_M} m)",
-    )
-    a.add_argument("--file", metavar="FILE", help="a request as JSON instead; - is standard input")
+    via_point_options.add_options(a)
     _reach(a)
     a = actions.add_parser(
         "remove", help="forget via-points by name", epilog=f"{nothing}remove handover", formatter_class=FORMATTER
