@@ -33,6 +33,7 @@ AT, ALIKE = 0.9, 0.85  # share from which on hands are at a place; and the tool,
 LEAST_SAMPLES_S = 0.4  # there, for a pair of places to be known
 UNSEEN = (0.15, 0.3, 0.45)  # of the way to a pair that was not: the tool stays
 TAUGHT = 1e-4  # deviation of the share at a known pair
+FALSE = 0.005  # of the time may the gate hold: hands that start elsewhere come nearer, and are to be followed
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
@@ -277,4 +278,4 @@ def _gate(task: Task, told: Sequence[Told]) -> Gate:
         for off, hands in zip(wrong, nonsense(one.hands[:: max(1, len(one.hands) // 50)]), strict=True):
             off.append(Placed.of(task, one.layout).inputs(hands, np.zeros_like(hands))[1].max(axis=1))
     held_out = np.concatenate([one.off.max(axis=1) for one in told])
-    return between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M)
+    return between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M, false=FALSE)

@@ -48,7 +48,7 @@ def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float)
     return between(held_out, wrong, ceiling=min(CEILING_M * calibration, HIGHEST_GATE_M))
 
 
-def between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float) -> Gate:
+def between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
     """The gate between what held-out demonstrations reach (T,) [m] and what each kind of planted
     nonsense does.
     """
@@ -57,7 +57,7 @@ def between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float) -> Gat
     if least > most:
         threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
     else:
-        threshold = min(max(least, float(np.quantile(held_out, 1 - FALSE))), most)
+        threshold = min(max(least, float(np.quantile(held_out, 1 - false))), most)
     threshold, capped = min(threshold, ceiling), threshold > ceiling
     return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in wrong)), capped)
 
