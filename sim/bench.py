@@ -21,7 +21,7 @@ import numpy.typing as npt
 from service.config import Settings
 from service.contract.messages import BASE, Thing
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
-from sim.script import HandMotions, HandScript
+from sim.script import GRIP_S, HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
@@ -29,6 +29,7 @@ STILL_S = 0.25  # of rest is settled
 BRAKE_AFTER_S = 0.020  # without a command
 REJOIN_AFTER_S = 0.1  # without a command; then the next one must begin where the arm stands
 REJOIN_RAD, REJOIN_RADPS = 0.02, 0.05  # how nearly
+HOLDS = 0.5  # closed so far the fingers hold what is between them
 TAIL_S = 0.5  # watched after the script's end
 STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
 
@@ -58,7 +59,7 @@ class TaskEvents(msgspec.Struct, frozen=True):
 
 class Observation(NamedTuple):
     """The bench after a step: steps done, seconds since the script began (0 before), joints [rad,
-    rad/s], tool [m, m/s], hands.
+    rad/s], tool [m, m/s], hands, gripper.
     """
 
     tick: int
@@ -68,6 +69,7 @@ class Observation(NamedTuple):
     tool: Pose
     tool_velocity: Floats
     hands: HandMotions
+    gripper: float  # how far it is closed, 0 to 1
 
 
 class _Watch:
@@ -110,6 +112,7 @@ class Bench:
         self._since_command = 0
         self.refused = 0  # commands that did not begin where the arm stood, after a silence
         self._still = 0
+        self._gripper: float | None = None  # as commanded; None: never, and what is near is grasped
         self._lay_out()
         self._observation = self._observe()
         self._still_at = self._observation.tool.position
@@ -130,6 +133,7 @@ class Bench:
         self.closed = 0  # events whose window is over
         world.put(world.glass, Pose(scene.glass, LEVEL))
         world.put(world.iron, Pose(scene.iron, LEVEL))
+        self._closure, self._closing = 1.0, 0  # of the fingers; 1 when they closed in this step, -1 when they opened
         # What is held: by which holder, and how it lies in its hand.
         self._held: dict[int, tuple[int, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
 
@@ -178,9 +182,14 @@ class Bench:
         """What the last step left."""
         return self._observation
 
-    def step(self, position: Floats | None = None, velocity: Floats | None = None) -> Observation:
-        """The bench one period later, after a command of its joints [rad, rad/s], or none."""
+    def step(
+        self, position: Floats | None = None, velocity: Floats | None = None, *, gripper: float | None = None
+    ) -> Observation:
+        """The bench one period later, after a command of its joints [rad, rad/s] and of its gripper
+        (0 open, 1 closed), or none. Until the first of the latter it grasps what is near.
+        """
         self._follow(position, velocity)
+        self._grip(gripper)
         self.world.step()
         self.tick += 1
         self._ticks_since_begin = max(0, self._ticks_since_begin + self._direction)
@@ -222,10 +231,20 @@ class Bench:
             position = tuple(q + age_s * dq for q, dq in zip(position, velocity, strict=True))
         self.world.follow(position, self._command[1])
 
+    def _grip(self, told: float | None) -> None:
+        """Moves the fingers on toward the newest command."""
+        self._gripper = self._gripper if told is None else told
+        if self._gripper is None:
+            return
+        before, most = self._closure, self.period_s / GRIP_S
+        self._closure += min(max(self._gripper - before, -most), most)
+        self._closing = (before < HOLDS <= self._closure) - (before >= HOLDS > self._closure)
+
     def _observe(self) -> Observation:
         joints, velocities = self.world.joints()
         tool, speed = self.world.tool()
-        return Observation(self.tick, self.time_s, joints, velocities, tool, speed, self.script.truth(self.time_s))
+        hands = self.script.truth(self.time_s)
+        return Observation(self.tick, self.time_s, joints, velocities, tool, speed, hands, self._closure)
 
     def _handle(self, seen: Observation) -> None:
         """Move the hands, and what anyone holds."""
@@ -252,10 +271,15 @@ class Bench:
         first, second, third = scene.dwells
         handover, grasp, carry = self._watches
         offered = _distance(tool, np.add(seen.hands.left.position, TOOL_FROM_HAND))
-        if first[0] <= script_s <= first[1] and handover.see(offered, seen.time_s):
+        by_itself = self._gripper is None
+        if first[0] <= script_s <= first[1] and handover.see(offered, seen.time_s, counts=by_itself):
             self._take(world.board, world.left)
+        if self._closing < 0:
+            self._let_go(seen, offered)
+        if self._closing > 0 and not self._held_by_arm() and grasp.see(_distance(tool, scene.glass), seen.time_s):
+            self._take(world.glass, world.arm)
         if second[0] <= script_s <= second[1]:
-            if grasp.see(_distance(tool, scene.glass), seen.time_s):
+            if grasp.see(_distance(tool, scene.glass), seen.time_s, counts=by_itself):
                 self._take(world.glass, world.arm)
             if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= GRASP_DISTANCE:
                 self._take(world.iron, world.right)
@@ -276,6 +300,20 @@ class Bench:
             frame, pose = (self._plate, grip) if held and grip else (BASE, self.world.pose(body))
             found.append(Thing(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
         return tuple(found)
+
+    def _held_by_arm(self) -> list[int]:
+        return [thing for thing, (holder, _) in self._held.items() if holder == self.world.arm]
+
+    def _let_go(self, seen: Observation, offered: float) -> None:
+        """What the fingers held goes to the hand that it is offered to, or falls on the table."""
+        world = self.world
+        for thing in self._held_by_arm():
+            if thing == world.board and self._watches[0].see(offered, seen.time_s):
+                self._take(thing, world.left)
+            else:
+                del self._held[thing]
+                x, y, _ = seen.tool.position
+                world.put(thing, Pose((x, y, 0.0), LEVEL))
 
     def events(self) -> TaskEvents:
         """How the run went, so far as it went: an event that was not watched yet has an infinite

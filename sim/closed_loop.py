@@ -14,6 +14,7 @@ from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Tick
+from service.core.pose import CLOSED, UNKNOWN
 
 if TYPE_CHECKING:
     from sim.bench import Bench  # PyBullet, which not all who make events have
@@ -51,14 +52,11 @@ class ClosedLoop:
         *,
         direct: Callable[[Bench], None] = begin_when_settled,
         spoil: Callable[[Event], tuple[Event, ...]] = lambda event: (event,),
-        more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
     ) -> None:
         """`direct` starts and turns the script before each step, `spoil` says what becomes of each
         hand's sample.
-
-        `more` makes further events of the newest frame, as often as hands are seen.
         """
-        self._bench, self._direct, self._spoil, self._more = bench, direct, spoil, more
+        self._bench, self._direct, self._spoil = bench, direct, spoil
         self._newest: Frame | None = None
 
     def follow(self, tick: Tick, frame: Frame) -> None:
@@ -75,7 +73,9 @@ class ClosedLoop:
                 return
             newest = self._newest
             if newest is not None and newest["commanded"]:
-                seen = bench.step(tuple(newest["joints"].tolist()), tuple(newest["joint_velocities"].tolist()))
+                position, velocity = tuple(newest["joints"].tolist()), tuple(newest["joint_velocities"].tolist())
+                known = newest["gripper"] != UNKNOWN
+                seen = bench.step(position, velocity, gripper=float(newest["gripper"] == CLOSED) if known else None)
             else:
                 seen = bench.step()
             inbox: list[Event] = []
@@ -84,7 +84,5 @@ class ClosedLoop:
                 for side, pose in zip(SIDES, bench.script.sample(bench.time_s), strict=True):
                     x, y, z, *orientation = pose.tolist()
                     inbox += self._spoil(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))
-                if newest is not None:
-                    inbox += self._more(newest)
                 inbox.append(joints_event(bench.joint_names, seen.joints, seen.joint_velocities, stamp_ns))
             yield Tick(bench.tick, tuple(inbox))

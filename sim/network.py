@@ -121,27 +121,53 @@ class Commands:
         return newest or (None, None)
 
 
+class Gripper:
+    """The newest command of the gripper: 0 open, 1 closed; None: there was none."""
+
+    def __init__(self) -> None:
+        self.newest: float | None = None
+
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Keep one command; what is none is let pass, as those of the joints tell."""
+        try:
+            command = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), (messages.GRIPPER,))[0]
+        except messages.WireError:
+            return
+        if messages.finite(command):
+            self.newest = min(max(command[0], 0.0), 1.0)
+
+
 class Bridge:
     """The bench's channels on a session: closes what it declared."""
 
     def __init__(self, session: zenoh.Session, live: Live, names: tuple[str, ...]) -> None:
         self.commands = Commands(names)
+        self.gripper = Gripper()
         self._names = names
         self.hands_sent = 0
         self._publishers = {
             suffix: session.declare_publisher(
                 channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
             )
-            for suffix in ("hands/left", "hands/right", "joints/state", "objects")
+            for suffix in ("hands/left", "hands/right", "joints/state", "gripper/state", "objects")
         }
         # A callback costs 20 µs on its own thread, stamps each command as it comes, and overwrites
         # the last: the newest wins.
-        self._subscriber = session.declare_subscriber(channels.key(live.cell, "joints/command"), self.commands.receive)
+        self._subscribers = [
+            session.declare_subscriber(channels.key(live.cell, suffix), receive)
+            for suffix, receive in (
+                ("joints/command", self.commands.receive),
+                ("gripper/command", self.gripper.receive),
+            )
+        ]
 
     def publish_joints(self, seen: Observation) -> None:
-        """Send the arm's joints."""
+        """Send the arm's joints and its gripper."""
         state = messages.JointState(time.time_ns(), self._names, seen.joints, seen.joint_velocities)
         self._publishers["joints/state"].put(cdr.encode_joints(state))
+        if self.gripper.newest is not None:
+            fingers = messages.JointState(state.stamp_ns, (messages.GRIPPER,), (seen.gripper,), ())
+            self._publishers["gripper/state"].put(cdr.encode_joints(fingers))
 
     def publish_hands(self, poses: Sequence[Array], *, hidden: str | None = None) -> None:
         """Send both hands with one stamp, as a tracker's frame; not the one that is hidden."""
@@ -160,7 +186,8 @@ class Bridge:
 
     def close(self) -> None:
         """Take the channels back."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
         for publisher in self._publishers.values():
             publisher.undeclare()  # type: ignore[no-untyped-call]
 
@@ -209,7 +236,7 @@ def _play(
         if now_s >= live.duration_s:
             return
         position, velocity = commands.take()
-        seen = bench.step(position, velocity)
+        seen = bench.step(position, velocity, gripper=bridge.gripper.newest)
         bridge.publish_joints(seen)
         if bench.tick % hands_every == 0:
             hidden = live.dropout.hand if live.dropout and running and live.dropout.at(seen.time_s) else None
@@ -262,7 +289,7 @@ def _let_stop(bench: Bench, bridge: Bridge, deadlines: Deadlines) -> None:
     """Without hands the service stops the arm; one that vanished before that would be a fault."""
     for _ in range(round(STOP_S / bench.period_s)):
         deadlines.wait()
-        bridge.publish_joints(bench.step(*bridge.commands.take()))
+        bridge.publish_joints(bench.step(*bridge.commands.take(), gripper=bridge.gripper.newest))
 
 
 def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun_ns: int) -> RunReport:

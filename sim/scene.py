@@ -123,15 +123,23 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """Script time from the first motion to the end of the last rest [s]."""
         return self.dwells[-1][1]
 
-    def via_points(self) -> tuple[requests.ViaPoint, ...]:
+    def via_points(self, *, gripper: bool = False) -> tuple[requests.ViaPoint, ...]:
         """The three via-points, each with a flat neighbourhood of 3 cm: handover, glass and
-        soldering.
+        soldering; with what the gripper does there, if wanted.
         """
         s = self
-        return (
+        places = (
             _via_point("handover", left=s.handover, right=s.right_start, tool=s.offer, follow="left"),
             _via_point("glass", left=s.soldering, right=s.iron, tool=s.glass),
             _via_point("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
+        )
+        if not gripper:
+            return places
+        handover, glass, soldering = places
+        return (
+            msgspec.structs.replace(handover, gripper="open"),
+            msgspec.structs.replace(glass, gripper="closed"),
+            msgspec.structs.replace(soldering, gripper="closed"),
         )
 
     @staticmethod
@@ -170,13 +178,14 @@ def main(arguments: list[str] | None = None) -> int:
         type=Path,
         help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
     )
+    p.add_argument("--gripper", action="store_true", help="tell what the gripper does there, too")
     args = p.parse_args(arguments)
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
     except SceneError as error:
         print(error, file=sys.stderr)
         return 1
-    print(requests.encode_json(requests.Add(scene.via_points())).decode())
+    print(requests.encode_json(requests.Add(scene.via_points(gripper=args.gripper))).decode())
     return 0
 
 

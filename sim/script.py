@@ -25,6 +25,7 @@ TREMOR_HZ = (8.0, 10.0)  # physiological tremor of a resting hand
 TREMOR_WAVES = 6
 # Height that the tool gains in the middle of each motion [m], the same in all demonstrations: over
 # the hand, over the bench, over the board.
+GRIP_AT, GRIP_S = 0.8, 0.25  # of a motion the gripper opens or closes, as the hands arrive; how long that takes [s]
 TOOL_ARCS = ((0.0, 0.0, 0.03), (0.03, 0.0, 0.05), (0.0, 0.0, 0.04))
 
 
@@ -203,6 +204,7 @@ class Teacher:
         ]
         self._clock = clock or Clock()
         self._path = Path(points, scene.segments, arcs=TOOL_ARCS)
+        self._opens, self._closes = (begin + GRIP_AT * (end - begin) for begin, end in scene.segments[:2])
 
     def truth(self, t: float) -> Motion:
         """The tool's motion `t` seconds after the script began."""
@@ -211,6 +213,13 @@ class Teacher:
     def sample(self, t: float) -> Array:
         """The tool's pose (7,): x y z [m] and quaternion x y z w."""
         return np.concatenate((self.truth(t).position, TOOL_ORIENTATION))
+
+    def closure(self, t: float) -> float:
+        """How far the gripper is closed, 0 to 1: it lets the board go at the hand, and takes the
+        glass.
+        """
+        script_s = self._clock.at(max(t, 0.0))[0]
+        return 1.0 - _ramp((script_s - self._opens) / GRIP_S)[0] + _ramp((script_s - self._closes) / GRIP_S)[0]
 
 
 def _ramp(u: float) -> tuple[float, float, float]:

@@ -38,9 +38,11 @@ EXAMPLE = """example:
 BEFORE_S, AFTER_S = 0.5, 3.0  # of rest
 
 
-def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0) -> Demonstration:
+def demonstrate(
+    scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0, gripper: bool = False
+) -> Demonstration:
     """One demonstration of a scene, sampled at `rate_hz`: hands as a tracker sees them, the tool as
-    the arm measures it.
+    the arm measures it, and what the gripper does, if wanted.
     """
     script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
     steps = np.arange(round(scene.duration_s * rate_hz) + 1)
@@ -51,14 +53,18 @@ def demonstrate(scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0
         np.array([left for left, _ in hands]),
         np.array([right for _, right in hands]),
         np.array([teacher.sample(t) for t in times]),
+        gripper=np.array([teacher.closure(t) for t in times]) if gripper else None,
     )
 
 
-def demonstrations(scene: Scene, *, count: int, seed: int) -> list[Demonstration]:
+def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False) -> list[Demonstration]:
     """Several demonstrations of a scene, one a minute; the first ones do not depend on how many
     there are.
     """
-    return [demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number) for number in range(1, count + 1)]
+    return [
+        demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number, gripper=gripper)
+        for number in range(1, count + 1)
+    ]
 
 
 def by_people(people: int) -> list[Demonstration]:
@@ -183,6 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
         help="by modelled people, two of each, with things moved and named: what is learned between places",
     )
     p.add_argument("--cell", default="thirdhand", help="prefix of topics and keys (default: %(default)s)")
+    p.add_argument("--gripper", action="store_true", help="tell what the gripper does, too")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
@@ -200,7 +207,11 @@ def main(arguments: list[str] | None = None) -> int:
             return _perform_all(scene, args)
         args.output.mkdir(parents=True, exist_ok=True)
         seed = scene.seed if args.seed is None else args.seed
-        made = by_people(args.count) if args.people else demonstrations(scene, count=args.count, seed=seed)
+        made = (
+            by_people(args.count)
+            if args.people
+            else demonstrations(scene, count=args.count, seed=seed, gripper=args.gripper)
+        )
         for number, taught in enumerate(made, start=1):
             path = args.output / f"demonstration-{number}.mcap"
             write_demonstration(path, taught, cell=args.cell)

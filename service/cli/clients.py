@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,12 @@ def via_points(args: argparse.Namespace) -> int:
     reply = ask(args, "via_points", request)
     for point in reply["points"]:
         tool = " ".join(f"{v:.3f}" for v in point["tool"])
-        print(f"{point['name']:<16} tool {tool}   missed by {1000 * point['missed_by_m']:.1f} mm")
+        missed = f"missed by {1000 * point['missed_by_m']:.1f} mm"
+        if point["missed_by_rad"] is not None:
+            missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
+        if point["gripper"]:
+            missed += f", gripper {point['gripper']}"
+        print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
     for warning in reply.get("warnings", ()):
@@ -45,7 +51,8 @@ def _add(args: argparse.Namespace) -> Any:
             setattr(args, name, getattr(args, name) or place)
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError("a name, and --here or --left, --right and --tool, are needed, or --file")
-    point = {"name": args.name, **{k: getattr(args, k) for k in ("left", "right", "tool", "std", "radius", "follow")}}
+    told = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
+    point = {"name": args.name, **{k: getattr(args, k) for k in told}}
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
 
 

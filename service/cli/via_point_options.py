@@ -34,6 +34,10 @@ def add_options(c: argparse.ArgumentParser) -> None:
         help="within the radius the tool moves with this hand",
     )
     c.add_argument(
+        "--orientation", nargs=4, type=float, metavar=("X", "Y", "Z", "W"), help="how the tool is turned there"
+    )
+    c.add_argument("--gripper", choices=("open", "closed"), help="what the gripper does there")
+    c.add_argument(
         "--tolerance",
         type=float,
         metavar="M",

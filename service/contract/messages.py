@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 BASE = "base"
+GRIPPER = "gripper"  # the name of its joint: position 0 is open, 1 closed
 Vector3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]  # x y z w
 

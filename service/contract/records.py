@@ -97,6 +97,12 @@ FRAME = (
     Field("setpoint_acceleration", "float64", (3,)),
     Field("tool", "float64", (3,)),  # where the commanded joints put the tool [m]
     Field("orientation", "float64", (4,)),  # of the target, quaternion x y z w
+    Field("turning", "float64", (3,)),  # its angular velocity [rad/s]
+    Field("orientation_covariance", "float64", (3, 3)),  # of small rotations [rad²]; 0 where it was not learned
+    Field("setpoint_orientation", "float64", (4,)),  # after smoothing
+    Field("setpoint_turning", "float64", (3,)),
+    Field("tool_orientation", "float64", (4,)),  # how the commanded joints turn the tool
+    Field("closure", "float64"),  # of the gripper as predicted, 0 to 1; -1: the skill has none
     Field("joints", "float64", (PER_JOINT,)),  # the command [rad]
     Field("joint_velocities", "float64", (PER_JOINT,)),
     Field("joint_accelerations", "float64", (PER_JOINT,)),
@@ -107,6 +113,7 @@ FRAME = (
     Field("mode", "uint8"),
     Field("reason", "uint8"),
     Field("flags", "uint8"),
+    Field("gripper", "uint8"),  # 0: nothing is known of it; 1: open; 2: closed
     Field("commanded", "uint8"),  # 0: the joints are not to be sent
 )
 STATE = (
@@ -135,9 +142,14 @@ STATE = (
     Field("hull", "float64", (7, 2, 3)),  # least and greatest target of the last spans of time
     Field("joints", "float64", (3, PER_JOINT)),  # position, velocity, acceleration; by joint
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
+    Field("orientation", "float64", (4,)),  # of the setpoint
+    Field("turning", "float64", (3,)),
+    Field("orientation_covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample
+    Field("closure", "float64"),
     Field("rejected", "uint32", (len(Cause),)),
     Field("mode", "uint8"),
     Field("reason", "uint8"),
+    Field("gripper", "uint8"),
     Field("operator_hold", "uint8"),
     Field("arm_ready", "uint8"),  # 1: yes; 2: on its way into its limits
     Field("skill", "uint8", (16,)),  # digest of the skill in force, which is recorded apart

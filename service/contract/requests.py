@@ -5,6 +5,7 @@ And the status.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
@@ -13,9 +14,12 @@ from service.contract.explain import ExplainedError, explained
 from service.contract.messages import Vector3
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
+NORM = 1e-3  # by which that of a quaternion may differ from 1
 TOLERANCE_M = 0.05  # a reference point nearer to a via-point gives way, unless said otherwise
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
 Point = tuple[Metre, Metre, Metre]
+Turned = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001, extra={"accepted": "-1 to 1"})]
+Orientation = tuple[Turned, Turned, Turned, Turned]  # quaternion x y z w
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)]
 
 
@@ -24,7 +28,8 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     With a `radius` it is a flat neighbourhood: the point and its twelve neighbours, one hand
     coordinate `radius` away each, whose tool position is the same, or moves with the hand named in
-    `follow`.
+    `follow`. With an `orientation`, a quaternion x y z w of norm 1, the tool is turned so there;
+    with a `gripper` that opens or closes there. Both hold for the neighbourhood too.
     """
 
     name: Name
@@ -34,6 +39,13 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     std: Annotated[float, msgspec.Meta(ge=1e-5, le=1)] = 0.0001
     radius: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = 0.0
     follow: Literal["none", "left", "right"] = "none"
+    orientation: Orientation | None = None
+    gripper: Literal["open", "closed"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.orientation is not None and abs(math.hypot(*self.orientation) - 1.0) > NORM:
+            norm = math.hypot(*self.orientation)
+            raise ValueError(f"orientation: {list(self.orientation)} has norm {norm:.4g}; 1 needed (x y z w)")
 
 
 class _Operation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="op"):
@@ -78,9 +90,10 @@ class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
-    """A via-point in force, and how far the skill misses it [m]."""
+    """A via-point in force, and how far the skill misses it [m], and its orientation [rad]."""
 
     missed_by_m: float
+    missed_by_rad: float | None = None
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):

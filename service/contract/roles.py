@@ -12,7 +12,7 @@ from service.contract import channels, ros2
 DAEMON, ROUTER = "daemon", "router"
 SERVERS = (DAEMON, ROUTER)  # others connect to them
 HANDS = ("hands/left", "hands/right")
-ARM = ("joints/state",)
+ARM = ("joints/state", "gripper/state")
 TOOL, THINGS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed

@@ -17,6 +17,7 @@ import pinocchio as pin
 from service.config import Settings
 from service.core.frame import Vector
 from service.core.inverse_kinematics import APART, NEAR, SPEED, joint_costs, joint_step, tool_speeds, tool_tasks
+from service.core.least_squares import TASKS
 from service.core.limiter import MARGIN, approach_gain
 from service.core.separation import Separation
 
@@ -24,6 +25,7 @@ from service.core.separation import Separation
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large one's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
+SOON_S = 0.02  # in which joints have to come to what turns the tool, or it turns less
 SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
@@ -56,8 +58,8 @@ class Closing(NamedTuple):
 class Kinematics(NamedTuple):
     """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
 
-    The tasks (5, J): the tool's velocity by the joints', and what turns its direction, times
-    DIRECTION_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
+    The tasks (6, J): the tool's velocity by the joints', and what turns it, in its own axes, times
+    TURN_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
     """
 
     joints: Vector
@@ -87,15 +89,20 @@ class Arm:
         self._data = self._model.createData()
         fastest, hardest = settings.tool.max_speed, settings.tool.max_acceleration
         closing = closing or Closing(CLOSING_BRAKES * hardest, min(fastest, CLOSING_SPEED), FAR_DAMPING)
-        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * fastest])
+        self._about = float(settings.tool.orientation == "full")
+        turn = settings.tool.max_turn_speed
+        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * fastest, turn, self._about])
         limits = settings.joints
         self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
         self._velocity = np.array(limits.velocity)
+        self._still = np.zeros(3)
         self._nothing, self._none = np.empty((0, len(limits.velocity))), np.empty(0)
         self._jerk = np.array(limits.jerk)
         self._gain = approach_gain(limits)
         self._posture = np.array(settings.arm.posture)
         acceleration = np.array(limits.acceleration)
+        self._at_rest = np.zeros(len(acceleration))
+        self._change, self._any_change = SOON_S * acceleration, np.full(len(acceleration), np.inf)
         self._scale = (acceleration / acceleration.max()) ** SPARING
         self._limits = (
             PLANNED_SHARE[:, None] * np.array([limits.velocity, limits.acceleration, limits.jerk]) / self._scale
@@ -107,15 +114,15 @@ class Arm:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        rotation, tasks = placement.rotation.copy(), np.empty((5, len(q)))
+        rotation, tasks = placement.rotation.copy(), np.empty((TASKS, len(q)))
         jacobian = np.ascontiguousarray(jacobian)
-        damping = tool_tasks(jacobian, rotation, tasks)
+        damping = tool_tasks(jacobian, rotation, self._about, tasks)
         return Kinematics(q, placement.translation.copy(), rotation, tasks, damping, jacobian)
 
     def costs(self, here: Kinematics) -> Vector:
         """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
 
-        (3, 3, J): by order of the derivative, then by axis. The tool's direction is kept.
+        (3, 3, J): by order of the derivative, then by axis. The tool does not turn.
         """
         out = np.empty((3, 3, len(here.joints)))
         joint_costs(here.tasks * self._scale, here.damping, self._limits, out)
@@ -133,16 +140,20 @@ class Arm:
         q: Vector,
         position: Vector,
         velocity: Vector,
-        direction: Vector,
+        orientation: Vector,
+        turning: Vector | None = None,
         *,
+        moving: Vector | None = None,
         here: Kinematics | None = None,
         apart: Separation | None = None,
     ) -> Solution:
         """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
         `velocity` (3,) [m/s].
 
-        The tool's +z turns to `direction` (3,), at any angle about it. Position goes before
-        direction, both before the posture. `here` is the arm at q, where that is known; `apart` has
+        The tool turns to `orientation` (4,), which turns at `turning` (3,) [rad/s]: all of it or,
+        as the settings say, its +z only, at any angle about it. Position goes before orientation,
+        both before the posture; where joints that are `moving` (J,) [rad/s] cannot have both at
+        once, it turns later. `here` is the arm at q, where that is known; `apart` has
         looked at it and says what goes before all. Never raises nor returns NaN for finite
         arguments.
         """
@@ -156,12 +167,15 @@ class Arm:
             here.damping,
             position,
             velocity,
-            direction,
+            orientation,
+            self._still if turning is None else turning,
             self._posture,
             self._within,
             self._gain,
             self._scale,
+            self._at_rest if moving is None else moving,
             self._velocity,
+            self._any_change if moving is None else self._change,
             self._closing,
             self._nothing if apart is None else apart.rows,
             self._none if apart is None else apart.plan,

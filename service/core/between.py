@@ -117,6 +117,16 @@ class Placed:
             _inputs(hand, velocity, self.layout.hands, self.task.inputs, row, away)
         return out, off
 
+    def moving_inputs(self, hands: Vector, velocities: Vector, accelerations: Vector) -> tuple[Vector, Vector]:
+        """The inputs (F,) of hands (6,) that move so, and the inputs' velocity (F,) [1/s], by
+        differences along their motion.
+        """
+        found, off = np.empty((3, self.task.width)), np.empty(2)
+        for row, step in zip(found, (-STEP_S, 0.0, STEP_S), strict=True):
+            at, moving = hands + step * velocities, velocities + step * accelerations
+            _inputs(at, moving, self.layout.hands, self.task.inputs, row, off)
+        return found[1], (found[2] - found[0]) / (2.0 * STEP_S)
+
     def mean(self, hands: Vector, velocities: Vector) -> Vector:
         """The tool (T, 3) [m] for hands and velocities (T, 6)."""
         out = np.empty((len(hands), 3))

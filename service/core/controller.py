@@ -6,20 +6,15 @@ the skill in force.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import TypeAlias
 
-import msgspec
 import numpy as np
 
 from service.config import Settings
-from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.arm import Arm, Kinematics
 from service.core.frame import (
-    Event,
     Frame,
     Lap,
     Record,
@@ -32,19 +27,18 @@ from service.core.frame import (
     frame_layout,
     frozen,
     no_lap,
-    order,
     state_layout,
 )
-from service.core.intake import Intake, rest_ticks
+from service.core.intake import Intake
 from service.core.inverse_kinematics import measured_error, slow_down
 from service.core.limiter import Limited, Limiter
-from service.core.rotation import rotation
+from service.core.orientation_setpoint import OrientationSetpoint
+from service.core.pose import NO_GRIPPER, decided
 from service.core.separation import Separation
 from service.core.setpoint import WRONG, SetpointGenerator
 from service.core.skill import Prediction, Skill
 from service.core.workspace import Target, clamp
 
-REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
 READY, RETURNING = 1, 2  # of an arm: within its limits, on its way into them
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
 NEAR_SPEED = 0.95  # of the tool's greatest; what the joints turn in a tick changes it by less than the rest
@@ -66,6 +60,7 @@ def start_state(settings: Settings, skill: Skill) -> Record:
     Intake(settings).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
+    state["orientation"], state["closure"] = skill.orientation, NO_GRIPPER
     state["skill"] = np.frombuffer(skill.digest, np.uint8)
     return state
 
@@ -85,14 +80,13 @@ class Controller:
         self._layout = frame_layout(len(settings.joints.names))
         self.intake = self._intake = Intake(settings)
         self._setpoint = SetpointGenerator(settings)
+        self._turn = OrientationSetpoint(settings)
         self._arm = Arm(settings, urdf)
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._jerk = np.array(settings.joints.jerk)
         self._still = np.zeros(len(self._jerk))
         self._apart = Separation(settings, urdf)
         self._apart.expect(skill.via_points)
-        self._direction = rotation(tuple(skill.orientation))[:, 2]
-        self._orientation = np.ascontiguousarray(skill.orientation)
         self._nothing = np.zeros((3, 3))
         self._here: Kinematics | None = None  # of the joints asked about last
         self.measured = (0.0, 0.0)  # how far the arm is off [rad], the tool's speed [m/s]; at the fault, in one
@@ -130,11 +124,16 @@ class Controller:
         joints, moving = state["joints"], self._is_moving()
         here = self._arm_at(joints[0])
         self._apart.look(state, here.joints, here.position, here.jacobian)
-        if state["mode"] == FOLLOW and target is not None:
+        if state["mode"] == FOLLOW and prediction is not None and target is not None:
             met = self._lead(target, here)
+            self._turn.step(state, *prediction.turn[:2])
+            state["gripper"] = decided(int(state["gripper"]), float(state["closure"]))
             lap("setpoint")
-            setpoint = state["setpoint"]
-            wanted = self._arm.step(joints[0], setpoint[0], setpoint[1], self._direction, here=here, apart=self._apart)
+            position, velocity = state["setpoint"][:2]
+            orientation, turning = state["orientation"], state["turning"]
+            wanted = self._arm.step(
+                joints[0], position, velocity, orientation, turning, moving=joints[1], here=here, apart=self._apart
+            )
             lap("arm")
             limited, stopped = self._move(wanted.velocity)
             flags |= CLAMPED * target.clamped
@@ -147,7 +146,7 @@ class Controller:
                 state["joints"] = self._brake()[:3]
             else:
                 self._move(inwards)
-            self._setpoint.begin(state, self._at_rest())
+            self._begin_setpoints()
         lap("limiter")
         return self._frame(prediction, target, flags, moving=moving)
 
@@ -177,25 +176,25 @@ class Controller:
 
     def _adopt(self, skill: Skill) -> None:
         self._skill = skill
-        self._direction = rotation(tuple(skill.orientation))[:, 2]
-        self._orientation = np.ascontiguousarray(skill.orientation)
         self._state["skill"] = np.frombuffer(skill.digest, np.uint8)
-        self._state["covariance"] = 0.0
+        self._state["covariance"], self._state["orientation_covariance"], self._state["closure"] = 0.0, 0.0, NO_GRIPPER
         self._apart.expect(skill.via_points)
 
     def _predict(self) -> Prediction | None:
         """The prediction, if both hands are known.
 
-        Its covariance is predicted anew only when a sample of a hand has come.
+        Its covariances and the gripper are predicted anew only when a sample of a hand has come.
         """
         state = self._state
         if not self._intake.are_fresh(state):
             return None
         hands, known = state["hands"], state["covariance"]
         is_new = int(state["tick"]) in state["hand_ticks"].tolist() or known[0, 0] == 0.0
-        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], covariance=None if is_new else known)
+        before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
+        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], before=before)
         if is_new:
-            state["covariance"] = prediction.covariance
+            state["covariance"], state["orientation_covariance"] = prediction.covariance, prediction.turn.covariance
+            state["closure"] = prediction.closure
         return prediction
 
     def _decide(self, prediction: Prediction | None) -> None:
@@ -217,7 +216,7 @@ class Controller:
         if arm.source == "assumed":
             if not state["arm_ready"]:
                 state["arm_ready"] = READY
-                self._setpoint.begin(state, self._at_rest())
+                self._begin_setpoints()
             return None
         heard = self._intake.is_arm_heard(state)
         if not state["arm_ready"]:
@@ -227,7 +226,7 @@ class Controller:
                 state["slow_tick"] = state["tick"]
                 state["joints"] = 0.0
                 state["joints"][0] = state["measured"]
-                self._setpoint.begin(state, self._at_rest())
+                self._begin_setpoints()
             return None
         if not heard:
             if state["mode"] == FOLLOW or self._is_moving():
@@ -345,24 +344,29 @@ class Controller:
         """Whether the commanded joints have not come to rest."""
         return bool(self._state["joints"][1:].any())
 
-    def _at_rest(self) -> Vector:
-        """The setpoint (3, 3) that goes with the commanded joints."""
+    def _begin_setpoints(self) -> None:
+        """Puts the setpoints where the commanded joints have the tool."""
         joints, velocities = self._state["joints"][:2]
         here = self._arm_at(joints)
-        return np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)])
+        self._setpoint.begin(self._state, np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)]))
+        self._turn.begin(self._state, here.rotation, here.jacobian[3:] @ velocities)
 
     def _frame(self, prediction: Prediction | None, target: Target | None, flags: int, *, moving: bool) -> Frame:
         state, frame = self._state, blank(self._layout)
+        here, turn = self._arm_at(state["joints"][0]), prediction.turn if prediction else None
         fill(
             as_array(frame),
             self._memory,
-            self._arm_at(state["joints"][0]).position,
-            self._orientation,
+            here.position,
+            here.rotation,
             target.position if target else state["setpoint"][0],
             target.velocity if target else self._nothing[0],
             target.acceleration if target else self._nothing[0],
             prediction.covariance if prediction else self._nothing,
             prediction.deviation if prediction else 0.0,
+            turn.orientation if turn else state["orientation"],
+            turn.velocity if turn else self._nothing[0],
+            turn.covariance if turn else self._nothing,
             self._apart.told,
         )
         frame["flags"] = flags
@@ -379,22 +383,3 @@ def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap:
         frame = controller.step(tick, lap)
         for tap in taps:
             tap(tick, frame)
-
-
-def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
-    """Lets a controller that is thrown away follow two hands for a moment, and stop.
-
-    What its stages compile, or load compiled from disk, is then there: the first hand that a loop
-    sees would otherwise stop it for a fifth of a second, the first ever for many seconds.
-    """
-    arm = msgspec.structs.replace(settings.arm, source="state")
-    controller = Controller(msgspec.structs.replace(settings, arm=arm), replace(skill, threshold=math.inf), urdf=urdf)
-    names = settings.joints.names
-    count = rest_ticks(settings) + REHEARSED_TICKS
-    for index in range(count):
-        stamp_ns = round(1e9 * (1 + index * settings.period_s))
-        sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
-        measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
-        controller.step(Tick(index, (*hands, measured)))
-    controller.step(Tick(count, (order("hold"),)))

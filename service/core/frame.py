@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kmp.compiled import compiled
 from service.contract import cdr, records
+from service.core.rotation import quaternion_of
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
@@ -142,12 +143,15 @@ def fill(
     frames: Records,
     states: Records,
     tool: Vector,
-    orientation: Vector,
+    rotation: Vector,
     target: Vector,
     velocity: Vector,
     acceleration: Vector,
     covariance: Vector,
     deviation: float,
+    orientation: Vector,
+    turning: Vector,
+    orientation_covariance: Vector,
     told: Vector,
 ) -> None:
     """Into the memory of a blank frame what the state's memory holds, and what was predicted."""
@@ -166,7 +170,12 @@ def fill(
     frame.setpoint_acceleration[:] = state.setpoint[2]
     frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = target, velocity, acceleration
     frame.covariance[:], frame.deviation = covariance, deviation
-    frame.orientation[:], frame.tool[:] = orientation, tool
+    frame.orientation[:], frame.turning[:] = orientation, turning
+    frame.orientation_covariance[:] = orientation_covariance
+    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
+    frame.tool[:] = tool
+    quaternion_of(rotation, frame.tool_orientation)
+    frame.closure, frame.gripper = state.closure, state.gripper
     frame.joints[:], frame.joint_velocities[:] = state.joints[0], state.joints[1]
     frame.joint_accelerations[:] = state.joints[2]
     frame.rejected[:] = state.rejected

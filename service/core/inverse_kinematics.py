@@ -14,14 +14,14 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 from service.core.least_squares import TASKS, factorise, keep_under, least_squares, substitute
+from service.core.rotation import axis_of, quaternion_of, swing, turn_between
 
 # Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.
 NEAR_LIMIT = 0.1  # [rad]
 
 POSITION_GAIN = 50.0  # [1/s] of a small error's decay
-DIRECTION_GAIN = 10.0  # [1/s]
-DIRECTION_SPEED = 0.5  # [rad/s] at most
-DIRECTION_LEVER = 0.01  # [m] 1 rad/s of direction counts as this many m/s of the tool: position goes first
+TURN_GAIN = 10.0  # [1/s]
+TURN_LEVER = 0.03  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
@@ -30,6 +30,7 @@ SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 t
 FAR_SPEED = 0.15  # [m/s]
 GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
+ROUNDING = 1e-12  # of a speed
 STEPS = 1e9  # [s/rad] of the result: rounded so that a replay on another kind of CPU agrees
 SPEED, NEAR, APART = 1, 2, 4  # what a step says: a limit of speed met; of position near; of separation met
 
@@ -125,20 +126,21 @@ def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> N
 
 
 @compiled
-def tool_tasks(jacobian: Vector, rotation: Vector, tasks: Vector) -> float:
-    """The tasks (5, J) of a tool's Jacobian (6, J) and rotation (3, 3); their damping [m²]: small,
-    and growing smoothly where the tool's position becomes singular.
+def tool_tasks(jacobian: Vector, rotation: Vector, about: float, tasks: Vector) -> float:
+    """The tasks (6, J) of a tool's Jacobian (6, J) and rotation (3, 3), the last, which turns it
+    about its +z, times `about`; their damping [m²]: small, and growing smoothly where the tool's
+    position becomes singular.
     """
     joints = jacobian.shape[1]
     square = np.empty((3, 3))
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
-        for i in range(2):
+        for i in range(3):
             turn = 0.0
             for k in range(3):
                 turn += rotation[k, i] * jacobian[3 + k, joint]
-            tasks[3 + i, joint] = DIRECTION_LEVER * turn
+            tasks[3 + i, joint] = TURN_LEVER * (turn if i < 2 else about * turn)
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -163,23 +165,27 @@ def joint_step(
     damping: float,
     position: Vector,
     velocity: Vector,
-    direction: Vector,
+    orientation: Vector,
+    turning: Vector,
     posture: Vector,
     within: Vector,
     gain: Vector,
     scale: Vector,
+    moving: Vector,
     fastest: Vector,
+    change: Vector,
     closing: Vector,
     rows: Vector,
     limits: Vector,
     count: int,
     out: Vector,
 ) -> int:
-    """`Arm.step` into out (J,) [rad/s], with the first `count` of rows (K, J) times out at most
-    limits (K,) [m/s]; what is to be said of it.
+    """`Arm.step` into out (J,) [rad/s], for joints that move so (J,) and can soon change that by
+    change (J,) [rad/s], with the first `count` of rows (K, J) times out at most limits (K,) [m/s];
+    what is to be said of it.
     """
     joints = len(q)
-    period, braking, closing_speed, far_damping, most = closing
+    period, braking, closing_speed, far_damping, most, fastest_turn, about = closing
     wanted, error, linear, turn = np.empty(TASKS), np.empty(3), np.empty(3), np.empty(3)
     distance = 0.0
     for i in range(3):
@@ -197,13 +203,11 @@ def joint_step(
     for i in range(3):  # the error decays as it will be, not as it is
         error[i] *= rate / (1.0 + POSITION_GAIN * period)
     _add_closing(linear, error, most)
-    _turn(rotation, direction, turn)
+    _turn(rotation, orientation, turning, fastest_turn, about, turn)
     for i in range(3):
-        wanted[i] = linear[i]
-    for i in range(2):
-        wanted[3 + i] = 0.0
+        wanted[i], wanted[3 + i] = linear[i], 0.0
         for k in range(3):
-            wanted[3 + i] += DIRECTION_LEVER * rotation[k, i] * turn[k]
+            wanted[3 + i] += TURN_LEVER * (1.0 if i < 2 else about) * rotation[k, i] * turn[k]
     said, scaled, home, bounds = 0, np.empty((TASKS, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = q[j] - within[0, j], within[1, j] - q[j]
@@ -214,43 +218,95 @@ def joint_step(
         home[j] = min(max(POSTURE_GAIN * (posture[j] - q[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
         for i in range(TASKS):
             scaled[i, j] = tasks[i, j] * scale[j]
-    least_squares(scaled, wanted, home, damping, bounds, out)
     scaled_rows = np.empty((count, joints))
     for k in range(count):
         for j in range(joints):
             scaled_rows[k, j] = rows[k, j] * scale[j]
+    least_squares(scaled, wanted, home, damping, bounds, out)
     if keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, out):
         said |= APART
-    excess = 0.0
-    for j in range(joints):
-        out[j] *= scale[j]
-        excess = max(excess, abs(out[j]) / fastest[j])
-        if not math.isfinite(out[j]):
-            excess = math.nan
-            break
+    if not _can_have(out, moving, scale, fastest, change):  # it turns as far as costs its position nothing
+        free = np.empty(joints)
+        scaled[3:], wanted[3:] = 0.0, 0.0
+        for j in range(joints):
+            home[j] = moving[j] / scale[j]
+        least_squares(scaled, wanted, home, damping, bounds, free)
+        keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, free)
+        _turn_less(out, free, moving, scale, fastest, change)
+    excess = _excess(out, scale, fastest)
     for j in range(joints):
         if math.isnan(excess):
             out[j] = 0.0
-        elif excess > 1.0:
-            out[j] /= excess
+        else:
+            out[j] *= scale[j] / max(excess, 1.0)
         out[j] = np.rint(out[j] * STEPS) / STEPS
-    return said | SPEED if excess > 1.0 else said
+    return said | SPEED if excess > 1.0 + ROUNDING else said
 
 
 @compiled
-def _turn(rotation: Vector, direction: Vector, out: Vector) -> None:
-    """Into out (3,) [rad/s] the angular velocity that turns the tool's +z toward a direction; 0 if
-    that has no length.
+def _excess(out: Vector, scale: Vector, fastest: Vector) -> float:
+    """How many times its greatest speed the fastest joint needs; NaN where one is not finite."""
+    excess = 0.0
+    for j in range(len(out)):
+        if not math.isfinite(out[j]):
+            return math.nan
+        excess = max(excess, abs(out[j] * scale[j]) / fastest[j])
+    return excess
+
+
+@compiled
+def _can_have(out: Vector, moving: Vector, scale: Vector, fastest: Vector, change: Vector) -> bool:
+    """Whether joints that move so (J,) [rad/s] can soon have the velocities of a solution (J,)."""
+    for j in range(len(out)):
+        wanted = out[j] * scale[j]
+        if abs(wanted) > fastest[j] or abs(wanted - moving[j]) > change[j]:
+            return False
+    return True
+
+
+@compiled
+def _turn_less(out: Vector, free: Vector, moving: Vector, scale: Vector, fastest: Vector, change: Vector) -> None:
+    """Brings a solution (J,) as near to that of a tool that is free to turn as it has to be for
+    joints that can have it.
     """
-    out[:] = 0.0
-    largest = max(abs(direction[0]), abs(direction[1]), abs(direction[2]))
-    if not 0.0 < largest < math.inf:
-        return
-    ax, ay, az = rotation[0, 2], rotation[1, 2], rotation[2, 2]
-    dx, dy, dz = direction[0] / largest, direction[1] / largest, direction[2] / largest
-    x, y, z = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
-    sine, cosine = math.sqrt(x * x + y * y + z * z), ax * dx + ay * dy + az * dz
-    if sine < 1e-9 * math.sqrt(dx * dx + dy * dy + dz * dz):
-        return  # there already, or exactly opposite, where no way is nearer
-    speed = min(DIRECTION_GAIN * math.atan2(sine, cosine), DIRECTION_SPEED) / sine
-    out[0], out[1], out[2] = speed * x, speed * y, speed * z
+    share = 1.0
+    for j in range(len(out)):
+        there, more = free[j] * scale[j], (out[j] - free[j]) * scale[j]
+        low = min(max(-fastest[j], moving[j] - change[j]), there)
+        high = max(min(fastest[j], moving[j] + change[j]), there)
+        if there + more > high:
+            share = min(share, (high - there) / more)
+        elif there + more < low:
+            share = min(share, (low - there) / more)
+    for j in range(len(out)):
+        out[j] = free[j] + share * (out[j] - free[j])
+
+
+@compiled
+def _turn(
+    rotation: Vector,
+    orientation: Vector,
+    turning: Vector,
+    fastest: float,
+    about: float,
+    out: Vector,
+) -> None:
+    """Into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,) that
+    turns itself (3,) [rad/s]: all of it, or, with `about` 0, its +z the shortest way.
+    """
+    here, axis = np.empty(4), np.empty(3)
+    if about > 0.0:
+        quaternion_of(rotation, here)
+        turn_between(here, orientation, out)
+    else:
+        axis_of(orientation, axis)
+        swing(rotation[:, 2].copy(), axis, out)
+    square = 0.0
+    for i in range(3):
+        out[i] = TURN_GAIN * out[i] + turning[i]
+        square += out[i] * out[i]
+    if not square < math.inf:
+        out[:] = 0.0
+    elif square > fastest * fastest:
+        for i in range(3):
+            out[i] *= fastest / math.sqrt(square)

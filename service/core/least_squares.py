@@ -11,7 +11,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 
-TASKS = 5  # three of the tool's velocity, two of its direction
+TASKS = 6  # three of the tool's velocity, three that turn it
 LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
 ROUNDS = 40  # inequalities that may be met or left in one step
@@ -103,7 +103,7 @@ def least_squares(
 def _solve(
     tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
 ) -> None:
-    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of five
+    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of six
     equations.
     """
     joints = len(posture)

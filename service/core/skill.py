@@ -8,7 +8,7 @@ import hashlib
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,9 +19,14 @@ from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.between import Moving, Placed
 from service.core.frame import Vector
 from service.core.places import Places, Task
+from service.core.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.taught import bent
 
 MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded
+
+Known: TypeAlias = tuple[Vector, Vector, float]
+"""What was predicted at the newest sample of a hand: covariances of position (3, 3) [m²] and
+orientation (3, 3) [rad²], and the closure of the gripper."""
 
 
 class LearnedBetween(NamedTuple):
@@ -44,6 +49,8 @@ class Prediction(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
     deviation: float  # [m] what is compared with the skill's threshold, see `Skill.deviations`
+    turn: Turn
+    closure: float  # of the gripper, 0 (open) to 1 (closed); NO_GRIPPER where the skill has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,25 +63,31 @@ class Skill:
 
     name: str
     primitive: KMP
-    orientation: Vector  # (4,) of the tool, quaternion x y z w
+    orientation: Vector  # (4,) of the tool where none was learned, quaternion x y z w
     workspace: Vector  # (2, 3) lower and upper corner for targets [m]
     threshold: float  # [m] a deviation above it is far from the demonstrations
     learned_from: str  # hash of the demonstrations
     components: int = 0  # of the mixture that it was learned with, 0 for none
     via_points: tuple[ViaPoint, ...] = ()
+    turn: LearnedOrientation | None = None
+    gripper: LearnedGripper | None = None
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
     between: LearnedBetween | None = None
     figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
     file: bytes = field(default=b"", repr=False)  # all of the above, as it is stored and recorded
 
     def predict(
-        self, hands: Vector, velocities: Vector, accelerations: Vector, *, covariance: Vector | None = None
+        self,
+        hands: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        *,
+        before: Known | None = None,
     ) -> Prediction:
         """The prediction for hands (2, 3) [m] that move so.
 
-        Equation (8) of Huang et al. 2019, its derivatives along the motion, its covariance. The
-        covariance takes as long as all else; one that was predicted just before may be given (3, 3)
-        [m²].
+        Equation (8) of Huang et al. 2019, its derivatives along the motion, its covariance.
+        Covariances take as long as all else; what was predicted just `before` may be given.
 
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
@@ -82,16 +95,43 @@ class Skill:
         moving = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
         found: MotionPrediction | Moving
         if self.placed is None:
-            found = self.primitive.predict_motion(*moving, covariance=covariance is None)
+            found = self.primitive.predict_motion(*moving, covariance=before is None)
         else:
-            found = self.placed.moving(*moving, covariance=covariance is None)
-        given = covariance if found.covariance is None else found.covariance
+            found = self.placed.moving(*moving, covariance=before is None)
+        given = before[0] if before is not None else found.covariance
         assert given is not None
         motion, rounded = np.empty((3, 3)), np.empty((3, 3))
         deviation = _round(found.mean, found.velocity, found.acceleration, given, motion, rounded)
         if isinstance(found, Moving):
             deviation = round(found.off * MOTION_STEPS) / MOTION_STEPS
-        return Prediction(motion[0], motion[1], motion[2], rounded, deviation)
+        turn, closure = self._beside(*moving, before)
+        return Prediction(motion[0], motion[1], motion[2], rounded, deviation, turn, closure)
+
+    def _beside(
+        self, hands: Vector, velocities: Vector, accelerations: Vector, before: Known | None
+    ) -> tuple[Turn, float]:
+        """The orientation, learned or constant, and the closure of the gripper."""
+        if self.turn is None and self.gripper is None:
+            return self.constant_turn, NO_GRIPPER
+        if self.placed is None:
+            at, moving = hands, velocities
+        else:
+            at, moving = self.placed.moving_inputs(hands, velocities, accelerations)
+        turn = self.constant_turn
+        if self.turn is not None:
+            turn = self.turn.predict(at, moving, covariance=None if before is None else before[1])
+        if self.gripper is None or before is not None:
+            return turn, NO_GRIPPER if before is None else before[2]
+        return turn, self.gripper.predict(at)
+
+    def inputs(self, hands: Vector) -> Vector:
+        """The primitives' inputs (T, I) of hands (T, 6) [m] at rest."""
+        return hands if self.placed is None else self.placed.inputs(hands, np.zeros_like(hands))[0]
+
+    @cached_property
+    def constant_turn(self) -> Turn:
+        """What is predicted where no orientation was learned."""
+        return Turn(np.ascontiguousarray(self.orientation, np.float64), np.zeros(3), np.zeros((3, 3)))
 
     def mean(self, hands: Vector, velocities: Vector | None = None) -> Vector:
         """The tool (T, 3) [m] for hands (T, 6) [m] at rest, or that move so [m/s]."""

@@ -17,12 +17,13 @@ from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
+CLOSURE_MARGIN = 0.05  # by which a gripper may be told to be more than open or closed
 
 
 class Demonstration(NamedTuple):
     """Stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, each x y z [m] and
-    quaternion x y z w, in one frame; and where the named places of its task were, in the order in
-    which the tool comes to them.
+    quaternion x y z w, in one frame; where the named places of its task were, in the order in which
+    the tool comes to them; and how far the gripper is closed (T,), 0 to 1, where that is told.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -31,6 +32,7 @@ class Demonstration(NamedTuple):
     tool: Vector
     frame: str = BASE
     places: tuple[ViaPoint, ...] = ()
+    gripper: Vector | None = None
 
     @property
     def hands(self) -> Vector:
@@ -45,19 +47,50 @@ class Demonstration(NamedTuple):
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
         stamps_ns, left, right, tool = self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step]
-        return self._replace(stamps_ns=stamps_ns, left=left, right=right, tool=tool)
+        gripper = None if self.gripper is None else self.gripper[::step]
+        return self._replace(stamps_ns=stamps_ns, left=left, right=right, tool=tool, gripper=gripper)
 
 
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     """The hash by which a skill knows what it was learned from."""
-    parts = (part.tobytes() for one in demonstrations for part in (one.hands, one.tool))
+    parts = (
+        part.tobytes() for one in demonstrations for part in (one.hands, one.tool, one.gripper) if part is not None
+    )
     return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
 
 
-def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vector, Vector]:
-    """Hands and tool, shifted against each other where that makes their speeds agree better.
+def in_phase(demonstration: Demonstration) -> tuple[Vector, Vector]:
+    """Hands (T, 6) and tool (T, 7), shifted against each other where that makes their speeds agree
+    better.
 
     With a tool that lags, one position of the hands would go with two of the tool.
+    """
+    late, hands = lag(demonstration), demonstration.hands
+    return hands[max(0, -late) : len(hands) - max(0, late)], _shifted(demonstration.tool, late)
+
+
+def closure_in_phase(demonstration: Demonstration) -> Vector | None:
+    """How far the gripper is closed (T,), shifted as the tool is."""
+    closure = demonstration.gripper
+    if closure is None:
+        return None
+    if closure.shape != demonstration.stamps_ns.shape or not np.isfinite(closure).all():
+        raise SkillError(f"a demonstration's gripper has shape {closure.shape}: one finite number a sample needed")
+    if closure.min() < -CLOSURE_MARGIN or closure.max() > 1.0 + CLOSURE_MARGIN:
+        raise SkillError(
+            f"a demonstration's gripper goes from {closure.min():g} to {closure.max():g}: 0 (open) to 1 (closed) needed"
+        )
+    return _shifted(closure, lag(demonstration))
+
+
+def _shifted(tool: Vector, late: int) -> Vector:
+    return tool[max(0, late) : len(tool) + min(0, late)]
+
+
+def lag(demonstration: Demonstration, longest_s: float = 1.0) -> int:
+    """By how many samples the tool lags behind the hands; less than 0: the hands behind it.
+
+    Raises SkillError for a demonstration that nothing can be learned from.
     """
     if len({len(part) for part in demonstration[:4]}) > 1:
         counts = ", ".join(
@@ -85,6 +118,4 @@ def in_phase(demonstration: Demonstration, longest_s: float = 1.0) -> tuple[Vect
     inner = a[reach : len(a) - reach]
     score = [float(inner @ b[reach + shift : len(b) - reach + shift]) for shift in range(-reach, reach + 1)]
     best = int(np.argmax(score)) - reach
-    if best == 0 or score[best + reach] < 1.02 * score[reach]:
-        return hands, tool
-    return (hands[: len(hands) - best], tool[best:]) if best > 0 else (hands[-best:], tool[: len(tool) + best])
+    return 0 if score[best + reach] < 1.02 * score[reach] else best

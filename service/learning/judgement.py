@@ -63,6 +63,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     one_beside: float  # one of them
     ambiguous: float  # of the samples contradict another: same hands, other tool
     beyond_reach: float  # of the tool's way
+    orientation_error_deg: float | None = None  # root mean square, held out; None: none was learned or held out
+    gripper_right: float | None = None  # [%] of held-out samples
     warnings: tuple[str, ...] = ()
     unsafe: tuple[str, ...] = ()  # reasons not to use it
 
@@ -227,6 +229,16 @@ def table(found: Figures) -> str:
         f"30 cm beside, {found.one_beside:.0f} % of one hand 30 cm beside",
         f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
         "out of reach",
+        *(
+            [f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms"]
+            if found.orientation_error_deg is not None
+            else []
+        ),
+        *(
+            [f"the gripper is right in {found.gripper_right:.0f} % of the samples"]
+            if found.gripper_right is not None
+            else []
+        ),
         *(f"warning: {text}" for text in found.warnings),
         *(f"unsafe: {text}" for text in found.unsafe),
     ]

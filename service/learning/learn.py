@@ -12,18 +12,18 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
 from service.core.frame import Vector
 from service.core.places import Task
 from service.core.skill import LearnedBetween, Skill
-from service.learning.between import learned, task_of
+from service.learning.between import Told, learned, task_of
 from service.learning.choice import Choice
-from service.learning.demonstration import Demonstration, fingerprint, in_phase
+from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
 from service.learning.gate import deviations, gate
 from service.learning.judgement import Figures, HeldOut, figures, repeated
+from service.learning.pose import learned_pose
 from service.learning.skill_file import SkillError, with_file
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
@@ -113,16 +113,34 @@ def learn(
                 np.concatenate([one.deviations for one in held_out]),
                 calibration=_calibration(held_out) if components else 1.0,
             )
+        posed = learned_pose(
+            _inputs(by_places, demonstrations, paths),
+            [hands for hands, _ in paths],
+            [pairs[i][1][:, 3:] for i in kept],
+            [closure_in_phase(one) for one in demonstrations],
+            names,
+            points=points,
+            between_places=by_places is not None,
+        )
     except ValueError as error:
         if isinstance(error, SkillError):
             raise
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
     judged = figures(demonstrations, paths, names, held_out, found, reach=reach or Reach(), remarks=remarks)
+    judged = msgspec.structs.replace(
+        judged,
+        orientation_error_deg=posed.turn_error_deg,
+        gripper_right=posed.gripper_right,
+        warnings=(*judged.warnings, *posed.warnings),
+        unsafe=(*judged.unsafe, *posed.unsafe),
+    )
     tools = np.concatenate([pairs[i][1] for i in kept])
     skill = Skill(
         name=name,
         primitive=primitive,
-        orientation=mean_orientation(tools[:, 3:]),
+        orientation=posed.orientation,
+        turn=posed.turn,
+        gripper=posed.gripper,
         workspace=np.stack([tools[:, :3].min(axis=0) - MARGIN_M, tools[:, :3].max(axis=0) + MARGIN_M]),
         threshold=found.threshold,
         learned_from=fingerprint(demonstrations),
@@ -133,6 +151,17 @@ def learn(
     skill = with_file(skill)
     show(Evidence(skill, judged, paths, held_out))
     return skill
+
+
+def _inputs(
+    by_places: LearnedBetween | None,
+    demonstrations: Sequence[Demonstration],
+    paths: Sequence[tuple[Vector, Vector]],
+) -> list[Vector]:
+    """The inputs (T, I) of the position's primitive along demonstrations in phase."""
+    if by_places is None:
+        return [hands for hands, _ in paths]
+    return [Told.of(by_places.task, one, *path).inputs for one, path in zip(demonstrations, paths, strict=True)]
 
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
@@ -187,13 +216,3 @@ def _calibration(held_out: Sequence[HeldOut]) -> float:
     errors = np.concatenate([one.errors for one in held_out])
     predicted = np.concatenate([one.deviations for one in held_out])
     return max(1.0, float(np.sqrt((predicted**2).mean() / max(float((errors**2).mean()), 1e-12))))
-
-
-def mean_orientation(quaternions: ArrayLike) -> Vector:
-    """The mean (4,) of quaternions x y z w (M, 4), whatever their signs: the leading eigenvector of
-    their scatter (Markley et al. 2007).
-    """
-    q = np.asarray(quaternions, dtype=np.float64)
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    mean = np.linalg.eigh(q.T @ q)[1][:, -1]
-    return np.asarray(mean * (1 if mean[3] >= 0 else -1))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,13 +24,16 @@ from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import Name, ViaPoint
 from service.core.places import MOST_CORNERS, Places, Task
+from service.core.pose import LearnedGripper, LearnedOrientation
 from service.core.skill import LearnedBetween, Skill
 
-# The second holds what was found in learning, the third is of a skill between places; a skill of
-# the first stays one, to the byte.
-PLAIN, JUDGED, BETWEEN = FORMATS = (1, 2, 3)
+# The second holds what was found in learning, the third is of a skill between places, the fourth
+# has orientation or gripper, and may be one between places; a skill of the first stays one, to the
+# byte.
+PLAIN, JUDGED, BETWEEN, POSED = FORMATS = (1, 2, 3, 4)
 INPUTS, OUTPUTS = 6, 3
 MOST_PLACES = 100
+TURN, GRIPPER = "turn.", "gripper."  # before the names of their primitives' arrays
 LARGEST_FILE = 100_000_000  # bytes, unpacked
 MOST_POINTS = 2500  # of the reference: a tick takes as long
 FARTHEST_M = 10.0  # of anything from the base plate
@@ -60,6 +63,9 @@ RANGES_BETWEEN = {  # of those that a skill between places has besides
     "seen": (-0.001, 1.001, ""),
     "errors": (-FARTHEST_M, FARTHEST_M, "m"),
 }
+PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
+    f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
+}
 KNOWN = {
     *RANGES,
     "format",
@@ -72,6 +78,8 @@ KNOWN = {
     "checksum",
     "names",
     *RANGES_BETWEEN,
+    *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
+    TURN + "auxiliary",
 }
 UNITS = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
 UNITS_BETWEEN = (
@@ -79,7 +87,8 @@ UNITS_BETWEEN = (
     "the first, deviation x y z [m]; frame base"
 )
 MARGIN_M = 0.25  # by which a skill may leave its box where it was learned: targets are held in it
-STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'
+STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'; also of its turn [rad/m], half the angle
+FARTHEST_TURN = 2.0 * np.pi  # [rad, half the angle] of an orientation from the auxiliary one; also of a closure
 
 
 class SkillError(ExplainedError, ValueError):
@@ -90,7 +99,9 @@ def with_file(skill: Skill) -> Skill:
     """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
-        format=np.array(BETWEEN if skill.between else JUDGED if skill.figures else PLAIN),
+        format=np.array(
+            POSED if skill.turn or skill.gripper else BETWEEN if skill.between else JUDGED if skill.figures else PLAIN
+        ),
         units=np.array(UNITS_BETWEEN if skill.between else UNITS),
         name=np.array(skill.name),
         orientation=skill.orientation,
@@ -115,6 +126,11 @@ def with_file(skill: Skill) -> Skill:
             "seen": seen,
             "errors": errors,
         }
+    if skill.turn:
+        arrays |= {TURN + name: array for name, array in skill.turn.primitive.to_arrays().items()}
+        arrays[TURN + "auxiliary"] = skill.turn.auxiliary
+    if skill.gripper:
+        arrays |= {GRIPPER + name: array for name, array in skill.gripper.primitive.to_arrays().items()}
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue())
 
@@ -138,7 +154,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             arrays = dict(archive)
         if (kind := arrays["format"].item()) not in FORMATS:
             raise SkillError(
-                f"{origin}: skill of format {kind}, {PLAIN} to {BETWEEN} needed: written by a later version?"
+                f"{origin}: skill of format {kind}, {PLAIN} to {POSED} needed: written by a later version?"
             )
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
@@ -152,8 +168,10 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             components=int(arrays["components"]),
             via_points=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
             tolerance=float(arrays["tolerance"]),
-            between=_between(arrays) if kind == BETWEEN else None,
-            figures=str(arrays["figures"]) if kind != PLAIN else "",
+            turn=_turn(_part(arrays, TURN)),
+            gripper=_gripper(_part(arrays, GRIPPER)),
+            between=_between(arrays) if _is_between(arrays) else None,
+            figures=str(arrays["figures"]) if kind in {JUDGED, BETWEEN} or "figures" in arrays else "",
             file=bytes(data),
         )
         for fault in _faults(skill):
@@ -169,18 +187,35 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
     return skill
 
 
+def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """The arrays of the primitive with this prefix."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _is_between(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether it is a skill between places."""
+    kind = arrays["format"].item()
+    return bool(kind == BETWEEN or (kind == POSED and "corners" in arrays))
+
+
+def _turn(arrays: Mapping[str, NDArray[Any]]) -> LearnedOrientation | None:
+    return LearnedOrientation(KMP.from_arrays(arrays), arrays["auxiliary"]) if arrays else None
+
+
+def _gripper(arrays: Mapping[str, NDArray[Any]]) -> LearnedGripper | None:
+    return LearnedGripper(KMP.from_arrays(arrays)) if arrays else None
+
+
 def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[str]:
     """What in the arrays is not what was written, or not what any skill has."""
     for name in sorted(set(arrays) - KNOWN):  # what kmp can hold besides, and the loop was never tried with
         yield f"an array {name!r}, which no skill has"
-    is_between = arrays["format"].item() == BETWEEN
-    for name, (low, high, unit) in (RANGES | RANGES_BETWEEN if is_between else RANGES).items():
-        array = arrays[name]
-        if array.dtype.kind not in "iuf":
-            yield f"{name} has numbers of type {array.dtype}, real ones needed"
-        elif array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
-            worst = array.flat[np.argmax(np.where(np.isfinite(array), np.abs(array), np.inf))]
-            yield f"{name} has {worst:g}, {low:g} to {high:g} {unit}".rstrip() + " accepted"
+    yield from _beyond(arrays, RANGES | RANGES_BETWEEN if _is_between(arrays) else RANGES, "")
+    for prefix in (TURN, GRIPPER):
+        if part := _part(arrays, prefix):
+            yield from _beyond(part, RANGES.keys() & part.keys(), prefix)
+            if len(part["base_inputs"]) > MOST_POINTS:
+                yield f"{len(part['base_inputs'])} points of {prefix}, at most {MOST_POINTS} accepted"
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
@@ -193,6 +228,17 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
     elif not recorded:
         yield "no checksum: written by an earlier version, or changed; learn it anew"
+
+
+def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
+    """Which arrays hold what is in no range."""
+    for name in names:
+        array, (low, high, unit) = arrays[name], (RANGES | RANGES_BETWEEN)[name]
+        if array.dtype.kind not in "iuf":
+            yield f"{prefix}{name} has numbers of type {array.dtype}, real ones needed"
+        elif array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
+            worst = array.flat[np.argmax(np.where(np.isfinite(array), np.abs(array), np.inf))]
+            yield f"{prefix}{name} has {worst:g}, {low:g} to {high:g} {unit}".rstrip() + " accepted"
 
 
 def _is_json(array: NDArray[Any]) -> bool:
@@ -246,6 +292,27 @@ def _faults(skill: Skill) -> Iterator[str]:
     if skill.orientation.shape != (4,) or not abs(np.linalg.norm(skill.orientation) - 1) < 1e-6:
         yield f"orientation is {skill.orientation.tolist()}, a quaternion x y z w of norm 1 needed"
     yield from _tried(skill)
+    if skill.turn:
+        if skill.turn.auxiliary.shape != (4,) or not abs(np.linalg.norm(skill.turn.auxiliary) - 1) < 1e-6:
+            yield f"{TURN}auxiliary is {skill.turn.auxiliary.tolist()}, a quaternion x y z w of norm 1 needed"
+        yield from _tried_beside(skill, skill.turn.primitive, TURN, outputs=3)
+    if skill.gripper:
+        yield from _tried_beside(skill, skill.gripper.primitive, GRIPPER, outputs=1)
+
+
+def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
+    """What is wrong with a primitive beside the position's, where it was learned and taught."""
+    wanted, given = (skill.primitive.inputs.shape[1], outputs), (primitive.inputs.shape[1], primitive.outputs)
+    if given != wanted:
+        yield f"{name} has {given[0]} inputs and {given[1]} outputs, {wanted[0]} and {wanted[1]} needed"
+        return
+    with np.errstate(all="ignore"):
+        found = np.abs(primitive.mean(primitive.inputs))
+        steep = np.linalg.norm(primitive.jacobians(primitive.inputs), axis=(1, 2)).max()
+    if not found.max() <= FARTHEST_TURN:
+        yield f"{name} says {found.max():g} where it was learned, up to {FARTHEST_TURN:.2g} accepted"
+    if not steep <= STEEPEST:
+        yield f"{name} changes by {steep:g} a metre where it was learned, up to {STEEPEST:g} accepted"
 
 
 def _tried(skill: Skill) -> Iterator[str]:

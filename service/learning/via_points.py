@@ -17,6 +17,7 @@ from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
 from service.core.skill import Skill
 from service.core.taught import NEIGHBOURS, neighbourhoods
+from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
@@ -36,16 +37,20 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     inputs, outputs, deviations = neighbourhoods(via_points)
     _check_agreement(via_points, inputs, outputs, deviations)
-    if skill.between is not None:
-        return with_file(replace(skill, via_points=tuple(via_points), tolerance=tolerance))
+    owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    check_turns(owners, inputs)
+    skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
-            desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
-            primitive = skill.primitive.base.adapt(inputs, desired, tolerance=tolerance)
+            if skill.between is None:
+                desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
+                skill = replace(skill, primitive=skill.primitive.base.adapt(inputs, desired, tolerance=tolerance))
+            at = skill.inputs(inputs)
+            turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
-    return with_file(replace(skill, primitive=primitive, via_points=tuple(via_points), tolerance=tolerance))
+    return with_file(replace(skill, turn=turn, gripper=gripper))
 
 
 def _weight(skill: Skill) -> float:
@@ -79,6 +84,7 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
         ViaPointInForce(
             **msgspec.structs.asdict(point),
             missed_by_m=math.dist(point.tool, skill.mean(np.array([[*point.left, *point.right]]))[0]),
+            missed_by_rad=missed_by_rad(skill, point),
         )
         for point in skill.via_points
     )
@@ -93,6 +99,12 @@ def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
         "near it says otherwise. A smaller std makes it count more; a greater tolerance removes what was shown there"
         for point in in_force(after)
         if point.missed_by_m > NOTED_M
+    ]
+    out += [
+        f"the orientation of via-point {point.name!r} is missed by {math.degrees(point.missed_by_rad):.0f}°: what was "
+        "demonstrated or taught near it says otherwise"
+        for point in in_force(after)
+        if point.missed_by_rad is not None and point.missed_by_rad > NOTED_RAD
     ]
     for point in set(before.via_points) & set(after.via_points):
         hands = np.array([[*point.left, *point.right]])

@@ -208,7 +208,7 @@ class Chunks:
             if ghost is not None and len(told):
                 angles = [float(q[number]) for q in measured if q is not None]
                 yield columns(f"/measured/joints/{number}", told, ghost.compute_transform_columns(angles, clamp=False))
-        tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["orientation"][rows])
+        tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows])
         yield columns("/scene/tool", rows, tool)
         yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
         for side, name in enumerate(SIDES):

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from service.config import HandSettings, Settings
 from service.contract import cdr
-from service.contract.channels import POSE, STRING, topic
-from service.contract.messages import BASE, PoseStamped
+from service.contract.channels import JOINTS, POSE, STRING, topic
+from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
 from service.contract.requests import encode_json
 from service.core.frame import Vector
 from service.core.intake import FARTHEST_M, UNIT_M
@@ -24,7 +24,7 @@ from service.core.rotation import rotation
 from service.learning.demonstration import Demonstration
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.recorder.mcap_reader import Messages, next_whole
-from service.recorder.pose_streams import ENDINGS, PLACES, Recorded, Source, Track, chosen
+from service.recorder.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, Recorded, Source, Track, chosen
 
 _STREAMS = tuple(ENDINGS.values())
 LARGEST_DELAY_S = 0.2  # of one stream more than of another, from a stamp to its recording
@@ -42,6 +42,10 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             raise ValueError(
                 f"{name}: shape {stream.shape} given, finite numbers of shape ({len(stamps_ns)}, 7) needed"
             )
+    gripper = demonstration.gripper
+    if gripper is not None and (gripper.shape != (len(stamps_ns),) or not np.isfinite(gripper).all()):
+        given, wanted = gripper.shape, (len(stamps_ns),)
+        raise ValueError(f"{GRIPPER_STATE}: shape {given} given, finite numbers of shape {wanted} needed")
     file = McapFile(Path(path), joints=0, attached=False)
     try:
         for i, (stamp, *rows) in enumerate(
@@ -50,6 +54,9 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             for name, row in zip(_STREAMS, rows, strict=True):
                 data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
                 file.put(topic(cell, name), POSE.type, data, stamp, i)
+            if gripper is not None:
+                data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
+                file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
             file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
@@ -116,7 +123,7 @@ def read_demonstration(
         )
     left, right, tool = (_resampled(stamps, *row) for row in rows)
     stamps.setflags(write=False)
-    return Demonstration(stamps, left, right, tool, BASE, recorded.places)
+    return Demonstration(stamps, left, right, tool, BASE, recorded.places, recorded.closures(stamps))
 
 
 def _is_pose(poses: Vector) -> NDArray[np.bool_]:
@@ -216,10 +223,12 @@ def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
 
 
 class PoseStreams:
-    """Which topics of a file are the wanted streams of poses; one topic each, whatever the cell."""
+    """Which topics of a file are the wanted streams of poses, or of another type; one topic each,
+    whatever the cell.
+    """
 
-    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
-        self._path, self._names = path, names
+    def __init__(self, path: Path, names: tuple[str, ...], kind: str = POSE.type) -> None:
+        self._path, self._names, self._kind = path, names, kind
         self._found: dict[str, str] = {}
         self._seen: set[str] = set()
 
@@ -231,7 +240,7 @@ class PoseStreams:
         if (
             not name
             or schema is None
-            or schema.name.replace("/msg/", "/") != POSE.type.replace("/msg/", "/")
+            or schema.name.replace("/msg/", "/") != self._kind.replace("/msg/", "/")
             or channel.message_encoding != "cdr"
         ):
             return ""
@@ -242,4 +251,4 @@ class PoseStreams:
     def missing(self, name: str) -> RecordingError:
         """The error that says that a stream is not there, and what is."""
         topics = ", ".join(sorted(self._seen)) or "none"
-        return RecordingError(f"{self._path} has no topic ending in {name} with {POSE.type}; its topics: {topics}")
+        return RecordingError(f"{self._path} has no topic ending in {name} with {self._kind}; its topics: {topics}")

@@ -25,7 +25,7 @@ from service.recorder.tool import tool_poses
 
 SIDES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
-JOINT_STATES, PLACES = "joints/state", "places"
+JOINT_STATES, GRIPPER_STATE, PLACES = "joints/state", "gripper/state", "places"
 OF_A_HAND = {"hand", "hands", "wrist", "palm", "glove"}
 WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
 MANY, TREE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
@@ -191,6 +191,28 @@ class Recorded:
         poses, kept = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
         source = f"{topic}, by the URDF"
         return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
+
+    def closures(self, stamps: NDArray[np.int64]) -> Vector | None:
+        """How far the gripper is closed (T,) at stamps (T,) [ns], as the first joint of the topic
+        ending in `gripper/state` tells; None where there is none. Raises RecordingError.
+        """
+        topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
+        told: dict[int, float] = {}
+        for logged_ns, data in self._raw[topics[0]] if topics else ():
+            try:
+                state = self._joint_state(data)
+            except WireError as error:
+                raise RecordingError(f"{self.path}: {topics[0]}: {error}") from None
+            if not np.isfinite(state.position[:1]).all() or not state.position:
+                raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {state.stamp_ns} ns")
+            told[state.stamp_ns or logged_ns] = state.position[0]
+        if not told:
+            return None
+        at = np.array(sorted(told), np.int64)
+        ways = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out: Vector = np.interp(*ways, [told[i] for i in at.tolist()])
+        out.setflags(write=False)
+        return out
 
     def _joint_state(self, data: bytes) -> Any:
         """Raises WireError."""

@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Thing, Transform, Vector3
+from service.contract.messages import BASE, Quaternion, Thing, Transform, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Record, Tick, encode
 from service.core.outputs import outgoing
@@ -158,17 +158,17 @@ class Recorder:
 
     def _transforms(self, frame: Record) -> list[Transform]:
         """Where everything is, for viewers: the arm's links, tool, setpoint, target and hands."""
-        settings, orientation = self._settings, tuple(frame["orientation"].tolist())
+        settings = self._settings
         joints = dict(zip(settings.joints.names, frame["joints"].tolist(), strict=True))
         found = self._links.transforms(joints)
         offset = settings.tool.plate_from_tool
         found.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
-        found.append(Transform(BASE, "setpoint", _point(frame["setpoint"]), orientation))
+        found.append(Transform(BASE, "setpoint", _point(frame["setpoint"]), _quaternion(frame["setpoint_orientation"])))
         for side, name in enumerate(SIDES):
             if frame["hand_ages"][side] >= 0:
                 found.append(Transform(BASE, f"{name}_hand", _point(frame["hands"][side]), _UPRIGHT))
         if frame["covariance"].any():  # without both hands nothing is predicted
-            found.append(Transform(BASE, "target", _point(frame["target"]), orientation))
+            found.append(Transform(BASE, "target", _point(frame["target"]), _quaternion(frame["orientation"])))
         return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
@@ -219,6 +219,11 @@ class Recorder:
 def _point(position: Any) -> Vector3:
     x, y, z = position.tolist()
     return x, y, z
+
+
+def _quaternion(orientation: Any) -> Quaternion:
+    x, y, z, w = orientation.tolist()
+    return x, y, z, w
 
 
 class Recording:

@@ -25,9 +25,10 @@ from service.contract.messages import Attachment
 from service.contract.records import STAGES, Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
-from service.core.controller import Controller, rehearse, run
+from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import outgoing
+from service.core.rehearsal import rehearse
 from service.core.separation import FARTHEST, IRRELEVANT
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError

@@ -25,8 +25,9 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES
-from service.core.controller import Controller, rehearse
+from service.core.controller import Controller
 from service.core.frame import Event, Tick, Vector
+from service.core.rehearsal import rehearse
 from service.core.skill import Skill
 from service.learning.skill_file import decoded
 from service.shell.clock import SPIN_NS, Deadlines, ask_for_real_time

@@ -21,7 +21,6 @@ from service.core.arm import Arm, Closing
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick, Vector
 from service.core.limiter import Limiter
-from service.core.rotation import rotation
 from service.core.skill import Skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.moving_hands import PERIOD_S, Moving
@@ -91,7 +90,7 @@ class _Chain:
         eager = Closing(settings.tool.max_acceleration / 2, settings.tool.max_speed, far_damping=0.0)
         self.arm = Arm(settings, robot_description(settings), eager)
         self.limiter = Limiter(settings.joints, settings.period_s)
-        self.direction = rotation(tuple(skill.orientation))[:, 2]
+        self.orientation = skill.orientation
 
     def targets(self, samples: Array) -> Array:
         """What the skill makes of samples (M, 6): (M, 3) [m], inside its workspace."""
@@ -101,7 +100,7 @@ class _Chain:
         """The joints at rest with the tool at a position."""
         q, dq, ddq = np.array(self.settings.arm.posture), np.zeros(7), np.zeros(7)
         for _ in range(2000):
-            wanted = self.arm.step(q, position, np.zeros(3), self.direction)
+            wanted = self.arm.step(q, position, np.zeros(3), self.orientation)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
         return q, 0 * dq, 0 * ddq
 
@@ -110,7 +109,7 @@ class _Chain:
         q, dq, ddq = self.start(setpoints[0, 0])
         tool, limited = np.empty((len(setpoints), 3)), 0
         for k, (position, velocity) in enumerate(setpoints):
-            wanted = self.arm.step(q, position, velocity, self.direction)
+            wanted = self.arm.step(q, position, velocity, self.orientation)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
             tool[k] = self.arm.at(q).position
             limited += wanted.speed_limited
@@ -177,7 +176,7 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
         q = chain.start(targets[0])[0]
         before, low, wanted, limited = q, q.copy(), np.empty((len(targets), len(q))), 0
         for k, target in enumerate(targets):
-            solution = chain.arm.step(q, target, np.zeros(3), chain.direction)
+            solution = chain.arm.step(q, target, np.zeros(3), chain.orientation)
             limited += solution.speed_limited
             q = q + PERIOD_S * solution.velocity
             low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)

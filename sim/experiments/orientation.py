@@ -1,27 +1,23 @@
 """The tool's orientation predicted with its position: over the board the glass faces the user's
 eyes, in places that were never demonstrated too.
 
-Orientation is a primitive of its own, in the tangent space of kmp.orientation, from the same two
-hands. The service's core takes it as the tool direction of the skill in force, renewed at the rate
-of the hands, and its arm follows position first and direction second.
+The skill is learned from demonstrations that turn the tool, taught places with their orientations,
+and followed by the service's core, as any.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
 import rerun as rr
 
-from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, OrientationKMP
-from kmp.orientation import continuous, exp, log, multiplied
+from kmp.orientation import exp, log, multiplied
 from service.cli.usage import shipped
-from service.contract.requests import TOLERANCE_M
-from service.core.frame import Event, Frame
-from service.core.taught import neighbourhoods
-from service.learning.learn import mean_orientation
+from service.contract.requests import TOLERANCE_M, ViaPoint
+from service.core.skill import Skill
+from service.learning.learn import learn
 from service.learning.via_points import adapted
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
@@ -31,7 +27,7 @@ from sim.script import HandScript
 
 EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
 SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
-COMPONENTS, POINTS, ELL, LAMBDA, SPREAD_RAD, VIA_STD_RAD = 10, 200, 20.0, 2.0, 0.03, 0.002
+COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # of the position, as the shipped skill
 SCENES, SEED, RATE_HZ = 5, 31, 250
 WORK_S = 3.0  # that the hands stay over the board
 
@@ -43,22 +39,17 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     scenes = {
         name: msgspec.structs.replace(scene, dwells_s=(*scene.dwells_s[:2], WORK_S)) for name, scene in scenes.items()
     }
-    learned, skill = learn(), shipped()
+    skill = learn_turning()
     runs: dict[str, Rehearsed] = {}
     for name, scene in scenes.items():
-        taught, turned = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M), turned_to(learned, scene)
-
-        def direct(frame: Frame) -> tuple[Event, ...]:
-            quaternion = turned.mean(frame["hands"].reshape(1, 6))[0]  # noqa: B023
-            return (Event("skill", b"", replace(taught, orientation=quaternion)),)  # noqa: B023
-
         script = HandScript(scene, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M)
-        runs[name] = rehearse(script, lambda bench: taught, rate_hz=RATE_HZ, keep=True, more=direct)  # noqa: B023
+        taught = adapted(skill, turned(scene), tolerance=TOLERANCE_M)
+        runs[name] = rehearse(script, lambda bench: taught, rate_hz=RATE_HZ, keep=True)  # noqa: B023
         results.say(f"{name}: {_measured(runs[name], scene)}")
     nominal = scenes["nominal"]
     fixed = rehearse(
         HandScript(nominal, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M),
-        lambda bench: adapted(skill, nominal.via_points(), tolerance=TOLERANCE_M),
+        lambda bench: adapted(shipped(), nominal.via_points(), tolerance=TOLERANCE_M),
         rate_hz=RATE_HZ,
         keep=True,
     )
@@ -82,39 +73,33 @@ def facing(scene: Scene) -> Array:
     return multiplied(turn / np.linalg.norm(turn), np.array(TOOL_ORIENTATION))
 
 
-def learn() -> OrientationKMP:
-    """The primitive of five demonstrations in which the tool turns to the eyes on the way from the
+def learn_turning() -> Skill:
+    """The skill of five demonstrations in which the tool turns to the eyes on the way from the
     glass to the board.
     """
     scene = Scene()
     begin, end = scene.segments[2]
     there, back = np.array(TOOL_ORIENTATION), facing(scene)
     whole = log(back[None], there)[0]
-    hands, quaternions = [], []
+    turning = []
     for number, one in enumerate(demonstrated(5)):
         random = np.random.default_rng([number, SEED])
         u = np.clip((np.arange(len(one.hands)) * one.period_s - begin) / (end - begin), 0, 1)
         share = u**3 * (10 - 15 * u + 6 * u * u)
         off = SCATTER_RAD / 2 * random.standard_normal((2, 3))
-        hands.append(one.hands)
-        quaternions.append(exp(share[:, None] * (whole + off[1]) + (1 - share[:, None]) * off[0], there))
-    auxiliary = mean_orientation(np.concatenate(quaternions))
-    samples = np.concatenate(
-        [np.hstack([s, log(continuous(q), auxiliary)]) for s, q in zip(hands, quaternions, strict=True)]
+        quaternions = exp(share[:, None] * (whole + off[1]) + (1 - share[:, None]) * off[0], there)
+        turning.append(one._replace(tool=np.hstack([one.tool[:, :3], quaternions])))
+    return learn(turning, name="turning", components=COMPONENTS, ell=ELL, penalty=PENALTY)
+
+
+def turned(scene: Scene) -> tuple[ViaPoint, ...]:
+    """A scene's three via-points with the tool's orientation at each."""
+    x, y, z, w = facing(scene).tolist()
+    orientations = (TOOL_ORIENTATION, TOOL_ORIENTATION, (x, y, z, w))
+    return tuple(
+        msgspec.structs.replace(point, orientation=orientation)
+        for point, orientation in zip(scene.via_points(), orientations, strict=True)
     )
-    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=0)
-    inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=0)
-    reference = mixture.regress(inputs)
-    reference = Gaussians(reference.mean, reference.covariance + (SPREAD_RAD / 2) ** 2 * np.eye(3))
-    return OrientationKMP(KMP.fit(inputs, reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA), auxiliary)
-
-
-def turned_to(learned: OrientationKMP, scene: Scene) -> OrientationKMP:
-    """The primitive that is told the orientation at a scene's three places, and around them."""
-    at, _, _ = neighbourhoods(scene.via_points())
-    each = len(at) // 3
-    quaternions = np.concatenate([np.tile(TOOL_ORIENTATION, (2 * each, 1)), np.tile(facing(scene), (each, 1))])
-    return learned.adapt(at, quaternions, VIA_STD_RAD**2 * np.eye(3), tolerance=TOLERANCE_M)
 
 
 def _axis(quaternion: Array) -> Array:

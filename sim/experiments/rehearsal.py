@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
-from service.core.frame import Event, Frame, Tick
+from service.core.frame import Frame, Tick
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.bench import Bench, TaskEvents
@@ -55,13 +55,10 @@ def rehearse(
     rate_hz: int = 500,
     keep: bool = False,
     look: Callable[[Bench], None] = lambda bench: None,
-    more: Callable[[Frame], tuple[Event, ...]] = lambda frame: (),
 ) -> Rehearsed:
     """One run of a script through core and physics.
 
     `look` is shown the bench after each tick; `keep` keeps what was seen.
-
-    `more` makes further events of the newest frame, as often as hands are seen.
     """
     settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
@@ -87,7 +84,7 @@ def rehearse(
                 axes.append((2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)))
             look(bench)
 
-        loop = ClosedLoop(bench, more=more)
+        loop = ClosedLoop(bench)
         run(Controller(settings, skill_for(bench), urdf=robot_description(settings)), loop.ticks(), [loop.follow, tap])
         result = Rehearsed(bench.events(), held * settings.period_s)
     if keep:

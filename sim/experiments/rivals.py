@@ -20,7 +20,8 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
-from service.core.skill import Prediction, Skill
+from service.core.pose import NO_GRIPPER, Turn
+from service.core.skill import Known, Prediction, Skill
 from service.core.taught import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.via_points import adapted
@@ -52,12 +53,12 @@ class Rival(Skill):
     law: Law = field(kw_only=True)
 
     def predict(
-        self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None
+        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
     ) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
         curve = STEP_S**2 / 2 * a
-        return _moving(self.law(np.stack([s - STEP_S * v + curve, s, s + STEP_S * v + curve])))
+        return _moving(self.law(np.stack([s - STEP_S * v + curve, s, s + STEP_S * v + curve])), self.constant_turn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +71,15 @@ class TimeDriven(Skill):
     bench: Bench = field(kw_only=True)
 
     def predict(
-        self, hands: Array, velocities: Array, accelerations: Array, *, covariance: Array | None = None
+        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
     ) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s
         rows = self.trajectory(np.array([[t - STEP_S], [t], [t + STEP_S]]))
-        return _moving(rows)
+        return _moving(rows, self.constant_turn)
 
 
-def _moving(rows: Array) -> Prediction:
+def _moving(rows: Array, turn: Turn) -> Prediction:
     """The middle one of three positions (3, 3) that are STEP_S apart, with its velocity and
     acceleration.
     """
@@ -89,6 +90,8 @@ def _moving(rows: Array) -> Prediction:
         np.round((ahead - 2 * now + behind) / STEP_S**2, 6),
         np.zeros((3, 3)),
         0.0,
+        turn,
+        NO_GRIPPER,
     )
 
 

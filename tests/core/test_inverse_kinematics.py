@@ -8,9 +8,9 @@ from scipy.optimize import lsq_linear
 
 from service.core.inverse_kinematics import (
     DAMPING,
-    DIRECTION_LEVER,
     GAP_FREE,
     GAP_SLOW,
+    TURN_LEVER,
     least_squares,
     measured_error,
     slow_down,
@@ -22,7 +22,7 @@ from service.core.inverse_kinematics import (
 @pytest.mark.parametrize("seed", range(40))
 def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> None:
     random = np.random.default_rng(seed)
-    tasks, wanted, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
+    tasks, wanted, posture = random.normal(size=(6, 7)), random.normal(size=6), 0.1 * random.normal(size=7)
     damping, width = 10 ** random.uniform(-4, -1), 10 ** random.uniform(-1.5, 0.5)
     bounds = np.sort(random.normal(size=(2, 7)), axis=0) * width
     bounds[0], bounds[1] = np.minimum(bounds[0], -1e-3), np.maximum(bounds[1], 1e-3)
@@ -34,19 +34,20 @@ def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> Non
     np.testing.assert_allclose(found, best, atol=1e-7)
 
 
-def test_tasks_are_the_tool_s_velocity_and_what_turns_its_direction() -> None:
+@pytest.mark.parametrize("about", [0.0, 1.0])
+def test_tasks_are_the_tool_s_velocity_and_what_turns_it(about: float) -> None:
     random = np.random.default_rng(1)
     jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
-    tasks = np.empty((5, 7))
-    damping = tool_tasks(jacobian, rotation, tasks)
-    expected = np.vstack([jacobian[:3], DIRECTION_LEVER * rotation[:, :2].T @ jacobian[3:]])
+    tasks = np.empty((6, 7))
+    damping = tool_tasks(jacobian, rotation, about, tasks)
+    expected = np.vstack([jacobian[:3], TURN_LEVER * np.diag([1.0, 1.0, about]) @ rotation.T @ jacobian[3:]])
     np.testing.assert_allclose(tasks, expected, rtol=1e-12, atol=1e-15)
     assert damping == DAMPING  # far from singular
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
     random = np.random.default_rng(2)
-    tasks, q, dq, ddq = random.normal(size=(5, 7)), *random.normal(size=(3, 7))
+    tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
     speed, coming = tool_speeds(tasks, dq, ddq, jerk)
     crest = np.linalg.norm(tasks[:3] @ (dq + ddq * np.abs(ddq) / (2 * jerk)))

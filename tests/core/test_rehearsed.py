@@ -19,7 +19,7 @@ from service.core import (
     capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation, setpoint, skill,
     stops, workspace,
 )
-from service.core.controller import rehearse
+from service.core.rehearsal import rehearse
 from service.cli.main import main
 from service.cli.usage import shipped
 

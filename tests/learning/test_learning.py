@@ -8,7 +8,8 @@ from taught_scene import demonstrated, deviations, error_m, quickly
 
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
-from service.learning.learn import learn, mean_orientation
+from service.learning.learn import learn
+from service.learning.pose import mean_orientation
 from service.learning.skill_file import SkillError
 
 LATE = 40  # samples of 10 ms

@@ -127,7 +127,7 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill)
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"format": np.array(4)}, "skill of format 4, 1 to 3 needed"),
+        ({"format": np.array(5)}, "skill of format 5, 1 to 4 needed"),
         ({"format": np.array(3)}, "is missing"),
         ({"format": np.array(2)}, "'figures' is missing"),
         ({"via_directions": np.zeros((0, 6))}, "an array 'via_directions', which no skill has"),

@@ -238,7 +238,7 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
         ]
     topics = {topic for topic, _ in decoded}
     assert {"/tf", "/robot_description"} < topics
-    now_and_then = {"skill_in_force", "requests", "log", "objects"}
+    now_and_then = {"skill_in_force", "requests", "log", "objects", "gripper/command"}
     always = [channel.key for channel in channels.CHANNELS if channel.recorded and channel.key not in now_and_then]
     assert {channels.topic("hall/bench-1", key) for key in always} == topics
     frames = [message for topic, message in decoded if topic == "/hall/bench-1/frame"]
