@@ -25,7 +25,7 @@ TREMOR_HZ = (8.0, 10.0)  # physiological tremor of a resting hand
 TREMOR_WAVES = 6
 # Height that the tool gains in the middle of each motion [m], the same in all demonstrations: over
 # the hand, over the bench, over the board.
-GRIP_AT, GRIP_S = 0.8, 0.25  # of a motion the gripper opens or closes, as the hands arrive; how long that takes [s]
+GRIP_AT, GRIP_S = 0.88, 0.25  # of a motion the gripper opens or closes, as the hands arrive; how long that takes [s]
 TOOL_ARCS = ((0.0, 0.0, 0.03), (0.03, 0.0, 0.05), (0.0, 0.0, 0.04))
 
 

@@ -124,6 +124,7 @@ STATE = (
     Field("arm_tick", "int64"),
     Field("hull_ticks", "int64"),  # in the newest span
     Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
+    Field("gripper_tick", "int64"),  # at which the gripper was told to move
     Field("rest_tick", "int64"),  # since which the arm tells one posture, `rest`, and nothing else
     Field("told_ticks", "int64", (len(SOURCES), 2)),  # the last two at which a sample could have been right
     Field("doubts", "int64", (2, 3)),  # of samples of a hand that jumped, in a row: first and newest tick, count

@@ -6,6 +6,7 @@ the skill in force.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
@@ -127,7 +128,7 @@ class Controller:
         if state["mode"] == FOLLOW and prediction is not None and target is not None:
             met = self._lead(target, here)
             self._turn.step(state, *prediction.turn[:2])
-            state["gripper"] = decided(int(state["gripper"]), float(state["closure"]))
+            self._grip(target, here)
             lap("setpoint")
             position, velocity = state["setpoint"][:2]
             orientation, turning = state["orientation"], state["turning"]
@@ -285,6 +286,17 @@ class Controller:
         if met == WRONG:
             state["mode"], state["reason"] = FAULT, Reason.SETPOINT
         return bool(met)
+
+    def _grip(self, target: Target, here: Kinematics) -> None:
+        """Opens or closes the gripper where the skill says so, once the tool is where it is to
+        be.
+        """
+        state, before = self._state, int(self._state["gripper"])
+        since_s = self._settings.period_s * int(state["tick"] - state["gripper_tick"])
+        off = math.dist(target.position.tolist(), here.position.tolist())
+        state["gripper"] = decided(before, float(state["closure"]), since_s=since_s, off=off)
+        if state["gripper"] != before:
+            state["gripper_tick"] = state["tick"]
 
     def _move(self, wanted: Vector) -> tuple[bool, bool]:
         """Moves the joints on toward wanted velocities (J,) [rad/s]; whether a limit kept them from

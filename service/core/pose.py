@@ -19,6 +19,8 @@ TURN_STEPS, COVARIANCE_STEPS, CLOSURE_STEPS = 1e6, 1e10, 1e6  # [1/rad], [1/radÂ
 NO_GRIPPER = -1.0  # the closure that a skill without a gripper predicts
 UNKNOWN, OPEN, CLOSED = 0, 1, 2  # of a gripper
 OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
+MOVES_S = 0.5  # for so long it is let be once it was told to move
+THERE_M = 0.01  # a tool that is no farther off is where it is to be
 
 
 class Turn(NamedTuple):
@@ -65,18 +67,20 @@ class LearnedGripper:
         return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_STEPS) / CLOSURE_STEPS
 
 
-def decided(gripper: int, closure: float) -> int:
-    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper where such a closure is predicted.
+def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
+    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
+    closure is predicted and the tool is so far off [m].
 
-    With hysteresis: what trembles about the middle changes nothing.
+    With hysteresis, and not before it can have moved: what trembles about the middle changes
+    nothing. Not on the way: a tool that is late would open or close elsewhere.
     """
     if closure == NO_GRIPPER:
         return gripper
     if gripper == UNKNOWN:
         return CLOSED if closure > 0.5 else OPEN
-    if closure > CLOSE_ABOVE:
-        return CLOSED
-    return OPEN if closure < OPEN_BELOW else gripper
+    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
+        return gripper
+    return CLOSED if closure > CLOSE_ABOVE else OPEN
 
 
 _NOTHING = np.zeros((3, 3))

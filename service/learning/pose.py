@@ -31,9 +31,9 @@ ALONE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # of a single demonstration, which tel
 # undecided and stays as it is. Tried on 25 scenes with places up to 15 cm away: with 13 cm it opens
 # on the way to 22 of them.
 GRIPPER_ELL = 1000.0  # [1/m²]
-GRIPPER_ELL_BETWEEN = 200.0  # the same of a skill between places, whose inputs are shares
+GRIPPER_ELL_BETWEEN = 60.0  # the same of a skill between places, whose inputs are shares
 UNDECIDED = 0.5
-POINT_NOISE = 0.3  # a point's variance over the kernel's
+POINT_NOISE = 0.1  # a point's variance over the kernel's
 DEVIATION = 0.2  # [rad, half the angle], or of the closure
 GRIPPER_WRONG = 0.15  # share of the held-out time that is noted
 

@@ -1,0 +1,159 @@
+"""The tool's orientation and the gripper: predicted, led at limited speed, followed by the arm, and
+sent.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from in_process import ASSUMED, frames, ticks_of
+from scipy.spatial.transform import Rotation
+from wam import FRAME, URDF
+
+from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
+from service.config import Settings
+from service.contract import cdr
+from service.core.arm import Arm
+from service.core.controller import Controller
+from service.core.frame import blank, state_layout
+from service.core.limiter import Limiter
+from service.core.orientation_setpoint import SPEED_SHARE, OrientationSetpoint
+from service.core.outputs import outgoing
+from service.core.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
+from service.core.rotation import axis_of, quaternion_of, swing, turn_between, turn_on
+from service.core.skill import Skill
+from service.learning.via_points import adapted
+from sim.scene import TOOL_ORIENTATION, Scene
+from sim.script import HandScript
+
+PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
+
+
+def full(settings: Settings) -> Settings:
+    return msgspec.structs.replace(settings, tool=msgspec.structs.replace(settings.tool, orientation="full"))
+
+
+def random_rotations(count: int, seed: int) -> Rotation:
+    return Rotation.random(count, random_state=np.random.default_rng(seed))
+
+
+def test_rotations_are_those_of_scipy() -> None:
+    for one, other in zip(random_rotations(50, 1), random_rotations(50, 2), strict=True):
+        a, b, turn, axis = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
+        quaternion_of(one.as_matrix(), a)
+        quaternion_of(other.as_matrix(), b)
+        assert abs(a @ one.as_quat()) == pytest.approx(1.0, abs=1e-8)
+        turn_between(a, b, turn)
+        np.testing.assert_allclose(turn, (other * one.inv()).as_rotvec(), atol=1e-7)
+        axis_of(a, axis)
+        np.testing.assert_allclose(axis, one.as_matrix()[:, 2], atol=1e-8)
+        to = other.as_matrix()[:, 2].copy()
+        swing(axis, to, turn)
+        np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(axis), to, atol=1e-7)
+        turn_on(a, turn)
+        assert abs(a @ (Rotation.from_rotvec(turn) * one).as_quat()) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> None:
+    random = np.random.default_rng(3)
+    inputs, zeta = random.normal(size=(12, 6)), 0.5 * random.normal(size=(12, 3))
+    reference = Gaussians(zeta, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
+    primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.3), lambda_mean=1.0)
+    auxiliary = random_rotations(1, 4)[0].as_quat()
+    ours, kmp = LearnedOrientation(primitive, auxiliary), OrientationKMP(primitive, auxiliary)
+    for at, velocity in zip(inputs + 0.1, random.normal(size=(12, 6)), strict=True):
+        found, (mean, covariance) = ours.predict(at, velocity), kmp.predict(at[None])
+        assert abs(found.orientation @ mean[0]) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(found.velocity, kmp.angular_velocity(at, velocity), atol=2e-5)
+        np.testing.assert_allclose(found.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max())
+        again = ours.predict(at, velocity, covariance=found.covariance)
+        assert again.orientation.tobytes() == found.orientation.tobytes()
+        ahead = Rotation.from_quat(ours.predict(at + 1e-3 * velocity, velocity).orientation)
+        turned = (ahead * Rotation.from_quat(found.orientation).inv()).as_rotvec() / 1e-3
+        np.testing.assert_allclose(found.velocity, turned, atol=0.05 * np.linalg.norm(turned) + 1e-2)
+
+
+@pytest.mark.parametrize("about", [False, True])
+def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(about: bool) -> None:
+    settings = full(Settings()) if about else Settings()
+    lead, state = OrientationSetpoint(settings), blank(state_layout(7))
+    lead.begin(state, np.eye(3), np.zeros(3))
+    target = Rotation.from_rotvec(math.radians(120) * np.array([1.0, 2.0, 2.0]) / 3.0)
+    seen = []
+    for _ in range(2500):
+        lead.step(state, target.as_quat(), np.zeros(3))
+        seen.append(state["turning"].copy())
+    speeds = np.array(seen)
+    assert np.linalg.norm(speeds, axis=1).max() <= SPEED_SHARE * FASTEST + 1e-6
+    assert np.linalg.norm(np.diff(speeds, axis=0), axis=1).max() <= HARDEST * PERIOD_S + 1e-6
+    off = target * Rotation.from_quat(state["orientation"]).inv()
+    axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])
+    assert np.linalg.norm(axis - target.apply([0, 0, 1.0])) < 1e-3
+    assert (off.magnitude() < 1e-3) == about  # where a direction is followed, it does not turn about it
+    assert np.linalg.norm(speeds[-1]) < 1e-2
+
+
+def test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to() -> None:
+    settings = full(Settings())
+    arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
+    q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
+    here = arm.at(q)
+    target = Rotation.from_rotvec([0.3, -0.2, 0.5]) * Rotation.from_matrix(here.rotation)
+    farthest = 0.0
+    for _ in range(1500):
+        wanted = arm.step(q, here.position, np.zeros(3), target.as_quat(), moving=dq)
+        q, dq, ddq, _ = limiter.step(q, dq, ddq, wanted.velocity)
+        farthest = max(farthest, float(np.linalg.norm(arm.at(q).position - here.position)))
+    assert (target * Rotation.from_matrix(arm.at(q).rotation).inv()).magnitude() < 0.01
+    assert farthest < 5e-4  # it costs the tool's position nothing
+
+
+def test_an_orientation_taught_at_a_place_is_predicted_and_followed_there(skill: Skill) -> None:
+    places = Scene().via_points()
+    turned = (Rotation.from_euler("y", -40, degrees=True) * Rotation.from_quat(TOOL_ORIENTATION)).as_quat()
+    x, y, z, w = turned.tolist()
+    taught = adapted(skill, (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))), tolerance=0.05)
+    script = HandScript(msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
+    last = seen[-300:]
+    assert np.abs(last["orientation"] @ turned).min() > math.cos(math.radians(1.0))
+    axis = Rotation.from_quat(last["tool_orientation"]).apply([0, 0, 1.0])
+    assert np.degrees(np.arccos(axis @ Rotation.from_quat(turned).apply([0, 0, 1.0]))).max() < 2.0
+    assert np.linalg.norm(last["tool"] - last["setpoint"], axis=1).max() < 1e-3
+    turning = np.linalg.norm(seen["setpoint_turning"], axis=1)
+    assert 0.1 < turning.max() <= FASTEST
+    assert (np.linalg.eigvalsh(last["orientation_covariance"]) >= -1e-12).all()
+    assert last["orientation_covariance"].any()
+
+
+def test_a_gripper_is_decided_with_hysteresis() -> None:
+    assert decided(UNKNOWN, 0.6) == CLOSED
+    assert decided(UNKNOWN, 0.4) == OPEN
+    for closure in np.linspace(0.11, 0.89, 20):
+        assert decided(OPEN, closure) == OPEN
+        assert decided(CLOSED, closure) == CLOSED
+    assert decided(OPEN, 0.95) == CLOSED
+    assert decided(CLOSED, 0.05) == OPEN
+    assert decided(CLOSED, 0.05, since_s=0.5 * MOVES_S) == CLOSED  # it is still on its way
+    assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is not there yet
+    assert [decided(one, NO_GRIPPER) for one in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
+
+
+def test_orientation_covariance_and_gripper_go_out_with_a_frame() -> None:
+    frame = blank(FRAME)
+    frame["covariance"], frame["orientation_covariance"] = np.eye(3), np.arange(9).reshape(3, 3)
+    frame["orientation"], frame["setpoint_orientation"] = (0, 0, 0, 1), (0, 1, 0, 0)
+    sent = {channel.key: payload for channel, payload in outgoing(frame, 1, Settings().joints.names)}
+    assert "gripper/command" not in sent  # nothing is known of one
+    covariance = np.array(cdr.decode_pose_with_covariance(sent["tool/target"]).covariance).reshape(6, 6)
+    np.testing.assert_array_equal(covariance[3:, 3:], np.arange(9).reshape(3, 3))
+    assert not covariance[:3, 3:].any()
+    assert cdr.decode_pose(sent["tool/setpoint"]).orientation == (0, 1, 0, 0)
+    for gripper, position in ((OPEN, 0.0), (CLOSED, 1.0)):
+        frame["gripper"] = gripper
+        sent = {channel.key: payload for channel, payload in outgoing(frame, 1, Settings().joints.names)}
+        command = cdr.decode_joints(sent["gripper/command"])
+        assert (command.names, command.position) == (("gripper",), (position,))

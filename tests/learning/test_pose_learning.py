@@ -1,0 +1,135 @@
+"""Orientation and gripper as they are learned, judged, taught with places and stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from taught_scene import PLACES, SCENE
+
+from service.cli.usage import shipped
+from service.contract.requests import RequestError, ViaPoint, decode_request
+from service.core.frame import Vector
+from service.core.skill import Skill
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
+from service.learning.pose import learned_pose
+from service.learning.skill_file import SkillError, decoded
+from service.learning.via_points import adapted, in_force
+from sim.scene import TOOL_ORIENTATION
+from sim.teach import demonstrations
+
+TURN = np.radians(120.0) * np.array([0.0, 0.6, 0.8])
+START = Rotation.from_quat(TOOL_ORIENTATION)
+
+
+def turning(one: Demonstration, whole: Vector) -> Demonstration:
+    """A demonstration in which the tool turns by so much on the way to the board."""
+    begin, end = SCENE.segments[2]
+    share = np.clip((np.arange(len(one.tool)) * one.period_s - begin) / (end - begin), 0, 1)
+    turned = (Rotation.from_rotvec(share[:, None] * whole) * START).as_quat()
+    return one._replace(tool=np.hstack([one.tool[:, :3], turned]))
+
+
+@pytest.fixture(scope="module")
+def shown() -> list[Demonstration]:
+    """Three demonstrations that turn the tool and tell of the gripper."""
+    return [turning(one.every(2), TURN) for one in demonstrations(SCENE, count=3, seed=1, gripper=True)]
+
+
+@pytest.fixture(scope="module")
+def posed(shown: list[Demonstration]) -> Skill:
+    return learn(shown, components=5, points=80)
+
+
+def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]) -> float:
+    """Between what is predicted for hands (6,) at rest, and an orientation."""
+    still = np.zeros((2, 3))
+    found = skill.predict(np.reshape(hands, (2, 3)), still, still).turn.orientation
+    return float(np.degrees((Rotation.from_quat(found) * Rotation.from_quat(orientation).inv()).magnitude()))
+
+
+def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
+    figures = msgspec.json.decode(posed.figures)
+    assert not any("orientation" in text for text in (*figures["unsafe"], *figures["warnings"]))
+    assert figures["orientation_error_deg"] < 5
+    for row in (0, -1):
+        one = shown[0]
+        assert angle_deg(posed, one.hands[row], one.tool[row, 3:]) < 15  # smoothed, not averaged: that would be 60
+    assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(np.radians(120))
+
+
+def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demonstration]) -> None:
+    other = [one._replace(tool=np.hstack([one.tool[:, :3], turning(one, -TURN).tool[:, 3:]])) for one in shown]
+    found = learned_pose(
+        [one.hands for one in (*shown, other[0])],
+        [one.hands for one in (*shown, other[0])],
+        [one.tool[:, 3:] for one in (*shown, other[0])],
+        [None] * 4,
+        list("abcd"),
+        points=80,
+    )
+    assert "contradicts itself" in found.unsafe[0]
+    assert "a (sample" in found.unsafe[0]
+    assert "d (sample" in found.unsafe[0]
+
+
+def test_a_constant_orientation_and_no_gripper_stay_out_of_the_skill(coarse: Skill) -> None:
+    assert coarse.turn is None
+    assert coarse.gripper is None
+    assert b"turn." not in coarse.file
+
+
+def test_a_skill_with_orientation_and_gripper_comes_back_from_its_file(posed: Skill) -> None:
+    back = decoded(posed.file, origin="x.npz")
+    hands, still = np.array([*PLACES[2].left, *PLACES[2].right]).reshape(2, 3), np.zeros((2, 3))
+    one, other = (skill.predict(hands, still, still) for skill in (posed, back))
+    assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
+    assert one.turn.covariance.tobytes() == other.turn.covariance.tobytes()
+    assert one.closure == other.closure
+    assert back.digest == posed.digest
+
+
+def test_places_teach_orientation_and_gripper_and_give_them_back(posed: Skill, skill: Skill) -> None:
+    x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
+    told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
+    hands, still = np.array([*told.left, *told.right]).reshape(2, 3), np.zeros((2, 3))
+    for one in (posed, skill, shipped()):  # the last is between places
+        taught = adapted(one, (*PLACES[:2], told), tolerance=0.05)
+        assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
+        missed = in_force(taught)[2].missed_by_rad
+        assert missed is not None
+        assert missed < 0.02
+        assert taught.predict(hands, still, still).closure < 0.1
+        assert decoded(taught.file, origin="x").digest == taught.digest
+        cleared = adapted(taught, (), tolerance=0.05)
+        assert (cleared.turn is None, cleared.gripper is None) == (one.turn is None, one.gripper is None)
+
+
+def test_places_that_contradict_each_other_are_refused(skill: Skill) -> None:
+    x, y, z, w = TOOL_ORIENTATION
+    near = ViaPoint("near", PLACES[2].left, PLACES[2].right, PLACES[2].tool, std=0.01, orientation=(y, x, w, z))
+    with pytest.raises(SkillError, match=r"'soldering' and 'near' contradict each other: .* turned by 1\d\d°"):
+        adapted(skill, (msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w)), near), tolerance=0.05)
+    near = msgspec.structs.replace(near, orientation=None, gripper="open")
+    with pytest.raises(SkillError, match="gripper open at one and closed"):
+        adapted(skill, (msgspec.structs.replace(PLACES[2], gripper="closed"), near), tolerance=0.05)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [('"orientation": [0, 0, 0, 0.5]', "norm 0.5; 1 needed"), ('"gripper": "ajar"', "gripper")],
+)
+def test_what_is_no_orientation_or_gripper_is_said(told: str, message: str) -> None:
+    point = f'{{"name": "a", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0], {told}}}'
+    with pytest.raises(RequestError, match=message):
+        decode_request(point.encode(), ViaPoint)
+
+
+def test_a_gripper_that_tells_millimetres_is_refused(shown: list[Demonstration]) -> None:
+    spoilt = [one._replace(gripper=80.0 * np.asarray(one.gripper)) for one in shown]
+    with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
+        learn(spoilt, components=5, points=60)
