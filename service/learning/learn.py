@@ -80,6 +80,7 @@ def learn(
     kept = [i for i in range(len(pairs)) if i not in twins]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
+    closures = [closure_in_phase(one) for one in demonstrations]
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     task = task_of(demonstrations) if components is None and ell is None else ""
@@ -117,7 +118,7 @@ def learn(
             _inputs(by_places, demonstrations, paths),
             [hands for hands, _ in paths],
             [pairs[i][1][:, 3:] for i in kept],
-            [closure_in_phase(one) for one in demonstrations],
+            closures,
             names,
             points=points,
             between_places=by_places is not None,

@@ -31,6 +31,15 @@ def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path:
         assert not a.flags.writeable
 
 
+def test_a_gripper_comes_back_with_its_demonstration_at_the_tools_stamps(tmp_path: Path) -> None:
+    stamps = START_NS + np.arange(50) * 10_000_000
+    poses, closure = np.random.default_rng(1).normal(size=(3, 50, 7)), np.linspace(0.0, 1.0, 50)
+    write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses, gripper=closure))
+    np.testing.assert_array_equal(read_demonstration(tmp_path / "a.mcap").gripper, closure)
+    with pytest.raises(ValueError, match=r"gripper/state: shape \(7,\) given"):
+        write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, *poses, gripper=closure[:7]))
+
+
 def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, frame: str = "base") -> None:
     """Writes poses as any ROS 2 recorder would: each topic at its own stamps."""
     with path.open("wb") as stream:

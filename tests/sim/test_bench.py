@@ -24,10 +24,15 @@ from wam import JOINT_NAMES
 from service.client import endpoints, open_session
 from service.config import WAM
 from service.contract import cdr, channels, messages
+from service.core.pose import CLOSED, OPEN
+from service.learning.learn import learn
+from service.learning.via_points import adapted
 from sim.bench import Bench, Observation
+from sim.experiments.rehearsal import rehearse
 from sim.network import Commands, Dropout, Live, RunReport, run
 from sim.scene import Scene
-from sim.script import HandScript, Teacher
+from sim.script import GRIP_S, HandScript, Teacher
+from sim.teach import demonstrations
 
 SCENE = Scene()
 STILL = (0.0,) * 7
@@ -54,6 +59,28 @@ class Follower:
         velocity = np.clip(velocity, -1.5, 1.5)
         self.joints = self.joints + 0.002 * velocity
         return tuple(self.joints.tolist()), tuple(velocity.tolist())
+
+
+def test_the_fingers_let_go_of_what_they_hold_when_they_are_told_to_open() -> None:
+    with Bench(HandScript(SCENE, seed=1)) as bench:
+        bench.begin()
+        assert bench.step(gripper=1.0).gripper == 1.0
+        held = bench.world.pose(bench.world.board).position
+        closures = [bench.step(gripper=0.0).gripper for _ in range(round(GRIP_S / bench.period_s))]
+        assert closures[-1] == pytest.approx(0.0, abs=1e-9)
+        assert closures[len(closures) // 2] == pytest.approx(0.5, abs=0.02)
+        assert held[2] > 0.2
+        assert bench.world.pose(bench.world.board).position[2] == pytest.approx(0.0)  # no hand was there to take it
+        assert not bench.events().handover.reached
+
+
+def test_a_learned_gripper_hands_the_board_over_and_grasps_the_glass() -> None:
+    shown = [one.every(2) for one in demonstrations(SCENE, count=3, seed=1, gripper=True)]
+    taught = adapted(learn(shown, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05)
+    run = rehearse(HandScript(SCENE, seed=31), lambda bench: taught, rate_hz=100, keep=True)
+    assert run.events.success
+    changes = np.flatnonzero(np.diff(run.frames["gripper"].astype(int)))
+    assert run.frames["gripper"][changes + 1].tolist() == [CLOSED, OPEN, CLOSED]
 
 
 @pytest.fixture
