@@ -169,7 +169,7 @@ class TestExperiments:
 
     def test_the_tool_turns_to_the_eyes_over_the_board(self, tmp_path: Path) -> None:
         found = numbers("orientation", tmp_path)
-        assert found["scenes"]["nominal"]["from_the_eyes_in_the_last_second_deg"] < 5
+        assert found["scenes"]["nominal"]["from_the_eyes_in_the_last_second_deg"] < 2
         assert found["scenes"]["nominal"]["success"]
         assert found["nominal_with_a_constant_orientation"]["from_the_eyes_in_the_last_second_deg"] > 30
 
