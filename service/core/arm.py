@@ -17,7 +17,6 @@ import pinocchio as pin
 from service.config import Settings
 from service.core.frame import Vector
 from service.core.inverse_kinematics import APART, NEAR, SPEED, joint_costs, joint_step, tool_speeds, tool_tasks
-from service.core.least_squares import TASKS
 from service.core.limiter import MARGIN, approach_gain
 from service.core.separation import Separation
 
@@ -58,8 +57,8 @@ class Closing(NamedTuple):
 class Kinematics(NamedTuple):
     """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
 
-    The tasks (6, J): the tool's velocity by the joints', and what turns it, in its own axes, times
-    TURN_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
+    The tasks (5 or 6, J): the tool's velocity by the joints', and what turns it, in its own axes,
+    times TURN_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
     """
 
     joints: Vector
@@ -89,9 +88,9 @@ class Arm:
         self._data = self._model.createData()
         fastest, hardest = settings.tool.max_speed, settings.tool.max_acceleration
         closing = closing or Closing(CLOSING_BRAKES * hardest, min(fastest, CLOSING_SPEED), FAR_DAMPING)
-        self._about = float(settings.tool.orientation == "full")
+        self._tasks = 6 if settings.tool.orientation == "full" else 5
         turn = settings.tool.max_turn_speed
-        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * fastest, turn, self._about])
+        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * fastest, turn])
         limits = settings.joints
         self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
         self._velocity = np.array(limits.velocity)
@@ -114,9 +113,9 @@ class Arm:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        rotation, tasks = placement.rotation.copy(), np.empty((TASKS, len(q)))
+        rotation, tasks = placement.rotation.copy(), np.empty((self._tasks, len(q)))
         jacobian = np.ascontiguousarray(jacobian)
-        damping = tool_tasks(jacobian, rotation, self._about, tasks)
+        damping = tool_tasks(jacobian, rotation, tasks)
         return Kinematics(q, placement.translation.copy(), rotation, tasks, damping, jacobian)
 
     def costs(self, here: Kinematics) -> Vector:

@@ -13,7 +13,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Vector
-from service.core.least_squares import TASKS, factorise, keep_under, least_squares, substitute
+from service.core.least_squares import factorise, keep_under, least_squares, substitute
 from service.core.rotation import axis_of, quaternion_of, swing, turn_between
 
 # Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.
@@ -111,7 +111,8 @@ def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> N
     """Into out (3, 3, J): joint speeds per tool velocity, by damped least squares, as shares of
     limits (3, J).
     """
-    root, right = np.empty((TASKS, TASKS)), np.empty(TASKS)
+    count = len(tasks)
+    root, right = np.empty((count, count)), np.empty(count)
     factorise(tasks, damping, root)
     for axis in range(3):
         right[:] = 0.0
@@ -119,28 +120,28 @@ def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> N
         substitute(root, right)
         for joint in range(tasks.shape[1]):
             speed = 0.0
-            for i in range(TASKS):
+            for i in range(count):
                 speed += tasks[i, joint] * right[i]
             for order in range(3):
                 out[order, axis, joint] = speed / limits[order, joint]
 
 
 @compiled
-def tool_tasks(jacobian: Vector, rotation: Vector, about: float, tasks: Vector) -> float:
-    """The tasks (6, J) of a tool's Jacobian (6, J) and rotation (3, 3), the last, which turns it
-    about its +z, times `about`; their damping [m²]: small, and growing smoothly where the tool's
-    position becomes singular.
+def tool_tasks(jacobian: Vector, rotation: Vector, tasks: Vector) -> float:
+    """The tasks (5 or 6, J) of a tool's Jacobian (6, J) and rotation (3, 3), the sixth turns it
+    about its +z; their damping [m²]: small, and growing smoothly where the tool's position becomes
+    singular.
     """
     joints = jacobian.shape[1]
     square = np.empty((3, 3))
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
-        for i in range(3):
+        for i in range(len(tasks) - 3):
             turn = 0.0
             for k in range(3):
                 turn += rotation[k, i] * jacobian[3 + k, joint]
-            tasks[3 + i, joint] = TURN_LEVER * (turn if i < 2 else about * turn)
+            tasks[3 + i, joint] = TURN_LEVER * turn
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -184,9 +185,9 @@ def joint_step(
     change (J,) [rad/s], with the first `count` of rows (K, J) times out at most limits (K,) [m/s];
     what is to be said of it.
     """
-    joints = len(q)
-    period, braking, closing_speed, far_damping, most, fastest_turn, about = closing
-    wanted, error, linear, turn = np.empty(TASKS), np.empty(3), np.empty(3), np.empty(3)
+    joints, rows_of_tasks = len(q), len(tasks)
+    period, braking, closing_speed, far_damping, most, fastest_turn = closing
+    wanted, error, linear, turn = np.empty(rows_of_tasks), np.empty(3), np.empty(3), np.empty(3)
     distance = 0.0
     for i in range(3):
         linear[i] = min(max(velocity[i], -FARTHEST), FARTHEST)
@@ -203,12 +204,12 @@ def joint_step(
     for i in range(3):  # the error decays as it will be, not as it is
         error[i] *= rate / (1.0 + POSITION_GAIN * period)
     _add_closing(linear, error, most)
-    _turn(rotation, orientation, turning, fastest_turn, about, turn)
-    for i in range(3):
-        wanted[i], wanted[3 + i] = linear[i], 0.0
+    _turn(rotation, orientation, turning, fastest_turn, rows_of_tasks == 6, turn)
+    wanted[:3], wanted[3:] = linear, 0.0
+    for i in range(rows_of_tasks - 3):
         for k in range(3):
-            wanted[3 + i] += TURN_LEVER * (1.0 if i < 2 else about) * rotation[k, i] * turn[k]
-    said, scaled, home, bounds = 0, np.empty((TASKS, joints)), np.empty(joints), np.empty((2, joints))
+            wanted[3 + i] += TURN_LEVER * rotation[k, i] * turn[k]
+    said, scaled, home, bounds = 0, np.empty((rows_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = q[j] - within[0, j], within[1, j] - q[j]
         if min(low, high) < NEAR_LIMIT:
@@ -216,7 +217,7 @@ def joint_step(
         bounds[0, j] = -gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = gain[j] * max(high, 0.0) / scale[j]
         home[j] = min(max(POSTURE_GAIN * (posture[j] - q[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
-        for i in range(TASKS):
+        for i in range(rows_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
     scaled_rows = np.empty((count, joints))
     for k in range(count):
@@ -288,14 +289,14 @@ def _turn(
     orientation: Vector,
     turning: Vector,
     fastest: float,
-    about: float,
+    about: bool,
     out: Vector,
 ) -> None:
     """Into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,) that
-    turns itself (3,) [rad/s]: all of it, or, with `about` 0, its +z the shortest way.
+    turns itself (3,) [rad/s]: all of it, also `about` its +z, or that the shortest way.
     """
     here, axis = np.empty(4), np.empty(3)
-    if about > 0.0:
+    if about:
         quaternion_of(rotation, here)
         turn_between(here, orientation, out)
     else:

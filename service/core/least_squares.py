@@ -11,7 +11,6 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 
-TASKS = 6  # three of the tool's velocity, three that turn it
 LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
 ROUNDS = 40  # inequalities that may be met or left in one step
@@ -52,7 +51,7 @@ def least_squares(
     """Into result the x (J,) in bounds (2, J) with least |tasks x - wanted|² + damping |x -
     posture|², by an active-set method.
     """
-    joints = len(posture)
+    joints, count = len(posture), len(wanted)
     free, best = np.ones(joints), np.empty(joints)
     _solve(tasks, wanted, posture, damping, free, posture, result)
     inside = True
@@ -62,7 +61,7 @@ def least_squares(
             result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
     if inside:
         return
-    rest = np.empty(TASKS)
+    rest = np.empty(count)
     for _ in range(BOUND_ROUNDS):
         _solve(tasks, wanted, posture, damping, free, result, best)
         blocked, least = -1, 1.0
@@ -80,7 +79,7 @@ def least_squares(
             free[blocked] = 0.0
             continue
         result[:] = best
-        for i in range(TASKS):
+        for i in range(count):
             rest[i] = -wanted[i]
             for j in range(joints):
                 rest[i] += tasks[i, j] * result[j]
@@ -89,7 +88,7 @@ def least_squares(
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
             slope = damping * (result[j] - posture[j])
-            for i in range(TASKS):
+            for i in range(count):
                 slope += tasks[i, j] * rest[i]
             gained = slope if result[j] >= bounds[1, j] else -slope
             if gained > most:
@@ -103,12 +102,12 @@ def least_squares(
 def _solve(
     tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
 ) -> None:
-    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of six
-    equations.
+    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of as
+    many equations as there are tasks.
     """
-    joints = len(posture)
-    part, root, right = np.empty((TASKS, joints)), np.empty((TASKS, TASKS)), np.empty(TASKS)
-    for i in range(TASKS):
+    joints, count = len(posture), len(wanted)
+    part, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
+    for i in range(count):
         right[i] = wanted[i]
         for j in range(joints):
             part[i, j] = tasks[i, j] * free[j]
@@ -117,7 +116,7 @@ def _solve(
     substitute(root, right)
     for j in range(joints):
         out[j] = posture[j] if free[j] > 0.0 else held[j]
-        for i in range(TASKS):
+        for i in range(count):
             out[j] += part[i, j] * right[i]
 
 
@@ -143,10 +142,10 @@ def keep_under(
     if _share_within(bounds, rows, limits, count, x) == 1.0:
         return False
     joints = len(x)
-    turned, root = np.empty((joints, TASKS)), np.empty((joints, joints))
+    turned, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
     for j in range(joints):
         x[j] = damping * posture[j]
-        for i in range(TASKS):
+        for i in range(len(wanted)):
             turned[j, i] = tasks[i, j]
             x[j] += tasks[i, j] * wanted[i]
     factorise(turned, damping, root)

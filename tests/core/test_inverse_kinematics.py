@@ -34,13 +34,13 @@ def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> Non
     np.testing.assert_allclose(found, best, atol=1e-7)
 
 
-@pytest.mark.parametrize("about", [0.0, 1.0])
-def test_tasks_are_the_tool_s_velocity_and_what_turns_it(about: float) -> None:
+@pytest.mark.parametrize("count", [5, 6])
+def test_tasks_are_the_tool_s_velocity_and_what_turns_it(count: int) -> None:
     random = np.random.default_rng(1)
     jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
-    tasks = np.empty((6, 7))
-    damping = tool_tasks(jacobian, rotation, about, tasks)
-    expected = np.vstack([jacobian[:3], TURN_LEVER * np.diag([1.0, 1.0, about]) @ rotation.T @ jacobian[3:]])
+    tasks = np.empty((count, 7))
+    damping = tool_tasks(jacobian, rotation, tasks)
+    expected = np.vstack([jacobian[:3], TURN_LEVER * rotation.T @ jacobian[3:]])[:count]
     np.testing.assert_allclose(tasks, expected, rtol=1e-12, atol=1e-15)
     assert damping == DAMPING  # far from singular
 
