@@ -25,6 +25,7 @@ GROUPS = {
         "install",
         "tutorial",
         "places",
+        "pose",
         "recordings",
         "reports",
         "viewing",

@@ -28,7 +28,7 @@ from service.launch import launched
 from service.shell.door import BOUNDS
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state", "tool/pose", "objects")
+INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", "objects")
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2
