@@ -224,7 +224,8 @@ def joint_step(
         for j in range(joints):
             scaled_rows[k, j] = rows[k, j] * scale[j]
     least_squares(scaled, wanted, home, damping, bounds, out)
-    if keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, out):
+    kept = keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, out)
+    if kept:
         said |= APART
     if not _can_have(out, moving, scale, fastest, change):  # it turns as far as costs its position nothing
         free = np.empty(joints)
@@ -233,7 +234,8 @@ def joint_step(
             home[j] = moving[j] / scale[j]
         least_squares(scaled, wanted, home, damping, bounds, free)
         keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, free)
-        _turn_less(out, free, moving, scale, fastest, change)
+        if not kept:  # what keeps distances was found for this solution, not for one on the way to it
+            _turn_less(out, free, moving, scale, fastest, change)
     excess = _excess(out, scale, fastest)
     for j in range(joints):
         if math.isnan(excess):

@@ -36,12 +36,14 @@ class Task(NamedTuple):
         return int(self.inputs.max()) + 1
 
     def layout(self, places: Places) -> Layout:
-        """Where this task's places are, those of a hand that are one at their mean."""
-        at = places.at[[places.names.index(name) for name in self.names]]
+        """Where this task's places are: those of a hand that are one at the mean of the known."""
+        rows = [places.names.index(name) for name in self.names]
+        at, told = places.at[rows], np.array([not places.known or name in places.known for name in self.names])
         hands = np.zeros((2, MOST_CORNERS, 3))
         for side in (0, 1):
             for corner in range(int(self.corners[:, side].max()) + 1):
                 here = self.corners[:, side] == corner
+                here &= told if (here & told).any() else True
                 hands[side, corner] = at[here, 3 * side : 3 * side + 3].mean(axis=0)
         return Layout(hands, at[:, 6:].copy(), places.std)
 
@@ -57,11 +59,14 @@ class Layout(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Named places: hands and tool (N, 9) [m] at each, and how sure that is, of each axis [m]."""
+    """Named places: hands and tool (N, 9) [m] at each; how sure that is, of each axis [m]; and
+    which were told in this scene, none: all alike.
+    """
 
     names: tuple[str, ...]
     at: Vector
     std: float = 0.0
+    known: tuple[str, ...] = ()
 
     @staticmethod
     def of(points: Sequence[ViaPoint]) -> Places:
@@ -74,4 +79,4 @@ class Places(NamedTuple):
         other = Places.of([point for point in points if point.name in self.names])
         at = self.at.copy()
         at[[self.names.index(name) for name in other.names]] = other.at
-        return Places(self.names, at, other.std)
+        return Places(self.names, at, other.std, other.names)

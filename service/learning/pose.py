@@ -28,8 +28,7 @@ NOTED, UNSAFE = 0.01, 0.10  # shares of the samples that contradict others
 NOTED_DEG = 15.0  # error of demonstrations that were held out
 ALONE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # of a single demonstration, which tells nothing of others
 # The gripper's is short, 2 cm, as it opens and closes where the hands arrive; off all data it is
-# undecided and stays as it is. Tried on 25 scenes with places up to 15 cm away: with 13 cm it opens
-# on the way to 22 of them.
+# undecided and stays as it is.
 GRIPPER_ELL = 1000.0  # [1/m²]
 GRIPPER_ELL_BETWEEN = 60.0  # the same of a skill between places, whose inputs are shares
 UNDECIDED = 0.5

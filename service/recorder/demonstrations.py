@@ -123,7 +123,9 @@ def read_demonstration(
         )
     left, right, tool = (_resampled(stamps, *row) for row in rows)
     stamps.setflags(write=False)
-    return Demonstration(stamps, left, right, tool, BASE, recorded.places, recorded.closures(stamps))
+    return Demonstration(
+        stamps, left, right, tool, BASE, recorded.places, recorded.closures(stamps, logged=bool(clocks))
+    )
 
 
 def _is_pose(poses: Vector) -> NDArray[np.bool_]:

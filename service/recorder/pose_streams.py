@@ -192,11 +192,14 @@ class Recorded:
         source = f"{topic}, by the URDF"
         return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
 
-    def closures(self, stamps: NDArray[np.int64]) -> Vector | None:
+    def closures(self, stamps: NDArray[np.int64], *, logged: bool = False) -> Vector | None:
         """How far the gripper is closed (T,) at stamps (T,) [ns], as the first joint of the topic
-        ending in `gripper/state` tells; None where there is none. Raises RecordingError.
+        ending in `gripper/state` tells, by the times of recording where `logged`; None where there
+        is none. Raises RecordingError.
         """
         topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
+        if len(topics) > 1:
+            raise RecordingError(f"{self.path}: topics {', '.join(sorted(topics))}: one gripper needed")
         told: dict[int, float] = {}
         for logged_ns, data in self._raw[topics[0]] if topics else ():
             try:
@@ -205,7 +208,7 @@ class Recorded:
                 raise RecordingError(f"{self.path}: {topics[0]}: {error}") from None
             if not np.isfinite(state.position[:1]).all() or not state.position:
                 raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {state.stamp_ns} ns")
-            told[state.stamp_ns or logged_ns] = state.position[0]
+            told[logged_ns if logged else state.stamp_ns or logged_ns] = state.position[0]
         if not told:
             return None
         at = np.array(sorted(told), np.int64)

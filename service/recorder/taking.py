@@ -1,5 +1,5 @@
-"""Taking a demonstration: hands and tool of a cell, heard over Zenoh until somebody ends it or all
-is at rest, and written as they came.
+"""Taking a demonstration: hands, tool and gripper of a cell, heard over Zenoh until somebody ends
+it or all is at rest, and written as they came.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from service.contract.messages import BASE, PoseStamped, WireError, finite, in_o
 from service.core.frame import Vector
 from service.core.intake import UNIT_M
 from service.recorder.mcap_file import McapFile, machine
-from service.recorder.pose_streams import ENDINGS, JOINT_STATES
+from service.recorder.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES
 from service.recorder.tool import tool_poses
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
-HEARD = (*HANDS, TOOL, JOINT_STATES)
+HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
 REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, and hands tremble
 TOLD = 0.7  # of that time samples have to cover
 MOVED = 5.0  # times that, before rest is the end
@@ -86,6 +86,8 @@ class Take:
             if not finite(message.position + message.orientation):
                 raise WireError("a pose that is not finite")
             return UNIT_M[self.settings.hands.unit if key in HANDS else "m"] * np.array(message.position)
+        if key == GRIPPER_STATE:
+            return np.array(message.position[:1])
         return np.array(in_order(message, self.settings.joints.names)[0])
 
     @property

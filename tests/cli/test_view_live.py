@@ -81,7 +81,7 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert page.ask("GET", "/", Host="elsewhere.example")[0] == 403  # a name that was made to point here
     assert page.ask("POST", "/shutdown", X_Thirdhand_Token=token)[0] == 404
     assert page.ask("POST", "/hold", bytes(10_000), X_Thirdhand_Token=token)[0] == 413
-    assert page.daemon.client.status()["mode"] == "follow"
+    assert page.daemon.client.ask("status")["mode"] == "follow"
     code, text = page.ask("POST", "/hold", X_Thirdhand_Token=token)
     assert (code, text.split(" ")[0]) == (200, "hold")
     assert page.daemon.until(lambda status: status["mode"] == "hold")["reason"] == "operator"
@@ -107,7 +107,7 @@ def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere
 def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scene_to_who_comes_late(
     page: Page, tmp_path: Path
 ) -> None:
-    age_s = screenshot(page.daemon.client.status()["scribe"]["live"], tmp_path / "live.png")
+    age_s = screenshot(page.daemon.client.ask("status")["scribe"]["live"], tmp_path / "live.png")
     assert age_s is not None
     assert age_s > 0
     assert FRESH_S == 1.0

@@ -147,7 +147,7 @@ def test_rows_are_how_fast_distances_shrink() -> None:
 
 
 class _Nothing:
-    digest = bytes(16)
+    digest, orientation = bytes(16), (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -252,7 +252,7 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
         seen = frames(Controller(settings, taught, urdf=URDF), [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)])
         assert (seen["mode"] == Mode.FOLLOW).all()
         assert (seen["flags"] & Flag.SEPARATION).any()
-        assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.065
+        assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.07
         for q in seen["joints"][::5]:
             capsules, near = placed(q), np.empty(9)
             if settings.obstacles.boxes:

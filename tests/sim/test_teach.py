@@ -37,9 +37,9 @@ def test_a_file_holds_hands_and_tool_at_a_hundred_hertz_in_frame_base(tmp_path: 
                 "cdr",
             )
             found.setdefault(channel.topic, []).append(cdr.decode_pose(message.data))
-    assert set(found) == {"lab/bench2/hands/left", "lab/bench2/hands/right", "lab/bench2/tool/pose"}
+    assert set(found) == {"/lab/bench2/hands/left", "/lab/bench2/hands/right", "/lab/bench2/tool/pose"}
     for topic, poses in (("hands/left", taught.left), ("hands/right", taught.right), ("tool/pose", taught.tool)):
-        messages = found[f"lab/bench2/{topic}"]
+        messages = found[f"/lab/bench2/{topic}"]
         assert {message.frame_id for message in messages} == {"base"}
         np.testing.assert_array_equal([message.stamp_ns for message in messages], taught.stamps_ns)
         np.testing.assert_array_equal([(*message.position, *message.orientation) for message in messages], poses)
