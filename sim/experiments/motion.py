@@ -16,11 +16,12 @@ import msgspec
 import numpy as np
 import rerun as rr
 
-from service.cli.usage import shipped
+from service.cli.usage import recordings
 from service.config import Settings
 from service.core.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
+from service.learning.skill_file import decoded
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
 from sim.experiments.linear_floor import Floor, best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
@@ -38,6 +39,7 @@ LABELS = {
     "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
 }
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
 TEACHERS, TAUGHT_S, TAUGHT_EVERY = range(100, 105), 20.0, 10  # people whom nobody follows, and ticks a sample
 LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # of their tool
@@ -115,7 +117,8 @@ _known: dict[str, Any] = {}
 
 def prepare(share: float) -> None:
     """Loads the skills and what follows by them, once in a process."""
-    skill = shipped()
+    # a function of where hands are alone: then how the tool follows is the followers' doing
+    skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
     _known.update({which: (one, followers(one, share)) for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other))})
 

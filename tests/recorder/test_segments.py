@@ -203,6 +203,7 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
     assert recordings[1].with_suffix(".rrd").stat().st_size > 10_000
 
 
+@pytest.mark.timed
 def test_a_limit_on_files_interrupts_a_recording_until_it_is_lifted(tmp_path: Path) -> None:
     with session(folder=tmp_path) as one:
         one.until(lambda status: status["sent"] > 200)

@@ -54,7 +54,7 @@ class Cell:
         self._loop.start()
         self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
         self.session = far
-        self.client = Client(far, self.settings.cell)
+        self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
         self.client.wait_until_ready()
 
     def status(self) -> requests.Status:
