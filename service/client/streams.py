@@ -72,7 +72,10 @@ class Tracker:
 
     def heard(self) -> bool:
         """Whether a daemon of the cell is alive, and both hands are listened to."""
-        listened = all(publisher.matching_status for publisher in self._publishers.values())
+        listened = all(
+            publisher.matching_status.matching  # type: ignore[attr-defined]
+            for publisher in self._publishers.values()
+        )
         return listened and bool(living(self._session, self._cell))
 
     def close(self) -> None:
