@@ -15,7 +15,7 @@ from service.client.session import RefusedError, UnreachableError
 from service.contract import channels, requests
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
-ASKED_AGAIN_S = 0.05
+ASKED_AGAIN_S, TIMES_ASKED = 0.05, 5
 Answer = TypeVar("Answer")
 
 
@@ -98,7 +98,7 @@ class Client:
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
-        alive: frozenset[str] | None = None
+        kept = False  # whether a storage answered
         for reply in self._session.get(
             self._key(suffix),
             payload=payload,
@@ -110,18 +110,26 @@ class Client:
             text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")
             if text == "Timeout":
                 continue
-            if alive is None:
-                alive = living(self._session, self._cell, timeout_s=self._timeout_s)
-            if reply.replier_id is None or str(reply.replier_id.zid) not in alive:
+            if reply.replier_id is None or not self._is_alive(str(reply.replier_id.zid)):
+                kept = True
                 continue
             if reply.ok is None:
                 raise RefusedError(text or "no reason given")
             return reply.ok.payload.to_bytes()
         raise UnreachableError(
             f"nobody answers on {self._key(suffix)}: is the daemon running there, and is the cell's name right?"
-            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps what one said."
-            * (alive is not None)
+            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps what one said." * kept
         )
+
+    def _is_alive(self, own: str) -> bool:
+        """Whether a daemon of the cell has this Zenoh session. Tokens are missing for a moment while
+        others join or leave: so it is asked more than once.
+        """
+        for _ in range(TIMES_ASKED):
+            if own in living(self._session, self._cell, timeout_s=self._timeout_s):
+                return True
+            time.sleep(ASKED_AGAIN_S)
+        return False
 
     def _key(self, suffix: str) -> str:
         return channels.key(self._cell, suffix)
