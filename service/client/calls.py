@@ -122,8 +122,9 @@ class Client:
         )
 
     def _is_alive(self, own: str) -> bool:
-        """Whether a daemon of the cell has this Zenoh session. Tokens are missing for a moment while
-        others join or leave: so it is asked more than once.
+        """Whether a daemon of the cell has this Zenoh session.
+
+        Tokens are missing for a moment while others join or leave: so it is asked more than once.
         """
         for _ in range(TIMES_ASKED):
             if own in living(self._session, self._cell, timeout_s=self._timeout_s):
