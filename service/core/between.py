@@ -74,7 +74,11 @@ class Placed:
         seen: Vector | None = None,
         errors: Vector | None = None,
     ) -> Placed:
-        """A KMP of shares among places, and its errors; without those it knows inputs alone."""
+        """A KMP of shares among places, and its errors; without those it knows inputs alone.
+
+        All arrays are copies: what came from elsewhere may be read-only, for which loops would be
+        compiled once more, while they run.
+        """
         if primitive is None:
             scale, centres, weights, prior = (
                 1.0,
@@ -84,25 +88,25 @@ class Placed:
             )
         else:
             scale = float(primitive.kernel.coordinates(1)[0])
-            centres = np.ascontiguousarray(primitive.centres)
-            weights = np.ascontiguousarray(primitive.weights.reshape(-1, primitive.outputs))
+            centres = primitive.centres
+            weights = primitive.weights.reshape(-1, primitive.outputs)
             prior = primitive.prior_mean
         return cls(
-            task,
-            layout,
+            Task(task.names, *(np.array(part, order="C") for part in task[1:])),
+            Layout(np.array(layout.hands, order="C"), np.array(layout.tool, order="C"), layout.std),
             scale,
-            centres,
-            weights,
-            prior,
-            np.empty((0, task.width)) if seen is None else seen,
-            np.empty((0, 3)) if errors is None else errors,
+            np.array(centres, order="C"),
+            np.array(weights, order="C"),
+            np.array(prior, order="C"),
+            np.empty((0, task.width)) if seen is None else np.array(seen, order="C"),
+            np.empty((0, 3)) if errors is None else np.array(errors, order="C"),
             np.empty((0, 6)),
             np.empty((0, 3)),
         )
 
     def through(self, taught: Vector, pulls: Vector) -> Placed:
         """The same, that is moved around some hands."""
-        return replace(self, taught=np.ascontiguousarray(taught), pulls=np.ascontiguousarray(pulls))
+        return replace(self, taught=np.array(taught, order="C"), pulls=np.array(pulls, order="C"))
 
     def at_rest(self, hands: Vector) -> Vector:
         """`mean` of hands (T, 6) that rest."""

@@ -5,6 +5,7 @@ then there.
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import replace
 
 import msgspec
@@ -31,13 +32,30 @@ def rehearse(settings: Settings, skill: Skill, *, urdf: str) -> None:
     one rehearsed with.
     """
     arm = msgspec.structs.replace(settings.arm, source="state")
+    plain = replace(skill, threshold=math.inf)
     skill = replace(
-        skill,
-        threshold=math.inf,
+        plain,
         turn=skill.turn or LearnedOrientation(_flat(skill, 3), skill.orientation),
         gripper=skill.gripper or LearnedGripper(_flat(skill, 1)),
     )
-    controller = Controller(msgspec.structs.replace(settings, arm=arm), skill, urdf=urdf)
+    for one in (plain, skill):
+        one.predict(*np.zeros((3, 2, 3)))
+    for one in (skill, _as_sent(skill), _as_sent(plain)):
+        _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
+
+
+def _as_sent(skill: Skill) -> Skill:
+    """The skill as another process gives it back: its arrays are read-only, and loops are compiled
+    once more for those.
+    """
+    parts: list[bytes] = []
+    data = pickle.dumps(skill, protocol=5, buffer_callback=lambda part: parts.append(bytes(part.raw())))
+    sent: Skill = pickle.loads(data, buffers=parts)
+    return sent
+
+
+def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
+    controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
     count = rest_ticks(settings) + REHEARSED_TICKS
     for index in range(count):
