@@ -22,7 +22,7 @@ from service.config import Settings
 from service.contract.messages import BASE, Thing
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
-from sim.world import BOARD_IN_TOOL, LEVEL, Floats, Pose, World, carried_by, seen_from
+from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
 STILL_S = 0.25  # of rest is settled
@@ -31,6 +31,7 @@ REJOIN_AFTER_S = 0.1  # without a command; then the next one must begin where th
 REJOIN_RAD, REJOIN_RADPS = 0.02, 0.05  # how nearly
 HOLDS = 0.5  # closed so far the fingers hold what is between them
 TAIL_S = 0.5  # watched after the script's end
+CATCH_UP_RADPS = 0.25  # beside the commanded speed, at most, by the joint that is farthest behind
 STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
 
 
@@ -229,7 +230,20 @@ class Bench:
                 self._command = (self._observation.joints, (0.0,) * len(self._observation.joints))
             position, velocity = self._command
             position = tuple(q + age_s * dq for q, dq in zip(position, velocity, strict=True))
-        self.world.follow(position, self._command[1])
+        self.world.follow(self._caught_up(position), self._command[1])
+
+    def _caught_up(self, position: Floats) -> Floats:
+        """Where the motors go in this step.
+
+        A bench that a busy machine held up finds the commands far ahead. The servo of an arm never
+        sleeps: it would not leap after them, and this one does not either.
+        """
+        at = self._observation.joints
+        behind = max(abs(told - is_at) for told, is_at in zip(position, at, strict=True))
+        most = CATCH_UP_RADPS * self.period_s / POSITION_GAIN
+        if behind <= most:
+            return position
+        return tuple(is_at + most / behind * (told - is_at) for told, is_at in zip(position, at, strict=True))
 
     def _grip(self, told: float | None) -> None:
         """Moves the fingers on toward the newest command."""

@@ -20,6 +20,7 @@ from sim.scene import HAND_ORIENTATION, Scene
 Floats = tuple[float, ...]
 ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule's own axis is z
 LEVEL = (0.0, 0.0, 0.0, 1.0)
+POSITION_GAIN = 0.3  # this much of a position error is made up in one step
 TABLE_THICKNESS = 0.04  # [m]
 GREEN, STEEL, WOOD, SKIN, BLUE = (
     (0.1, 0.5, 0.2, 1.0),
@@ -71,8 +72,7 @@ class World:
         self._tool = next(info[0] for info in joints if info[12].decode() == settings.arm.plate)
         self._joints = [index[name] for name in names]
         self._efforts = [joints[j][10] for j in self._joints]  # [N m]
-        # With the velocity fed forward, this much of a position error is made up in one step.
-        self._position_gains, self._velocity_gains = [0.3] * len(names), [1.0] * len(names)
+        self._position_gains, self._velocity_gains = [POSITION_GAIN] * len(names), [1.0] * len(names)
         for joint, angle in zip(self._joints, posture, strict=True):
             pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self._id)
         self.follow(posture, (0.0,) * len(names))

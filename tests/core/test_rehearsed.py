@@ -7,48 +7,84 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 from tests_paths import RECORDINGS
 
-SCRIPT = """
+COUNTED = """
+import importlib
+import pkgutil
 import sys
+from pathlib import Path
+
 from service import one_blas_thread
 from numba.core.dispatcher import Dispatcher
-from service.config import Settings, robot_description
-from kmp import compiled_query
-from service.core import (
-    capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation, setpoint, skill,
-    stops, workspace,
-)
-from service.core.rehearsal import rehearse
-from service.cli.main import main
-from service.cli.usage import shipped
 
-MODULES = (
-    compiled_query, capsules, frame, hand_estimator, intake, inverse_kinematics, least_squares, limiter, separation,
-    setpoint, skill, stops, workspace,
-)
+import kmp
+import service.core
+from service.config import Settings, robot_description
+from service.core.rehearsal import rehearse
+
+LOOPED = [
+    importlib.import_module(found.name)
+    for package in (kmp, service.core)
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
+    if not found.name.endswith("__main__")
+]
 
 def compiled():
     return {
-        name: len(f.signatures) for module in MODULES for name, f in vars(module).items() if isinstance(f, Dispatcher)
+        f"{name} of {module.__name__}": len(function.signatures)
+        for module in LOOPED
+        for name, function in vars(module).items()
+        if isinstance(function, Dispatcher)
     }
 
-nothing = compiled()
-rehearse(Settings(), shipped(), urdf=robot_description(Settings()))
-before = compiled()
-assert before != nothing and set(nothing.values()) == {0}, nothing
+def since(before):
+    return {name: count - before[name] for name, count in compiled().items() if count != before[name]}
+
+def rehearsed(skill):
+    so_far = compiled()
+    rehearse(Settings(), skill, urdf=robot_description(Settings()))
+    assert since(so_far)
+    return compiled()
+"""
+REPLAYED = """
+from service.cli.main import main
+from service.cli.usage import shipped
+
+before = rehearsed(shipped())
 assert main(["replay", sys.argv[1]]) in (0, None)
-assert compiled() == before, (before, compiled())
+assert since(before) == {}, since(before)
+"""
+FROM_THE_WORKSHOP = """
+from service.shell.workshop import Workshop
+from sim.experiments.rehearsal import rehearse as played
+from sim.scene import Scene
+from sim.script import HandScript
+
+workshop = Workshop()
+loaded = workshop.load(Path(sys.argv[1]), timeout_s=60.0)
+before = rehearsed(loaded)
+adapted = workshop.adapt(loaded, Scene().via_points(), tolerance=0.05, timeout_s=60.0)
+workshop.close()
+for skill in (loaded, adapted):
+    played(HandScript(Scene(), seed=1), lambda bench: skill)
+assert since(before) == {}, since(before)
 """
 
 
-def test_a_rehearsal_leaves_nothing_to_compile() -> None:
+def done_in_a_process(script: str, *arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(RECORDINGS / "golden.mcap")],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
+        [sys.executable, "-c", COUNTED + script, *arguments], capture_output=True, text=True, timeout=240, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "identical" in done.stdout
+    return done.stdout
+
+
+def test_a_rehearsal_leaves_nothing_to_compile() -> None:
+    assert "identical" in done_in_a_process(REPLAYED, str(RECORDINGS / "golden.mcap"))
+
+
+@pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
+def test_neither_does_a_skill_that_another_process_gave_back(file: str) -> None:
+    done_in_a_process(FROM_THE_WORKSHOP, str(RECORDINGS / file))

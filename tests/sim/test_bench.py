@@ -164,6 +164,17 @@ def test_the_arm_brakes_twenty_milliseconds_after_the_last_command(bench: Bench)
     assert seen.joints[0] - joints[0] < 0.8 * 0.025
 
 
+def test_an_arm_that_finds_its_commands_far_ahead_does_not_leap_after_them(bench: Bench) -> None:
+    joints = np.array(bench.observe().joints)
+    speed, speeds = np.array([0.8, 0, 0, 0, 0, 0, 0]), []
+    for tick in range(400):
+        joints = joints + (26 if tick == 100 else 1) * 0.002 * speed  # the bench had slept for 50 ms
+        seen = bench.step(tuple(joints), tuple(speed))
+        speeds.append(max(map(abs, seen.joint_velocities)))
+    assert max(speeds) < 0.8 + 0.3
+    assert seen.joints[0] == pytest.approx(joints[0] + 0.002 * 0.8, abs=1e-3)
+
+
 def test_what_a_mended_network_sends_late_does_not_move_the_arm(bench: Bench) -> None:
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
