@@ -7,13 +7,18 @@ from service import one_blas_thread  # noqa: F401
 # isort: split
 import importlib.util
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 from tests_paths import RECORDINGS
 
+from service.config import Settings, robot_description
+from service.contract.requests import ViaPoint
+from service.core import rehearsal
 from service.core.skill import Skill
 from service.learning.skill_file import decoded
+from service.shell.workshop import Workshop
 
 
 class _NoBench:
@@ -27,6 +32,23 @@ class _NoBench:
 
 if importlib.util.find_spec("pybullet") is None:
     sys.meta_path.insert(0, _NoBench)  # type: ignore[arg-type]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """In a fresh checkout, compiles what a daemon compiles at its first start.
+
+    Each test of a daemon would else do so in a process of its own, and time out where several do.
+    """
+    compiled = any((Path(rehearsal.__file__).parent / "__pycache__").glob("*.nbi"))
+    if compiled or hasattr(config, "workerinput"):
+        return
+    place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
+    workshop = Workshop()
+    for name in ("soldering.npz", "experiments/as-paper.npz"):
+        loaded = workshop.load(RECORDINGS / name, timeout_s=120.0)
+        for one in (loaded, workshop.adapt(loaded, [place], tolerance=0.05, timeout_s=120.0)):
+            rehearsal.rehearse(Settings(), one, urdf=robot_description(Settings()))
+    workshop.close()
 
 
 @pytest.fixture(scope="session")

@@ -19,12 +19,11 @@ from service.core.between import Placed, with_hands
 from service.core.frame import Vector
 from service.core.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
 from service.core.skill import LearnedBetween
+from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, Gate, between, nonsense
 from service.learning.judgement import HeldOut
 
-ELL = 4.0  # of the kernel, whose inputs are shares
-DEVIATION = 0.05  # of a demonstration's sample, in shares and metres
 EACH = 30  # samples of a demonstration that are learned from, and
 ERRORS_OF_EACH = 40  # that its errors are kept of
 SMOOTHED_S = 0.28  # of the hands in demonstrations
@@ -34,7 +33,19 @@ LEAST_SAMPLES_S = 0.4  # there, for a pair of places to be known
 UNSEEN = (0.15, 0.3, 0.45)  # of the way to a pair that was not: the tool stays
 TAUGHT = 1e-4  # deviation of the share at a known pair
 FALSE = 0.005  # of the time may the gate hold: hands that start elsewhere come nearer, and are to be followed
+BETTER = 0.98  # by which share of the error other parameters must be better than the usual ones
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
+
+
+class Parameters(NamedTuple):
+    """What a KMP between places is fitted with."""
+
+    ell: float  # of the kernel, whose inputs are shares
+    deviation: float  # of a demonstration's sample, in shares and metres
+
+
+USUAL = Parameters(4.0, 0.05)
+TRIED = (USUAL, *(Parameters(ell, d) for ell in (1.0, 2.0, 4.0, 8.0, 16.0) for d in (0.05, 0.15) if (ell, d) != USUAL))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +132,16 @@ def merged(task: Task, told: Sequence[Told]) -> Task:
     return task._replace(inputs=inputs)
 
 
-def fitted(task: Task, told: Sequence[Told]) -> KMP:
+def fitted(task: Task, told: Sequence[Told], parameters: Parameters = USUAL) -> KMP:
     """The KMP, with the tool at its place wherever both hands were found to be at theirs."""
     inputs = np.concatenate([one.inputs[one.rows] for one in told])
     outputs = np.concatenate([one.wanted[one.rows] for one in told])
     width = outputs.shape[1]
-    reference = Gaussians(outputs, np.tile(DEVIATION**2 * np.eye(width), (len(inputs), 1, 1)))
+    reference = Gaussians(outputs, np.tile(parameters.deviation**2 * np.eye(width), (len(inputs), 1, 1)))
     primitive = KMP.fit(
         inputs,
         reference,
-        kernel=GaussianKernel(ELL),
+        kernel=GaussianKernel(parameters.ell),
         lambda_mean=1.0,
         prior_mean=outputs.mean(axis=0),
         representation="dense",
@@ -244,13 +255,16 @@ def learned(
     pairs = list(zip(demonstrations, paths, strict=True))
     task = merged(task, [Told.of(task, one, *path) for one, path in pairs])
     told = [Told.of(task, one, *path) for one, path in pairs]
-    progress(f"learning from all {len(told)}")
-    primitive = fitted(task, told)
     errors: list[Vector] = []
-    for i, one in enumerate(told):
-        progress(f"holding out demonstration {i + 1} of {len(told)}")
-        without = fitted(task, told[:i] + told[i + 1 :] or told)
-        errors.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.velocities))
+    parameters, least = USUAL, np.inf
+    for i, tried in enumerate(TRIED):
+        progress(f"holding out each of {len(told)} demonstrations, parameters {i + 1} of {len(TRIED)}")
+        found = _left_out(task, told, tried)
+        error = rms(np.concatenate(found))
+        if error < least:
+            parameters, errors, least = tried, found, BETTER * error if tried == USUAL else error
+    progress(f"learning from all {len(told)}")
+    primitive = fitted(task, told, parameters)
     rows = [
         np.linspace(0, len(one.inputs) - 1, min(ERRORS_OF_EACH, len(one.inputs))).round().astype(int) for one in told
     ]
@@ -269,6 +283,17 @@ def learned(
     )
     known = LearnedBetween(task, nominal, np.concatenate(seen), np.concatenate(kept))
     return Learned(primitive, known, held_out, _gate(task, told))
+
+
+def _left_out(task: Task, told: Sequence[Told], parameters: Parameters) -> list[Vector]:
+    """The tool's errors (T, 3) [m] in each demonstration, as predicted from the others; of a single
+    one, from itself.
+    """
+    out = []
+    for i, one in enumerate(told):
+        without = fitted(task, [*told[:i], *told[i + 1 :]] or told, parameters)
+        out.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.velocities))
+    return out
 
 
 def _gate(task: Task, told: Sequence[Told]) -> Gate:
