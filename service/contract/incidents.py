@@ -113,7 +113,11 @@ REJECTIONS = {
     ),
     "jumped": Incident(
         "a hand or a joint that leapt; a hand is believed after three samples over 20 ms that agree",
-        "look for a tracker that takes one hand for the other, and for a second source",
+        "look for reflections and for a second source",
+    ),
+    "swapped": Incident(
+        "a hand where the other one was, and the other where it was; believed after 2 s",
+        "the tracker takes left for right: let it see both hands apart for a moment",
     ),
     "wrong_frame": Incident(
         "a pose in a frame that is neither `base` nor the configured one",

@@ -63,6 +63,7 @@ class Cause(enum.IntEnum):
     AHEAD = 6  # stamped later than the time that has passed explains
     JUMPED = 7  # not where it can have come to, and not yet confirmed
     WRONG_FRAME = 8
+    SWAPPED = 9  # where the other hand was, while that is said to be where this one was
 
 
 PER_JOINT = 0  # in a shape: one for each joint of the arm
@@ -127,7 +128,8 @@ STATE = (
     Field("gripper_tick", "int64"),  # at which the gripper was told to move
     Field("rest_tick", "int64"),  # since which the arm tells one posture, `rest`, and nothing else
     Field("told_ticks", "int64", (len(SOURCES), 2)),  # the last two at which a sample could have been right
-    Field("doubts", "int64", (2, 3)),  # of samples of a hand that jumped, in a row: first and newest tick, count
+    # of samples of a hand that jumped, in a row: first and newest tick, count, whether hands were taken for each other
+    Field("doubts", "int64", (2, 4)),
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
     Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`
     Field("covariances", "float64", (2, 3, 3, 3)),

@@ -16,12 +16,12 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SOURCES, Cause
 from service.core.frame import Record, Records, Vector, as_array
 from service.core.hand_estimator import HandEstimator, has_jumped, is_fresh, take
-from service.core.plausibility import REPEATED, is_confirmed, is_contested, note, refusal
+from service.core.plausibility import REPEATED, is_confirmed, is_contested, is_swapped, note, refusal
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
-JUMPED, ARM = int(Cause.JUMPED), SOURCES.index("arm")
+JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
 FASTEST_JOINT = 100.0  # [rad/s] beyond it a measured joint is a mistake
 JUMP_RAD, JUMP_RADPS = 0.2, 5.0  # so far and so fast no joint gets from one sample to the next
 FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
@@ -232,13 +232,15 @@ def _take_hand(
         if cause != REPEATED:
             jumped = fresh and has_jumped(states, side, in_base, since * period_s)
             note(states, side, jumped, period_s)
+            jumped = jumped or is_swapped(states, side, in_base, stale_ticks, period_s)
         if cause < 0 and jumped and not is_confirmed(states, side, in_base, stale_ticks, period_s):
-            cause = JUMPED
+            cause = SWAPPED if state.doubts[side, 3] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
     take(states, side, in_base, since * period_s, jumped or not fresh)
-    state.doubts[side, 2] = 0
+    state.doubts[side, 2:] = 0
+    state.doubts[1 - side, 3] = 0  # this hand is where it is said to be
     state.hand_stamps_ns[side] = stamp_ns
     state.hand_ticks[side] = state.tick
     return -1

@@ -7,6 +7,9 @@ contradicts it. One rule for both hands and the arm:
 * Where a sample cannot come from what was known it has jumped. A hand's jump is believed once
   `CONFIRMED` samples in a row, over `CONFIRMED_S` at least, agree with each other; the arm's never,
   before it was silent: it has a body.
+* A hand that comes to where the other one was, which is not seen there any more, has not moved: its
+  tracker takes one for the other. That is believed after `SWAPPED_S`, as it may have put itself
+  right.
 * A source is contested from when a quarter of what it told within about a second had jumped, until
   that is less than a tenth.
 """
@@ -21,6 +24,7 @@ from service.core.frame import Record, Records, Vector
 
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 CONFIRMED, CONFIRMED_S = 3, 0.02
+SWAPPED_M, SWAPPED_MPS, SWAPPED_S = 0.05, 0.2, 2.0  # so near to where the other one was, which may have moved on
 AGREE_M, AGREE_MPS = 0.03, 2.0  # samples of a hand that jumped agree as far as a fast hand moves
 CONTESTED, SETTLED = 0.25, 0.1
 MEMORY_S, MOST_S = 1.0, 1 / 30  # over which samples are averaged; as long counts one, whatever the pause before it
@@ -57,16 +61,59 @@ def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
 
 
 @compiled
+def is_swapped(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
+    """Whether a hand's sample (3,) [m], the first after a silence, is the other hand's, or goes on
+    from samples that were.
+    """
+    state = states[0]
+    doubts, seen = state.doubts[side], state.hand_ticks[side]
+    if doubts[3] and (state.tick - doubts[0]) * period_s >= SWAPPED_S:
+        return False
+    if doubts[3] and _goes_on(states, side, position, stale_ticks, period_s):
+        return True
+    silent = seen >= 0 and stale_ticks <= state.tick - seen and (state.tick - seen) * period_s < SWAPPED_S
+    return bool(silent and _is_at_other(states, side, position, period_s))
+
+
+@compiled
 def is_confirmed(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
     """Whether a hand's sample (3,) [m] that jumped is to be believed, by those just before it."""
     state = states[0]
-    doubts, doubted = state.doubts[side], state.doubted[side]
-    passed, off = state.tick - doubts[1], 0.0
-    for axis in range(3):
-        off += (position[axis] - doubted[axis]) ** 2
-        doubted[axis] = position[axis]
-    if doubts[2] == 0 or passed >= stale_ticks or math.sqrt(off) > AGREE_M + AGREE_MPS * passed * period_s:
-        doubts[0], doubts[2] = state.tick, 0
+    doubts = state.doubts[side]
+    if doubts[2] == 0 or not _goes_on(states, side, position, stale_ticks, period_s):
+        doubts[0], doubts[2], doubts[3] = state.tick, 0, 0
+    state.doubted[side, :] = position
     doubts[1] = state.tick
     doubts[2] += 1
-    return bool(doubts[2] >= CONFIRMED and (state.tick - doubts[0] + 0.5) * period_s >= CONFIRMED_S)
+    unseen = state.hand_ticks[1 - side] < doubts[0]
+    if doubts[2] > 1 and unseen and _is_at_other(states, side, position, period_s):
+        doubts[3] = 1
+    enough_s = SWAPPED_S if doubts[3] else CONFIRMED_S
+    return bool(doubts[2] >= CONFIRMED and (state.tick - doubts[0] + 0.5) * period_s >= enough_s)
+
+
+@compiled
+def _is_at_other(states: Records, side: int, position: Vector, period_s: float) -> bool:
+    """Whether a hand's sample is where the other hand was, and not where this one was."""
+    state = states[0]
+    seen = state.hand_ticks[1 - side]
+    here, there = state.hands[side, 0], state.hands[1 - side, 0]
+    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * period_s, SWAPPED_S)
+    return bool(seen >= 0 and _distance(position, there) < min(near, 0.5 * _distance(here, there)))
+
+
+@compiled
+def _goes_on(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
+    """Whether a sample is where a hand can be that was at the newest doubted one."""
+    state = states[0]
+    passed = state.tick - state.doubts[side, 1]
+    near = _distance(position, state.doubted[side]) <= AGREE_M + AGREE_MPS * passed * period_s
+    return bool(passed < stale_ticks and near)
+
+
+@compiled
+def _distance(a: Vector, b: Vector) -> float:
+    square = 0.0
+    for axis in range(3):
+        square += (a[axis] - b[axis]) ** 2
+    return math.sqrt(square)

@@ -40,7 +40,7 @@ RESUMED_S = 0.1  # hands must be near the data for so long after they were far
 LONGEST_DELAY_S = 0.6
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose coverage is counted
 KEPT = 0.05  # share of the time falsely followed up to which the way was kept
-SWAP_OVER_S = 0.2  # after a swap the hands' estimates are still coming back
+SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # until when it must be held; after it the hands' estimates are coming back
 Mask = NDArray[np.bool_]
 
 
@@ -163,7 +163,7 @@ class Outcome(NamedTuple):
     held: float
     falsely_held: float
     falsely_followed: float
-    swapped: float
+    swapped: float  # from 0.3 s after left was taken for right
     swapped_held: float  # of the session, as all shares
     negative_log_likelihood: float
     inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
@@ -200,7 +200,7 @@ def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
     squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
     wrong = np.linalg.norm(mean - wanted, axis=1) > WRONG_M
-    planted = one.swapped & judged
+    planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
     return Outcome(
         one.session.person.name,
         one.session.number,

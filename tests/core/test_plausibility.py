@@ -23,7 +23,7 @@ from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core import plausibility
 from service.core.controller import Controller
-from service.core.frame import Tick, as_array, copied
+from service.core.frame import Tick, Vector, as_array, copied
 from service.core.skill import Skill
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
@@ -122,6 +122,90 @@ def test_a_flood_of_ten_samples_a_tick_is_taken_in_turn() -> None:
         hands.hand(10**9 + 200_000 * k, tuple((np.array(PLACE) + row).tolist()))
     assert hands.rejected() == {}
     np.testing.assert_allclose(hands.state["hands"][LEFT_SIDE, 0], PLACE, atol=0.002)
+
+
+class BothHands(Hands):
+    """Hands that go up and down, told at a rate by a tracker that may take one for the other."""
+
+    def __init__(self, rate_hz: int) -> None:
+        super().__init__()
+        self.every, self.noise = 500 // rate_hz, np.random.default_rng(8)
+
+    def at(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        up = 0.2 + 0.15 * math.sin(0.006 * float(self.state["tick"]))  # up to 0.45 m/s
+        return (0.5, 0.1, up), (0.6, 0.5, up)
+
+    def tell(self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()) -> tuple[Vector, Vector]:
+        """Told so, but for labels that are hidden. How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by tick."""
+        off, fresh = [], []
+        for _ in range(round(500 * seconds)):
+            self.advance()
+            if int(self.state["tick"]) % self.every == 0:
+                told = self.at()[::-1] if swapped else self.at()
+                for side, place in enumerate(told):
+                    if side in hidden:
+                        continue
+                    seen = np.array(place) + 0.002 * self.noise.standard_normal(3)
+                    self.hand(10**9 + int(self.state["tick"]), tuple(seen.tolist()), side=side)
+            off.append([abs(self.state["hands"][side, 0, 1] - place[1]) for side, place in enumerate(self.at())])
+            fresh.append([self.fresh(side) for side in (0, 1)])
+        return np.array(off), np.array(fresh)
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+@pytest.mark.parametrize("lasts_s", [0.3, 1.5])
+def test_hands_that_are_taken_for_each_other_are_not_believed_but_held_for(rate_hz: int, lasts_s: float) -> None:
+    hands = BothHands(rate_hz)
+    assert hands.tell(1.0)[1][-1].all()
+    off, fresh = hands.tell(lasts_s, swapped=True)
+    assert off.max() < 0.02
+    assert not fresh[75:].any()  # 0.15 s
+    assert hands.rejected()[Cause.SWAPPED] >= 2 * rate_hz * lasts_s - 4
+    assert hands.rejected()[Cause.JUMPED] <= 3
+    off, fresh = hands.tell(1.0)
+    assert fresh[2 * hands.every :].all()
+    assert off.max() < 0.02
+    assert not hands.intake.is_contested(hands.state, already=True)
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+@pytest.mark.parametrize("hidden", [(0,), (1,), (0, 1)])
+def test_hands_that_come_back_from_hiding_under_each_others_labels_are_not_believed(
+    rate_hz: int, hidden: tuple[int, ...]
+) -> None:
+    hands = BothHands(rate_hz)
+    hands.tell(1.0)
+    hands.tell(0.2, hidden=hidden)  # the hand is covered, then its label goes to the other
+    hands.tell(0.1, swapped=True, hidden=hidden)
+    off, fresh = hands.tell(0.8, swapped=True)
+    assert off.max() < 0.02
+    assert not fresh[25:].any()
+    off, fresh = hands.tell(0.5)
+    assert fresh[2 * hands.every :].all()
+    assert off[2 * hands.every :].max() < 0.02
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+def test_labels_that_stay_changed_are_believed_after_two_seconds(rate_hz: int) -> None:
+    hands = BothHands(rate_hz)
+    hands.tell(1.0)
+    off, fresh = hands.tell(3.0, swapped=True)
+    held = np.flatnonzero(~fresh.all(axis=1))
+    assert held[-1] / 500 == pytest.approx(2.0, abs=0.07)
+    assert off[held[-1] + 1 :].min() > 0.35
+
+
+def test_one_hand_that_goes_where_the_other_one_is_is_believed_as_any_jump() -> None:
+    hands = BothHands(100)
+    hands.tell(1.0)
+    for _ in range(20):
+        hands.advance(5)
+        stamp_ns, (left, right) = 10**9 + int(hands.state["tick"]), hands.at()
+        hands.hand(stamp_ns, (right[0], right[1] - 0.04, right[2]), side=0)
+        hands.hand(stamp_ns, right, side=1)
+    assert hands.fresh(0)
+    assert hands.state["hands"][0, 0, 1] == pytest.approx(0.46, abs=0.01)
+    assert Cause.SWAPPED not in hands.rejected()
 
 
 NUMBERS = st.one_of(
