@@ -128,7 +128,8 @@ STATE = (
     Field("gripper_tick", "int64"),  # at which the gripper was told to move
     Field("rest_tick", "int64"),  # since which the arm tells one posture, `rest`, and nothing else
     Field("told_ticks", "int64", (len(SOURCES), 2)),  # the last two at which a sample could have been right
-    # of samples of a hand that jumped, in a row: first and newest tick, count, whether hands were taken for each other
+    # of samples of a hand that jumped, in a row: first and newest tick, count, whether it was where
+    # the other hand had been
     Field("doubts", "int64", (2, 4)),
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
     Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`

@@ -136,7 +136,9 @@ class BothHands(Hands):
         return (0.5, 0.1, up), (0.6, 0.5, up)
 
     def tell(self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()) -> tuple[Vector, Vector]:
-        """Told so, but for labels that are hidden. How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by tick."""
+        """How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by
+        tick, while some labels are hidden.
+        """
         off, fresh = [], []
         for _ in range(round(500 * seconds)):
             self.advance()
@@ -200,7 +202,7 @@ def test_one_hand_that_goes_where_the_other_one_is_is_believed_as_any_jump() -> 
     hands.tell(1.0)
     for _ in range(20):
         hands.advance(5)
-        stamp_ns, (left, right) = 10**9 + int(hands.state["tick"]), hands.at()
+        stamp_ns, right = 10**9 + int(hands.state["tick"]), hands.at()[1]
         hands.hand(stamp_ns, (right[0], right[1] - 0.04, right[2]), side=0)
         hands.hand(stamp_ns, right, side=1)
     assert hands.fresh(0)
