@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Generator, Iterator
@@ -125,6 +126,8 @@ def rows(now: Status) -> dict[str, str]:
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
         if now.target_m is not None
         else "none: it needs both hands",
+        "turned": _turned(now),
+        "gripper": now.gripper + (f", {now.closure:.0%} closed is predicted" if now.closure is not None else ""),
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
         or "none",
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
@@ -193,6 +196,13 @@ def _off(now: Status) -> str:
     assert now.tool_m is not None
     assert now.target_m is not None
     return f"{1000 * sum((a - b) ** 2 for a, b in zip(now.tool_m, now.target_m, strict=True)) ** 0.5:.1f} mm"
+
+
+def _turned(now: Status) -> str:
+    if now.turn_off_rad is None:
+        return ""
+    sure = f" ± {math.degrees(now.turn_std_rad):.1f}°" if now.turn_std_rad is not None else ""
+    return f"{math.degrees(now.turn_off_rad):.1f}° from the target{sure}"
 
 
 def _rejected(name: str, source: Source) -> str:

@@ -196,6 +196,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     target_m: Vector3 | None = None  # None where a hand is not seen
     setpoint_m: Vector3 | None = None
     std_m: float | None = None  # of the target, root mean square over the axes
+    turn_off_rad: float | None = None  # of the tool as commanded from how the target is turned, or where that points
+    turn_std_rad: float | None = None  # of how the target is turned; None: the skill did not learn it
+    gripper: str = ""  # `open` or `closed`, as commanded; empty: the skill knows of none
+    closure: float | None = None  # of the gripper as predicted, 0 to 1
     deviation_m: float | None = None  # of the hands from what the skill knows
     threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`

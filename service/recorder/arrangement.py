@@ -46,7 +46,9 @@ def curves(settings: Settings) -> dict[str, Curves]:
         view.origin: view
         for view in (
             Curves("/error", "Tool to target [mm]", 0, 60),
-            Curves("/deviation", "How sure: standard deviation of the target [mm]", 0, 250),
+            Curves("/turn", "Tool turned from the target [°]", 0, 10),
+            Curves("/gripper", "Gripper: how far closed [%]", 0, 110, True),
+            Curves("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
             Curves("/speed", "Speed [m/s]", 0, tool.max_speed),
             Curves("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
             Curves("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, IRRELEVANT),
@@ -111,7 +113,7 @@ def blueprint(
         rrb.Horizontal(
             _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
             rrb.Vertical(
-                plot("/error"),
+                rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), active_tab=0),
                 plot("/deviation"),
                 rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
                 rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),

@@ -16,6 +16,7 @@ from service.contract.records import SIDES, STAGES, Mode, Reason
 from service.core.body import body_of
 from service.core.capsules import between_segments, place
 from service.core.frame import TIMING, Record
+from service.core.pose import CLOSED, UNKNOWN
 from service.core.separation import FARTHEST
 from service.recorder.arrangement import TIMELINE
 from service.recorder.banner import banner, title
@@ -25,6 +26,8 @@ SCENE_HZ = 100
 TRAIL_S, TRAIL_HZ = 3.0, 20
 TRAIL_BREAK_M = 0.15  # between two corners no hand goes as far: another was taken for it
 NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
+SAME_M = 1e-5  # by which a deviation and the target's differ at most where they are one, by rounding
+AXIS = (0.0, 0.0, 1.0)  # of the tool, the direction that it points in
 REPEAT_S = 1.0  # a live view says the mode again as often, for those who come later
 Columns = Callable[..., rr.chunk.Chunk]
 
@@ -49,6 +52,7 @@ class Chunks:
         self._live = live
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
+        self._direction = settings.tool.orientation == "direction"
         self._stale_ticks = settings.hands.stale_ms / self._period_ms
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
             name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
@@ -137,14 +141,24 @@ class Chunks:
         ended = ~following & np.concatenate([[self._followed], following[:-1]])  # there the curve has a gap
         self._followed = bool(following[-1])
         yield from scalars("/error/target", np.flatnonzero(following | ended), off_mm, "/error")
-        sure = np.flatnonzero(seen.all(axis=1) & (frames["deviation"] > 0))  # 0: nothing is predicted
-        yield from scalars("/deviation/target", sure, 1e3 * frames["deviation"], "/deviation")
+        yield from scalars("/turn/target", np.flatnonzero(following | ended), self._turned(frames, following), "/turn")
+        std_m, std_deg = (root_mean_trace(frames[name]) for name in ("covariance", "orientation_covariance"))
+        known = seen.all(axis=1)
+        yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
+        gripping = known & (frames["closure"] >= 0)
+        yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
+        told = gripping & (frames["gripper"] != UNKNOWN)
+        closed = 100.0 * (frames["gripper"] == CLOSED)
+        yield from scalars("/gripper/commanded", np.flatnonzero(told), closed, "/gripper")
+        yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
+        other = known & (np.abs(frames["deviation"] - std_m) > SAME_M)  # of a skill between places
+        yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["deviation"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
-        told = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
+        measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
         off = np.zeros(len(batch))
-        off[told] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in told]
-        yield from scalars("/joints/error", told, off)
+        off[measured] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured]
+        yield from scalars("/joints/error", measured, off)
         timed = [i for i, shown in enumerate(batch) if shown.timing is not None]
         if timed:
             timings = np.zeros(len(batch), TIMING)
@@ -161,6 +175,23 @@ class Chunks:
                 yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
             self._missed = missed
         yield from scalars("/age", aimed, frames["hand_ages"] * self._period_ms)
+
+    def _turned(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
+        """By how much the tool is turned from its target (T,) [°]: of what it follows, see
+        `[tool] orientation`; NaN where it does not follow.
+        """
+        angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
+        for name in names:  # a frame may be damaged
+            following = following & (np.linalg.norm(frames[name], axis=1) > 0.5)
+        if not following.any():
+            return angles
+        tool, target = (Rotation.from_quat(frames[name][following]) for name in names)
+        if self._direction:
+            along = np.sum(tool.apply(AXIS) * target.apply(AXIS), axis=1)
+            angles[following] = np.degrees(np.arccos(np.clip(along, -1.0, 1.0)))
+        else:
+            angles[following] = np.degrees((target.inv() * tool).magnitude())
+        return angles
 
     def _modes(self, frames: NDArray[Any], times: NDArray[np.int64], columns: Columns) -> Iterator[rr.chunk.Chunk]:
         """Mode and reason where they change; to live viewers also now and then."""
@@ -263,3 +294,8 @@ class Chunks:
                     strips.append(np.array(trail, np.float32).reshape(-1, 3))
             if shown:
                 yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
+
+
+def root_mean_trace(covariances: NDArray[Any]) -> NDArray[Any]:
+    """Standard deviations (T,) of covariances (T, 3, 3), root mean square over the axes."""
+    return np.asarray(np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0) / 3))

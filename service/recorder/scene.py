@@ -150,7 +150,12 @@ def _log_names(fix: Any, settings: Settings) -> None:
         fix(path, rr.SeriesLines(names=[f"{name} [{unit}]" for name in names], **look, **_drawn_as(path)))
     for path, name, colour in (
         ("/error/target", "tool to target [mm]", palette.TOOL),
-        ("/deviation/target", "standard deviation [mm]", palette.TARGET),
+        ("/turn/target", "turned from the target [°]", palette.TOOL),
+        ("/turn/std", "target's standard deviation [°]", palette.TARGET),
+        ("/gripper/predicted", "predicted [%]", palette.TARGET),
+        ("/gripper/commanded", "commanded [%]", palette.TOOL),
+        ("/deviation/target", "target's standard deviation [mm]", palette.TARGET),
+        ("/deviation/hands", "hands off what is known [mm]", palette.NEAREST),
         ("/deviation/gate", "holds above [mm]", palette.VERMILLION),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),

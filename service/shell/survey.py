@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from service.config import Settings
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, remedy
 from service.contract.messages import Vector3
@@ -13,6 +15,8 @@ from service.contract.requests import Source, Status
 from service.core.controller import RETURNING, Controller
 from service.core.frame import Frame, Record
 from service.core.intake import REST_S
+from service.core.pose import CLOSED, OPEN
+from service.core.rotation import rotation
 from service.shell.sources import KEYS, frames
 
 
@@ -56,11 +60,24 @@ class Survey(NamedTuple):
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
-            std_m=round(math.sqrt(max(frame["covariance"].trace() / 3, 0.0)), 5) if aimed else None,
+            std_m=_std(frame["covariance"]) if aimed else None,
+            turn_off_rad=self._turned() if aimed else None,
+            turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
+            gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
+            closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
             deviation_m=round(float(frame["deviation"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,
         )
+
+    def _turned(self) -> float:
+        """By how much the tool is turned from its target, or points elsewhere [rad]."""
+        tool, target = (rotation(tuple(self.frame[name].tolist())) for name in ("tool_orientation", "orientation"))
+        if self.settings.tool.orientation == "direction":
+            cosine = float(tool[:, 2] @ target[:, 2])
+        else:
+            cosine = (float(np.trace(target.T @ tool)) - 1.0) / 2.0
+        return round(math.acos(min(max(cosine, -1.0), 1.0)), 5)
 
     def remedy(self, word: str) -> str:
         """What to do about a reason; where it comes of rejected samples, about these."""
@@ -143,6 +160,11 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
             told = f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause
             counts[told] = counts.get(told, 0) + count
     return counts
+
+
+def _std(covariance: Any) -> float:
+    """The standard deviation of a covariance (3, 3), root mean square over the axes."""
+    return round(math.sqrt(max(float(covariance.trace()) / 3, 0.0)), 5)
 
 
 def _point(values: Any) -> Vector3:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun as rr
+from scipy.spatial.transform import Rotation
 from test_recording import at_ns, ticks, write
 from wam import JOINT_NAMES
 
@@ -24,6 +25,7 @@ from service.contract import cdr
 from service.contract.messages import JointState, Thing
 from service.contract.records import Mode, Reason
 from service.contract.requests import ViaPoint, encode_json
+from service.core.pose import CLOSED
 from service.core.skill import Skill
 from service.learning.skill_file import with_file
 from service.recorder.banner import banner
@@ -111,7 +113,7 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
     names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
     told = [name for found in names.values() for several in found for name in several]
     assert len(told) > 30
-    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²)\]$", name) for name in told)
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%)\]$", name) for name in told)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
@@ -170,6 +172,28 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     assert "vise" in values(rows["/about/skill"], "TextDocument:text")[-1][0]
     (gate,) = set(np.ravel(values(rows["/deviation/gate"], "Scalars:scalars")))
     assert gate == pytest.approx(1000 * skill.threshold)
+
+
+def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Path, skill: Skill) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    turned = Rotation.from_euler("x", 3, degrees=True)
+    for tick, made, timing in ticks(200):
+        frame = made.copy()
+        if tick.index >= 100:
+            frame["closure"], frame["gripper"] = 0.7, CLOSED
+            frame["orientation_covariance"] = np.radians(2.0) ** 2 * np.eye(3)
+            frame["tool_orientation"] = (Rotation.from_quat(frame["orientation"]) * turned).as_quat()
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    told = {
+        path: np.ravel(values(rows[path], "Scalars:scalars")) for path in rows if path.startswith(("/turn", "/grip"))
+    }
+    assert told["/turn/target"][-50:] == pytest.approx(3.0, abs=1e-6)
+    assert told["/turn/std"] == pytest.approx([2.0] * 100)
+    assert told["/gripper/predicted"][-100:] == pytest.approx([70.0] * 100)
+    assert told["/gripper/commanded"] == pytest.approx([100.0] * 100)
 
 
 def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(tmp_path: Path) -> None:
