@@ -8,7 +8,7 @@ import select
 import sys
 from pathlib import Path
 
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
 from service.contract.channels import ENDPOINT
@@ -80,6 +80,7 @@ def _take(args: argparse.Namespace, settings: Settings) -> None:
         raise TakeNameError(f"{path} is there already: another name needed, or --delete it first")
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
+    places = places_in(args.places) if args.places else ()
     cell, ended = args.cell or settings.cell, _Ended()
     listen = [args.listen] if args.listen else []
     try:
@@ -110,7 +111,7 @@ def _take(args: argparse.Namespace, settings: Settings) -> None:
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    taken.write(path)
+    taken.write(path, places)
     for key, count in taken.malformed.items():
         print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
 

@@ -43,6 +43,12 @@ def add_options(c: argparse.ArgumentParser) -> None:
         metavar="EP",
         help="Zenoh endpoint to listen on instead, for tracker and arm to connect to while no daemon runs",
     )
+    c.add_argument(
+        "--places",
+        metavar="FILE",
+        type=Path,
+        help="where the things of the task lie in this take, by name: JSON as `via-points add --file` takes it",
+    )
     c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of the take, .png")
     instead = c.add_mutually_exclusive_group()
     instead.add_argument("--list", action="store_true", help="the takes that are there, instead")

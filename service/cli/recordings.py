@@ -10,10 +10,10 @@ from collections.abc import Mapping
 
 from service.cli.clients import reached
 from service.cli.progress import progress, steps
-from service.cli.usage import UsageError, check_writable
+from service.cli.usage import UsageError, check_writable, places_in
 from service.client import Client, Tracker
 from service.config import load
-from service.contract import cdr, requests
+from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.requests import Status
@@ -100,8 +100,7 @@ def learn(args: argparse.Namespace) -> int:
             check_writable(path)
     settings = load(args.config) if args.config else None
     sources = {name: Source.parsed(text) for name in SIDES if (text := getattr(args, name))}
-    told = requests.decode_request(args.places.read_bytes(), requests.Add) if args.places else None
-    places = told.points if told else ()
+    places = places_in(args.places) if args.places else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(

@@ -9,10 +9,12 @@ import difflib
 import os
 import re
 import socket
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
+    from service.contract.requests import ViaPoint
     from service.core.skill import Skill
 
 CONNECT_TIMEOUT_S = 3.0
@@ -54,6 +56,19 @@ def check_writable(path: Path) -> None:
         raise UsageError(f"{path}: there is no folder {folder}")
     if not os.access(path if path.exists() else folder, os.W_OK):
         raise UsageError(f"{path} cannot be written: no permission")
+
+
+def places_in(path: Path) -> tuple[ViaPoint, ...]:
+    """The places in a file as `via-points add --file` takes it; - is standard input. Raises
+    RequestError, which names the file, and OSError.
+    """
+    from service.contract.requests import Add, RequestError, decode_request  # heavy
+
+    try:
+        told: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+    except RequestError as error:
+        raise RequestError(f"{path}: {error}") from None
+    return told.points
 
 
 def recordings() -> Path:

@@ -123,6 +123,8 @@ def table(found: Summary) -> str:
         f"{one.gap_at_s:.1f} s  frame {one.frame or 'not named'}"
         for one in found.streams
     ]
+    if found.demonstration.places:
+        lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
     lines += [f"  {remark}" for remark in found.remarks]
     speeds = {side: _speed(found.demonstration, side) for side in SIDES}
     lines += [

@@ -5,7 +5,7 @@ it or all is at rest, and written as they came.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -14,13 +14,14 @@ import numpy as np
 import zenoh
 
 from service.config import Settings, robot_description
-from service.contract import channels
+from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
 from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
+from service.contract.requests import ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake import UNIT_M
 from service.recorder.mcap_file import McapFile, machine
-from service.recorder.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES
+from service.recorder.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.recorder.tool import tool_poses
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
@@ -147,9 +148,10 @@ class Take:
         for key, samples in self.samples.items():
             self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
         """Writes the take: the messages as they came, the tool found from the joints where nobody
-        tracks it, settings and URDF attached. All or nothing.
+        tracks it, the places of the task as far as they are told, settings and URDF attached. All
+        or nothing.
 
         Raises TakeError, OSError.
         """
@@ -161,6 +163,9 @@ class Take:
         ]
         if not self.samples[TOOL]:
             messages += self._tool_by_joints(urdf)
+        if places:
+            told = cdr.encode_string(encode_json(tuple(places)).decode())
+            messages.append((min(messages)[0], PLACES, told))
         part = path.with_name(f".{path.name}.part")
         file = McapFile(part, joints=len(self.settings.joints.names))
         try:
@@ -172,7 +177,8 @@ class Take:
             ):
                 file.writer.add_attachment(now_ns, now_ns, name, kind, data)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
-                file.put(channels.key(self.cell, key), channels.BY_KEY[key].codec.type, payload, arrived_ns, i)
+                codec = channels.STRING if key == PLACES else channels.BY_KEY[key].codec
+                file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
             file.close()
             part.replace(path)
         finally:

@@ -19,6 +19,7 @@ from service.client import endpoints, open_session
 from service.config import HandSettings, Settings, ToolSettings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import JointState, PoseStamped
+from service.contract.requests import Add, encode_json
 from service.core.arm import Arm
 from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.pose_streams import Recorded, Source
@@ -129,6 +130,8 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     teacher.start()
     folder = ["--folder", str(tmp_path / "takes")]
     ended = ["--until", "rest", "--rest", "0.5"]
+    (tmp_path / "places.json").write_bytes(encode_json(Add(Scene().via_points())))
+    ended += ["--places", str(tmp_path / "places.json")]
     assert main(["record", "take-1", "--listen", at, *ended, *folder]) == 0
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
@@ -136,6 +139,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in said.err
     found = summary(path)
     assert said.out.strip() == table(found)
+    assert "  places handover, glass, soldering\n" in said.out
     assert 1.0 < found.lasts_s < 2.5
     assert [one.name for one in found.streams] == ["left", "right", "tool"]
     assert all(one.poses > 20 and one.frame == "base" for one in found.streams)
@@ -148,6 +152,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert summary(path).lasts_s == found.lasts_s
     assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
     assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
+    assert summary(path).demonstration.places == Scene().via_points()
     assert Recorded.open(path).settings == Settings()
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
