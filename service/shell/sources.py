@@ -159,6 +159,8 @@ def _of_pose(cause: Cause, sample: PoseStamped, settings: Settings) -> str:
             meant = [u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_M[0] < far * m < PLAUSIBLE_M[1]]
             like = f", which looks like {meant[-1]}" if meant else ""
             return f"at {at}{like}; [hands] unit is {unit!r}, at most {FARTHEST_M:g} m from the base plate accepted"
+        case Cause.SWAPPED:
+            return f"at {at} in the tracker's frame, where the other hand was; left and right look exchanged"
     return f"at {at} in the tracker's frame, from one sample to the next"
 
 

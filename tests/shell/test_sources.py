@@ -118,6 +118,21 @@ def test_of_two_kinds_at_once_each_is_said_in_its_own_words(skill: Skill) -> Non
     assert "rejected as jumped: at (0.5, 0, 0.3)" in jumped
 
 
+def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(300):
+        left, right = (LEFT, RIGHT) if k < 100 else (RIGHT, LEFT)
+        cell.tell(("left", pose(k + 1, left)), ("right", pose(k + 1, right)), ("arm", joints(k + 1)))
+        if k % 50 == 0:
+            cell.status(k / 500)
+    told = cell.status(0.6)
+    assert (told.mode, told.reason) == ("hold", "stale_hand")
+    assert "the left hand was last seen 400 ms ago, as what comes is rejected as swapped: at (" in told.because
+    assert "where the other hand was; left and right look exchanged" in told.because
+    assert told.remedy == "the tracker takes left for right: let it see both hands apart for a moment"
+    assert sum("rejected as swapped" in line for line in cell.log) == 2
+
+
 def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
