@@ -49,7 +49,7 @@ class HandSettings(Section, frozen=True):
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` is taken too, as it is
     unit: Literal["m", "cm", "mm"] = "m"  # of the tracker's positions
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
-    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.05)] = 0.002  # each axis; a start, it is estimated
+    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # each axis; a start, it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
 
 

@@ -18,6 +18,7 @@ KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
 LATE_MS = 100.0  # a stamp that is older at its arrival tells of clocks, or of a slow way
 SLACK = 0.9  # of the least rate
 OFTEN = 0.05  # share of what comes that is rejected, above which it is no accident
+NOISY_MM = 8.0  # of a hand's samples, each axis: no tracker that sees it well
 ROOM_MB = 2000.0
 MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
 OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
@@ -118,6 +119,11 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
     if share > OFTEN:
         wanted = f"one publisher of {key(now.cell, KEYS[name])}"
         yield wrong(what, f"{share:.0%} of what comes contradicts the rest", wanted, remedy("two_sources"))
+    if source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM:
+        wanted = (
+            f"less than {NOISY_MM:g} mm: one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
+        )
+        yield wrong(what, f"its samples scatter by {source.scatter_mm:.0f} mm an axis", wanted, remedy("two_sources"))
 
 
 def _driver(now: Status) -> Finding:

@@ -43,7 +43,8 @@ HOLDS = {
         "bring the hands back to where it was demonstrated, or demonstrate this too",
     ),
     "two_sources": Incident(
-        "a quarter of what came in the last second says that a hand, or the arm, is somewhere else",
+        "a quarter of what came in the last second says that a hand, or the arm, is somewhere else; or a hand's "
+        "samples scatter by more than 12 mm",
         "two trackers or drivers publish under one key: stop one; `rejected` counts `older` and `jumped` meanwhile",
     ),
     "operator": Incident("somebody asked for it", "`thirdhand resume`"),

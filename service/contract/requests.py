@@ -153,9 +153,10 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     clock_ms: float | None = None  # stamp to arrival, median of the last second; below 0: a clock that is ahead
     frame: str = ""  # that the newest message names
     rejected: dict[str, int] = {}  # samples by cause, `malformed` among them
-    cause: str = ""  # of the newest one rejected
+    cause: str = ""  # of the newest one rejected in the last second
     refused: str = ""  # that one in words: what came, and what is accepted
     contested: float = 0.0  # share of the last second's samples that contradict the rest
+    scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):

@@ -11,7 +11,8 @@ contradicts it. One rule for both hands and the arm:
   tracker takes one for the other. That is believed after `SWAPPED_S`, as it may have put itself
   right.
 * A source is contested from when a quarter of what it told within about a second had jumped, until
-  that is less than a tenth.
+  that is less than a tenth; and while a hand's samples scatter more than any tracker's, as those of
+  two that are some centimetres apart do.
 """
 
 from __future__ import annotations
@@ -27,12 +28,15 @@ CONFIRMED, CONFIRMED_S = 3, 0.02
 SWAPPED_M, SWAPPED_MPS, SWAPPED_S = 0.05, 0.2, 2.0  # so near to where the other one was, which may have moved on
 AGREE_M, AGREE_MPS = 0.03, 2.0  # samples of a hand that jumped agree as far as a fast hand moves
 CONTESTED, SETTLED = 0.25, 0.1
+SCATTERED_M, GATHERED_M = 0.012, 0.010  # standard deviation of a hand's samples, each axis
 MEMORY_S, MOST_S = 1.0, 1 / 30  # over which samples are averaged; as long counts one, whatever the pause before it
 
 
 def is_contested(state: Record, *, already: bool) -> bool:
     """Whether some source is contradicted by another; `already`: it was found so before."""
-    return bool(max(state["contested"].tolist()) > (SETTLED if already else CONTESTED))
+    share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED, SCATTERED_M)
+    noise = state["noise"]
+    return bool(max(state["contested"].tolist()) > share or max(noise[0, 0], noise[1, 0]) > scatter_m**2)
 
 
 @compiled

@@ -319,9 +319,10 @@ def load_skill(workshop: Workshop, path: Path, settings: Settings) -> Skill:
     try:
         found = saved.read(skill)
     except SkillError as error:
-        aside = saved.path.with_suffix(".damaged")
+        path = saved.path(skill)
+        aside = path.with_suffix(".damaged")
         with contextlib.suppress(OSError):
-            saved.path.replace(aside)
+            path.replace(aside)
         log.warning("%s; it is kept as %s, and no via-points are in force", error, aside)
         return skill
     if found is None or found[0] == skill.via_points:

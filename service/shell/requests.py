@@ -238,7 +238,7 @@ class Requests:
         draft = self._saved.draft(skill)  # what cannot be saved is not taught
         try:
             tick = self._through_the_loop(Event("skill", skill.file, skill))
-            draft.replace(self._saved.path)
+            draft.replace(self._saved.path(skill))
         finally:
             draft.unlink(missing_ok=True)
         before, self._skill, self._in_force = self._skill, skill, in_force(skill)
@@ -253,10 +253,9 @@ class Requests:
             names = ", ".join(there) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {names}")
         skill = self._workshop.load(path)
-        if (
-            skill.learned_from == self._skill.learned_from and self._skill.via_points
-        ):  # what was taught goes with what was learned
-            skill = self._workshop.adapt(skill, self._skill.via_points, tolerance=self._skill.tolerance)
+        if found := self._saved.read(skill):  # what was taught goes with what was learned
+            points, tolerance = found
+            skill = self._workshop.adapt(skill, points, tolerance=tolerance)
         return self._adopt(skill)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:

@@ -1,5 +1,5 @@
-"""Via-points that survive a restart: a small file in the configured folder, for the skill that they
-were taught to.
+"""Via-points that survive a restart: a small file in the configured folder for each skill to which
+some were taught.
 """
 
 from __future__ import annotations
@@ -30,22 +30,28 @@ def _checksum(saved: dict[str, Any]) -> str:
 
 
 class SavedViaPoints:
-    """The via-points in force on disk, so that they survive a restart; written atomically."""
+    """What was taught to each skill, on disk, so that it survives a restart; written atomically."""
 
     def __init__(self, settings: Settings) -> None:
-        self.path = state_folder(settings) / "places.json"
+        self._folder = state_folder(settings)
+
+    def path(self, skill: Skill) -> Path:
+        """The file for this skill, known by what it was learned from."""
+        which = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
+        return self._folder / f"places-{which}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """Via-points and tolerance taught to this skill, or None.
 
         Raises SkillError where the file is damaged.
         """
+        path = self.path(skill)
         try:
-            content = self.path.read_bytes()
+            content = path.read_bytes()
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise SkillError(f"cannot read via-points {self.path}: {error.strerror}") from None
+            raise SkillError(f"cannot read via-points {path}: {error.strerror}") from None
         try:
             saved = json.loads(content)
             if saved.pop("checksum") != _checksum(saved):
@@ -58,7 +64,7 @@ class SavedViaPoints:
             if saved["learned_from"] != skill.learned_from:
                 return None
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise SkillError(f"{self.path} does not hold via-points ({error})") from None
+            raise SkillError(f"{path} does not hold via-points ({error})") from None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def draft(self, skill: Skill) -> Path:
@@ -74,11 +80,11 @@ class SavedViaPoints:
         saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
         content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         try:
-            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile("w", dir=self.path.parent, suffix=".new", delete=False) as file:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self._folder, suffix=".new", delete=False) as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise SkillError(f"cannot save via-points in {self.path.parent}: {error.strerror}") from None
+            raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
         return Path(file.name)

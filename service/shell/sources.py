@@ -6,6 +6,7 @@ The loop only counts; all else is found out beside it, ten times a second.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from statistics import median
@@ -58,7 +59,7 @@ class _History:
         self.seen: dict[str, int] = {}
         self.told: dict[str, int] = {}
         self.words: dict[str, str] = {}  # of the newest rejected, by cause
-        self.cause = ""
+        self.cause, self.refused_s = "", -math.inf
 
 
 class Sources:
@@ -90,8 +91,8 @@ class Sources:
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
             refused = intake.refused.get((source, Cause[cause.upper()])) if cause != MALFORMED else None
             history.words[cause] = arrivals.why if refused is None else in_words(refused, self._settings)
-            history.cause = cause
-        history.seen = rejected
+            history.cause, history.refused_s = cause, now_s
+        history.seen, lately = rejected, now_s - history.refused_s <= WINDOW_S
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
@@ -103,9 +104,10 @@ class Sources:
             clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
-            cause=history.cause,
-            refused=history.words.get(history.cause, ""),
+            cause=history.cause if lately else "",
+            refused=history.words.get(history.cause, "") if lately else "",
             contested=round(float(state["contested"][index]), 3),
+            scatter_mm=None if source == "arm" or seen < 0 else round(1e3 * float(state["noise"][index, 0]) ** 0.5, 2),
         )
 
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:

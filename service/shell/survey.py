@@ -15,6 +15,7 @@ from service.contract.requests import Source, Status
 from service.core.controller import RETURNING, Controller
 from service.core.frame import Frame, Record
 from service.core.intake import REST_S
+from service.core.plausibility import SCATTERED_M, SETTLED
 from service.core.pose import CLOSED, OPEN
 from service.core.rotation import rotation
 from service.shell.sources import KEYS, frames
@@ -97,9 +98,7 @@ class Survey(NamedTuple):
                 what = "the target's standard deviation is" if skill.between is None else "a hand is off its places by"
                 return f"{what} {100 * float(frame['deviation']):.1f} cm, {100 * skill.threshold:.1f} accepted"
             case Reason.TWO_SOURCES:
-                side, source = max(sources.items(), key=lambda item: item[1].contested)
-                when = "in the last second" if source.rate_hz else "before it ended"
-                return f"{SOURCE_NAMES[side]}: {source.contested:.0%} of what came {when} contradicts the rest"
+                return _contest(sources)
             case Reason.ARM_NOT_READY:
                 return self._not_ready()
             case Reason.ARM_ERROR:
@@ -146,6 +145,19 @@ def _silence(side: str, source: Source) -> str:
     seen = "has not been seen yet" if source.age_ms is None else f"was last seen {_ago(source.age_ms)} ago"
     why = f", as what comes is rejected as {source.cause}: {source.refused}" if _is_refused(source) else ""
     return f"the {SOURCE_NAMES[side]} {seen}{why}"
+
+
+def _contest(sources: dict[str, Source]) -> str:
+    """Whose samples contradict each other, or scatter, and by how much."""
+    side, source = max(sources.items(), key=lambda item: item[1].contested)
+    when = "in the last second" if source.rate_hz else "before it ended"
+    if source.contested > SETTLED:
+        return f"{SOURCE_NAMES[side]}: {source.contested:.0%} of what came {when} contradicts the rest"
+    side, source = max(sources.items(), key=lambda item: item[1].scatter_mm or 0.0)
+    return (
+        f"{SOURCE_NAMES[side]}: what came {when} scatters by {source.scatter_mm:.0f} mm an axis, "
+        f"{1e3 * SCATTERED_M:.0f} accepted"
+    )
 
 
 def _ago(age_ms: float) -> str:

@@ -51,7 +51,7 @@ def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
 def test_what_is_said_of_the_noise_makes_no_difference_after_a_second_and_a_half() -> None:
     noise = np.random.default_rng(2).normal(0.0, 0.002, (400, 3))
     told = [
-        follow(Hands(HandSettings(noise_std_m=said)), reach, until_s=3.0, noise=noise) for said in (0.0002, 0.002, 0.02)
+        follow(Hands(HandSettings(noise_std_m=said)), reach, until_s=3.0, noise=noise) for said in (0.0002, 0.002, 0.01)
     ]
     for other in told[1:]:
         assert np.linalg.norm(other[750:, 0] - told[0][750:, 0], axis=1).max() < 0.0005

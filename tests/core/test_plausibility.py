@@ -102,6 +102,31 @@ def test_a_second_source_with_a_clock_of_its_own_is_noticed_too(offset_ns: int) 
     assert abs(hands.state["hands"][LEFT_SIDE, 0, 1] - 0.1) < 0.001
 
 
+@pytest.mark.parametrize("apart_m", [0.03, 0.04, 0.05])
+def test_two_trackers_that_are_nearly_of_one_mind_are_noticed_by_the_scatter(apart_m: float) -> None:
+    hands, random = Hands(), np.random.default_rng(7)
+    when = sorted([(k / 97, 0.0) for k in range(500)] + [(1.0 + k / 100, apart_m) for k in range(400)])
+    told = []
+    for at_s, off in when:
+        hands.advance(max(0, round(500 * at_s) - int(hands.state["tick"])))
+        place = np.add(PLACE, (0.0, 0.1 * math.sin(2 * at_s), off)) + 0.002 * random.standard_normal(3)
+        hands.hand(10**12 + round(1e9 * at_s), tuple(place.tolist()))
+        told.append(hands.intake.is_contested(hands.state, already=bool(told and told[-1])))
+    seconds = np.array([at_s for at_s, _ in when])
+    assert not np.array(told)[seconds < 1.0].any()
+    assert np.array(told)[seconds > 2.5].all()
+    tell(hands, [PLACE] * 200, 100)
+    assert not hands.intake.is_contested(hands.state, already=True)
+
+
+def test_a_poor_tracker_alone_is_no_contest() -> None:
+    hands, random = Hands(), np.random.default_rng(7)
+    for row in 0.008 * random.standard_normal((500, 3)):
+        hands.advance(5)
+        hands.hand(10**9 + int(hands.state["tick"]), tuple((np.array(PLACE) + row).tolist()))
+        assert not hands.intake.is_contested(hands.state, already=False)
+
+
 def test_a_copy_of_the_same_source_that_comes_late_is_no_contest() -> None:
     hands = Hands()
     for k in range(500):

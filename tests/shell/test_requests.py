@@ -25,6 +25,7 @@ from service.core.skill import Skill
 from service.learning.skill_file import with_file
 from service.learning.via_points import adapted
 from service.shell.requests import Pending, Requests, SavedViaPoints
+from service.shell.saved_via_points import state_folder
 from service.shell.workshop import Workshop
 from sim.scene import Scene
 
@@ -100,8 +101,8 @@ class Cell:
         return [point["name"] for point in self.client.ask("via_points", {"op": "list"})["points"]]
 
     def place_bytes(self) -> bytes:
-        file = SavedViaPoints(self.settings).path
-        return file.read_bytes() if file.exists() else b""
+        folder = state_folder(self.settings)
+        return b"".join(file.read_bytes() for file in sorted(folder.glob("places-*.json")))
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.taken]
@@ -223,6 +224,9 @@ def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to
     assert cell.client.ask("skill", {"name": "other"})["points"] == []
     assert cell.taken[-1].value.digest == other.digest
     assert cell.names() == []
+    cell.client.add(PLACES[:1])
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    assert len(cell.client.load_skill("other").points or ()) == 1
 
 
 def test_what_is_taught_is_in_force_again_after_a_restart(cell: Cell, skill: Skill) -> None:
@@ -324,7 +328,7 @@ def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_pa
 def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
     cell.client.add(PLACES)
     saved = cell.folder / "state" / cell.settings.cell
-    assert stat.S_IMODE((saved / "places.json").stat().st_mode) == 0o600
+    assert stat.S_IMODE(next(saved.glob("places-*.json")).stat().st_mode) == 0o600
     assert stat.S_IMODE(saved.stat().st_mode) == 0o700
 
 

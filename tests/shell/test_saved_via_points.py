@@ -27,31 +27,42 @@ def saved(tmp_path: Path) -> SavedViaPoints:
 
 def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
     assert saved.read(skill) is None
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
     assert saved.read(skill) == (POINTS, 0.03)
-    saved.draft(skill).replace(saved.path)
+    saved.draft(skill).replace(saved.path(skill))
     assert saved.read(skill) == ((), skill.tolerance)
 
 
 def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
-    assert saved.read(replace(skill, learned_from="other demonstrations")) is None
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    other = replace(skill, learned_from="other demonstrations")
+    assert saved.read(other) is None
+    saved.path(skill).rename(saved.path(other))
+    assert saved.read(other) is None
+
+
+def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
+    other = replace(skill, learned_from="other demonstrations")
+    for one, count in ((skill, 2), (other, 1)):
+        saved.draft(adapted(one, POINTS[:count], tolerance=0.03)).replace(saved.path(one))
+    assert saved.read(skill) == (POINTS[:2], 0.03)
+    assert saved.read(other) == (POINTS[:1], 0.03)
 
 
 def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
     for count in (1, 2, 3):
-        saved.draft(adapted(skill, POINTS[:count], tolerance=0.03)).replace(saved.path)
-        assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
-        assert len(json.loads(saved.path.read_text())["request"]["points"]) == count
+        saved.draft(adapted(skill, POINTS[:count], tolerance=0.03)).replace(saved.path(skill))
+        assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
+        assert len(json.loads(saved.path(skill).read_text())["request"]["points"]) == count
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(saved.path)
-    before = saved.path.read_bytes()
+    saved.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(saved.path(skill))
+    before = saved.path(skill).read_bytes()
     with pytest.raises(TypeError, match="not JSON serializable"):
-        saved.draft(replace(skill, name=3j)).replace(saved.path)  # type: ignore[arg-type]
-    assert saved.path.read_bytes() == before
-    assert [file.name for file in saved.path.parent.iterdir()] == ["places.json"]
+        saved.draft(replace(skill, name=3j)).replace(saved.path(skill))  # type: ignore[arg-type]
+    assert saved.path(skill).read_bytes() == before
+    assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
 
 
 @pytest.mark.parametrize(
@@ -69,37 +80,37 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedVia
     ],
 )
 def test_a_damaged_file_is_told_with_what_to_do(saved: SavedViaPoints, skill: Skill, content: bytes) -> None:
-    saved.path.parent.mkdir(parents=True)
-    saved.path.write_bytes(content)
+    saved.path(skill).parent.mkdir(parents=True)
+    saved.path(skill).write_bytes(content)
     with pytest.raises(SkillError, match=r"does not hold via-points") as caught:
         saved.read(skill)
-    assert str(saved.path) in str(caught.value)
+    assert str(saved.path(skill)) in str(caught.value)
 
 
 def test_a_file_that_cannot_be_read_is_told(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.path.mkdir(parents=True)
+    saved.path(skill).mkdir(parents=True)
     with pytest.raises(SkillError, match=r"cannot read via-points .*: Is a directory"):
         saved.read(skill)
 
 
 def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedViaPoints, skill: Skill) -> None:
     random = Random(1)
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
-    whole = saved.path.read_bytes()
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    whole = saved.path(skill).read_bytes()
     for _ in range(1000):
         damaged = bytearray(whole)
         damaged[random.randrange(len(whole))] ^= 1 << random.randrange(8)
-        saved.path.write_bytes(damaged)
+        saved.path(skill).write_bytes(damaged)
         with contextlib.suppress(SkillError):
             assert saved.read(skill) == (POINTS, 0.03)
 
 
 def test_a_file_that_somebody_edited_is_told(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path)
-    whole = saved.path.read_text()
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    whole = saved.path(skill).read_text()
     for text, why in ((whole.replace("0.03", "0.04"), "changed since"), (whole.replace("checksum", "sum"), "checksum")):
-        saved.path.write_text(text)
+        saved.path(skill).write_text(text)
         with pytest.raises(SkillError, match=why):
             saved.read(skill)
-    saved.path.write_text(json.dumps(json.loads(whole)))  # laid out in another way
+    saved.path(skill).write_text(json.dumps(json.loads(whole)))  # laid out in another way
     assert saved.read(skill) == (POINTS, 0.03)

@@ -133,6 +133,21 @@ def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
     assert sum("rejected as swapped" in line for line in cell.log) == 2
 
 
+def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
+    cell = Cell(skill)
+    cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)), ("left", pose(1, (900.0, 0.0, 0.0))))
+    assert cell.status(1.0).sources["left"].cause == "out_of_range"
+    for k in range(1500):
+        seen = (("left", pose(2 * S + k, LEFT)),) if k < 1400 else ()
+        cell.tell(("right", pose(2 * S + k, RIGHT)), ("arm", joints(k + 1)), *seen)
+        if k % 50 == 0:
+            told = cell.status(1.0 + k / 500)
+    assert told.reason == "stale_hand"
+    assert told.because == "the left hand was last seen 102 ms ago"
+    assert told.remedy.startswith("look at the tracker; growing counters")
+    assert told.rejected == {"out_of_range": 1}
+
+
 def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
