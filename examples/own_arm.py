@@ -1,7 +1,7 @@
 """One's own arm on thirdhand's wire: a driver to begin from. Put the arm's library in `FakeArm`'s
 place; what else a driver owes is in docs/hardware.md.
 
-    python examples/own_arm.py tcp/127.0.0.1:7447
+    python examples/own_arm.py tcp/127.0.0.1:7447 thirdhand
 """
 
 from __future__ import annotations
@@ -74,13 +74,12 @@ def command_in(sample: zenoh.Sample | None, names: tuple[str, ...]) -> tuple[Joi
 
 def main() -> None:
     """Drives a fake arm until Ctrl-C."""
-    with (
-        contextlib.suppress(KeyboardInterrupt),
-        open_session(connect=sys.argv[1:2] or ["tcp/127.0.0.1:7447"]) as session,
-    ):
-        names = tuple(Client(session).ask("status")["joints"])
+    endpoint, cell = (*sys.argv[1:], *("tcp/127.0.0.1:7447", "thirdhand")[len(sys.argv) - 1 :])
+    with contextlib.suppress(KeyboardInterrupt), open_session(connect=[endpoint]) as session:
+        names = tuple(Client(session, cell).ask("status")["joints"])
         arm = FakeArm(names, (0.0, 0.8, 0.0, 2.2, 0.0, -1.0, 0.0)[: len(names)])
-        drive(arm, session, "thirdhand", threading.Event())
+        print(f"{', '.join(names)} of cell {cell} are driven; Ctrl-C ends it")
+        drive(arm, session, cell, threading.Event())
 
 
 if __name__ == "__main__":

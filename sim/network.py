@@ -25,6 +25,7 @@ from sim.script import Array
 
 THINGS_HZ = 10
 STOP_S = 0.5  # between the last hands and the end
+QUIET_S = 1.0  # without a command, after which that is said
 
 
 class BenchError(RuntimeError):
@@ -226,7 +227,7 @@ def _play(
     things_every = max(1, round(rate_hz / THINGS_HZ))
     deadlines = Deadlines(rate_hz)
     ready_s: float | None = None  # since when commands come and the hands wait at their start
-    running = False
+    running, spoke_s, quiet = False, 0.0, False
     said = missed_before = sent_before = begun_ns = 0
     say(
         f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
@@ -238,6 +239,13 @@ def _play(
         position, velocity = commands.take()
         seen = bench.step(position, velocity, gripper=bridge.gripper.newest)
         bridge.publish_joints(seen)
+        if position is not None:
+            if quiet:
+                say("commands come again")
+            spoke_s, quiet = now_s, False
+        elif ready_s is not None and not quiet and now_s - spoke_s > QUIET_S:
+            quiet = True
+            say("no commands come any more: thirdhand status tells why, and thirdhand reset ends a fault")
         if bench.tick % hands_every == 0:
             hidden = live.dropout.hand if live.dropout and running and live.dropout.at(seen.time_s) else None
             bridge.publish_hands(bench.script.sample(seen.time_s), hidden=hidden)

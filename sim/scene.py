@@ -37,6 +37,7 @@ TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radian
 # Both hands point at the robot, palms down: half a turn about z.
 HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 
+FAR_OFF = 5.0  # [m] nobody means
 MOST_MOVED = 0.15  # [m] from the nominal place: beyond it the arm cannot reach every scene
 LOWEST = {  # [m] above the table
     "robot_start": 0.05,
@@ -80,8 +81,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             moved = math.dist(given, nominal)
             if not moved <= MOST_MOVED + 1e-9:
                 raise ValueError(
-                    f"{name}: {list(given)} lies {100 * moved:.1f} cm from the nominal {list(nominal)}; "
-                    f"up to {100 * MOST_MOVED:.0f} cm is reachable"
+                    f"{name}: {list(given)} lies {moved:.3g} m from the nominal {list(nominal)} m; "
+                    f"up to {MOST_MOVED:g} m is reachable{'. Is it in metres?' if moved > FAR_OFF else ''}"
                 )
             if given[2] < lowest:
                 raise ValueError(

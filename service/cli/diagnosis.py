@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import msgspec
 
@@ -19,6 +19,7 @@ LATE_MS = 100.0  # a stamp that is older at its arrival tells of clocks, or of a
 SLACK = 0.9  # of the least rate
 OFTEN = 0.05  # share of what comes that is rejected, above which it is no accident
 NOISY_MM = 8.0  # of a hand's samples, each axis: no tracker that sees it well
+MOST_OTHERS = 4  # keys that are named
 ROOM_MB = 2000.0
 MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
 OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
@@ -53,8 +54,12 @@ def judged(fine: bool, what: str, found: str, wanted: str, remedy: str) -> Findi
     return Finding("ok" if fine else "wrong", what, found, wanted, remedy)
 
 
-def findings(before: Status, now: Status, *, own_ns: int, own_version: str) -> Iterator[Finding]:
-    """What is to be said of a cell; `own_ns` and `own_version` are time and version here."""
+def findings(
+    before: Status, now: Status, *, own_ns: int, own_version: str, published: Collection[str] = ()
+) -> Iterator[Finding]:
+    """What is to be said of a cell; `own_ns` and `own_version` are time and version here, and
+    `published` the keys on which hands and joints were heard, in whatever cell.
+    """
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
     yield judged(now.version == own_version, "daemon", found, wanted, "update the older one")
@@ -63,7 +68,7 @@ def findings(before: Status, now: Status, *, own_ns: int, own_version: str) -> I
         return
     yield _mode(now)
     for name in now.sources:
-        yield from _source(before, now, name)
+        yield from _source(before, now, name, published)
     yield _driver(now)
     yield from _hands_and_skill(now)
     yield from _machine(before, now)
@@ -79,7 +84,7 @@ def _mode(now: Status) -> Finding:
     return Finding(level, "mode", told + (f": {now.because}" if now.because else ""), "follow", now.remedy)
 
 
-def _source(before: Status, now: Status, name: str) -> Iterator[Finding]:
+def _source(before: Status, now: Status, name: str, published: Collection[str]) -> Iterator[Finding]:
     source, what = now.sources[name], SOURCE_NAMES[name]
     least, most = map(int, re.findall(r"\d+", BY_KEY[KEYS[name]].rate))
     wanted = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
@@ -89,8 +94,13 @@ def _source(before: Status, now: Status, name: str) -> Iterator[Finding]:
     )
     if not source.rate_hz:
         told = "nothing comes" if source.age_ms is None else f"nothing came for {source.age_ms / 1000:.1f} s"
+        group = KEYS[name].rpartition("/")[0]
+        ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
+        others = [one for one in sorted(published) if f"/{group}/" in one and one not in ours][:MOST_OTHERS]
+        told += f", but on {', '.join(others)}" if others else ""
         start = f"start {'the driver' if name == 'arm' else 'the tracker'}, connected to "
-        yield wrong(what, told, wanted, start + (", ".join(now.endpoints) or "where the daemon connects"))
+        rename = f"let it publish {key(now.cell, KEYS[name])}; or " if others else ""
+        yield wrong(what, told, wanted, rename + start + (", ".join(now.endpoints) or "where the daemon connects"))
         return
     told = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
     told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"

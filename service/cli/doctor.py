@@ -21,6 +21,7 @@ from service.client import UnreachableError, open_session
 from service.contract.channels import ENDPOINT
 
 PROBE_S = 1.0
+PUBLISHED = ("**/hands/*", "**/joints/state")  # of whatever cell: a name may be wrong
 
 
 def doctor(args: argparse.Namespace) -> int:
@@ -47,7 +48,11 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
     except UnreachableError as error:
         yield from (unreachable(endpoint, str(error)) for endpoint in connect)
         return
+    published: set[str] = set()
     with session:
+        listening = [
+            session.declare_subscriber(key, lambda sample: published.add(str(sample.key_expr))) for key in PUBLISHED
+        ]
         try:
             with contextlib.closing(heard(session, args.cell)) as told:
                 before = now = next(told)
@@ -68,7 +73,11 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
         except msgspec.ValidationError as error:
             yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")
             return
-    yield from findings(before, now, own_ns=time.time_ns(), own_version=version("thirdhand"))
+        for subscriber in listening:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+    yield from findings(
+        before, now, own_ns=time.time_ns(), own_version=version("thirdhand"), published=frozenset(published)
+    )
 
 
 def unreachable(endpoint: str, said: str) -> Finding:

@@ -8,7 +8,6 @@ import sys
 import time
 from typing import Any
 
-from service.cli.usage import CONNECT_TIMEOUT_S
 from service.client import Client, open_session
 from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
@@ -29,12 +28,16 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
     Raises NotHereError where they are not seen, or move, for too long.
     """
     wanted = [name for name in (*SIDES, "tool") if not getattr(args, name)]
-    print(f"waiting until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s", file=sys.stderr, flush=True)
+    print(
+        f"waiting for the daemon, and until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s",
+        file=sys.stderr,
+        flush=True,
+    )
     seen: list[tuple[float, dict[str, list[float]]]] = []
-    with open_session(
-        connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
-    ) as session:
-        client, begun_s = Client(session, args.cell), time.monotonic()
+    with open_session(connect=args.connect or [ENDPOINT], timeout_s=TIMEOUT_S, certificate=args.certificate) as session:
+        client = Client(session, args.cell)
+        client.wait_until_ready(timeout_s=TIMEOUT_S)
+        begun_s = time.monotonic()
         while True:
             now, at_s = client.ask("status"), time.monotonic()
             lacking = _not_seen(now, wanted)

@@ -165,10 +165,12 @@ def _at(point: tuple[float, float, float] | None) -> str:
 
 def _where(now: Status, side: str) -> str:
     source = now.sources.get(side, Source())
+    why = f" as {source.cause}" if source.cause else ""
+    refused = f"; {source.rate_hz:.0f} messages/s are rejected{why}" if source.rate_hz else ""
     if source.age_ms is None:
-        return "not seen yet" + (f"; {source.rate_hz:.0f} messages/s are rejected" if source.rate_hz else "")
+        return f"not seen yet{refused}"
     if not source.fresh:
-        return f"not seen for {source.age_ms / 1000:.1f} s"
+        return f"not seen for {source.age_ms / 1000:.1f} s{refused}"
     return f"{_at(now.hands_m.get(side))}, {source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
 
 

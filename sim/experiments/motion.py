@@ -81,11 +81,11 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
 
 
 def followers(skill: Skill, share: float) -> dict[str, Follower]:
-    """All that is compared; for a quick look one of each kind."""
+    """All that is compared; for a quick look one of each kind, and ours."""
     settings = Settings()
     found = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
-    for weight in WEIGHTS[:first]:
+    for weight in WEIGHTS if share == 1 else ():
         tool = msgspec.structs.replace(settings.tool, jerk_weight=weight)
         found[f"ours, jerk weight {weight:g}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
     for least_hz, beta in CHASES[:first]:
@@ -99,11 +99,11 @@ def followers(skill: Skill, share: float) -> dict[str, Follower]:
 def sequences(options: Options, middle: Array) -> list[Moving]:
     """The hands that are followed: recorded where a folder is given, modelled otherwise."""
     share = options.share
-    count, seconds = max(1, round(PEOPLE * share)), max(6.0, SECONDS * share)
+    count, seconds = max(1, round(PEOPLE * share)), max(4.0, SECONDS * share)
     people = recorded(options.hands, middle) if options.hands else modelled(middle, count=count, seconds=seconds)
     if share < 1:  # a quick look
         people = [one for one in people if one.group in FLOOR_GROUPS]
-    count = max(4, round(STOPS * share))
+    count = max(2, round(STOPS * share))
     return [
         *people,
         *reaches(count=REACHES),

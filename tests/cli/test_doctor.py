@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import zenoh
 from cell import LEFT, Daemon, Tracker
 from tests_paths import ROOT
 
@@ -65,6 +66,22 @@ def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
             driver.join(10)
 
 
+@contextlib.contextmanager
+def misnamed(session: zenoh.Session) -> Iterator[None]:
+    """A tracker that publishes under a key of another name."""
+    stop, pose = threading.Event(), messages.PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))
+
+    def publish() -> None:
+        while not stop.wait(0.02):
+            session.put("thirdhand/hands/Left", cdr.encode_pose(pose))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    yield
+    stop.set()
+    thread.join(10)
+
+
 def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, list[dict[str, str]]]:
     """Exit code and findings of `thirdhand doctor`, without those of this machine."""
     capsys.readouterr()
@@ -80,11 +97,14 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         open_session(connect=[service.endpoint]) as session,
     ):
         daemon = Daemon(service, session)
-        code, found = findings(daemon, capsys)
+        with misnamed(daemon.session):
+            code, found = findings(daemon, capsys)
         wrong = {finding["what"]: finding for finding in found if finding["level"] == "wrong"}
         assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
         assert all(finding["wanted"] and finding["remedy"] for finding in wrong.values())
         assert "no joint states came yet" in wrong["mode"]["found"]
+        assert wrong["left hand"]["found"] == "nothing comes, but on thirdhand/hands/Left"
+        assert wrong["left hand"]["remedy"].startswith("let it publish thirdhand/hands/left; or start the tracker")
 
         with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")

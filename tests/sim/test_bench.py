@@ -326,7 +326,7 @@ def test_bad_usage_and_bad_scenes_have_their_exit_codes(tmp_path: Path) -> None:
     assert "30 to 500 accepted" in usage.stderr
     bad = sim("--connect", "tcp/127.0.0.1:1", "--scene", str(tmp_path / "scene.toml"))
     assert bad.returncode == 1
-    assert "34.0 cm" in bad.stderr
+    assert "lies 0.34 m from" in bad.stderr
     assert "example:" in sim("--help").stdout
 
 
