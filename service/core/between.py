@@ -125,11 +125,9 @@ class Placed:
         """The inputs (F,) of hands (6,) that move so, and the inputs' velocity (F,) [1/s], by
         differences along their motion.
         """
-        found, off = np.empty((3, self.task.width)), np.empty(2)
-        for row, step in zip(found, (-STEP_S, 0.0, STEP_S), strict=True):
-            at, moving = hands + step * velocities, velocities + step * accelerations
-            _inputs(at, moving, self.layout.hands, self.task.inputs, row, off)
-        return found[1], (found[2] - found[0]) / (2.0 * STEP_S)
+        found = np.empty((2, self.task.width))
+        _moving_inputs(hands, velocities, accelerations, self.layout.hands, self.task.inputs, found)
+        return found[0], found[1]
 
     def mean(self, hands: Vector, velocities: Vector) -> Vector:
         """The tool (T, 3) [m] for hands and velocities (T, 6)."""
@@ -225,6 +223,19 @@ def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices,
             total += share[i]
         for i in range(count):
             out[inputs[side, i]] += share[i] / total
+
+
+@compiled
+def _moving_inputs(
+    hands: Vector, velocities: Vector, accelerations: Vector, corners: Vector, inputs: Indices, out: Vector
+) -> None:
+    """The shares of both hands (6,) that move so, and their velocity, into `out` (2, F)."""
+    ahead, off = np.empty(out.shape[1]), np.empty(2)
+    _inputs(hands - STEP_S * velocities, velocities - STEP_S * accelerations, corners, inputs, out[1], off)
+    _inputs(hands + STEP_S * velocities, velocities + STEP_S * accelerations, corners, inputs, ahead, off)
+    for i in range(len(ahead)):
+        out[1, i] = (ahead[i] - out[1, i]) / (2.0 * STEP_S)
+    _inputs(hands, velocities, corners, inputs, out[0], off)
 
 
 @compiled
