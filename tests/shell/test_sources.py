@@ -138,8 +138,8 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)), ("left", pose(1, (900.0, 0.0, 0.0))))
     assert cell.status(1.0).sources["left"].cause == "out_of_range"
     for k in range(1500):
-        seen = (("left", pose(2 * S + k, LEFT)),) if k < 1400 else ()
-        cell.tell(("right", pose(2 * S + k, RIGHT)), ("arm", joints(k + 1)), *seen)
+        seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1400 else ()
+        cell.tell(("right", pose(S + 1 + k, RIGHT)), ("arm", joints(k + 1)), *seen)
         if k % 50 == 0:
             told = cell.status(1.0 + k / 500)
     assert told.reason == "stale_hand"
