@@ -4,6 +4,7 @@ rest ends a take and is left out, and what was taken is shown, trimmed and delet
 
 from __future__ import annotations
 
+import argparse
 import re
 import threading
 import time
@@ -14,8 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from tests_paths import ROOT
 
 from service.cli.main import main
+from service.cli.record_options import add_options
 from service.cli.usage import free_port
 from service.client import endpoints, open_session
 from service.config import HandSettings, Settings, ToolSettings, robot_description
@@ -27,7 +30,7 @@ from service.recorder.demonstrations import iter_hands, read_demonstration
 from service.recorder.mcap_file import RecordingError
 from service.recorder.pose_streams import Recorded, Source
 from service.recorder.takes import summary, table, takes, trim, uncut
-from service.recorder.taking import JOINT_STATES, Sample, Take, TakeError, take
+from service.recorder.taking import JOINT_STATES, KEPT_S, MOVED, REST_M, REST_RAD, Sample, Take, TakeError, take
 from sim.scene import Scene
 from sim.teach import perform
 
@@ -202,6 +205,17 @@ def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Sess
     np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, wanted - now_ns, atol=6e7)
     assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
     assert 190 < len(taken.samples["tool/pose"]) < 220
+
+
+def test_what_rest_is_is_told_as_it_is() -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    options = " ".join(parser.format_help().split())
+    assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
+    assert f"left out but for {KEPT_S:g} s" in options
+    tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
+    assert MOVED == 5, "the tutorial says five times"
 
 
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
