@@ -25,7 +25,10 @@ def via_points(args: argparse.Namespace) -> int:
         request["names"] = args.names
     elif args.action == "add":
         request = _add(args)
-    reply = ask(args, "via_points", request)
+    with reached(args) as session:
+        client = Client(session, args.cell)
+        there = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
+        reply = client.ask("via_points", request)
     for point in reply["points"]:
         tool = " ".join(f"{v:.3f}" for v in point["tool"])
         missed = f"missed by {1000 * point['missed_by_m']:.1f} mm"
@@ -36,9 +39,18 @@ def via_points(args: argparse.Namespace) -> int:
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
+    if replaced := [point["name"] for point in there if point["name"] in _names(request)]:
+        print(f"replaced, as there was one of this name: {', '.join(replaced)}")
     for warning in reply.get("warnings", ()):
         print(f"warning: {warning}", file=sys.stderr)
     return 0
+
+
+def _names(request: Any) -> list[str]:
+    """Of the via-points that a request adds."""
+    if isinstance(request, requests.Add):
+        return [point.name for point in request.points]
+    return [point["name"] for point in request["points"]]
 
 
 def _add(args: argparse.Namespace) -> Any:

@@ -13,7 +13,7 @@ from service.client import UnreachableError, open_session
 from service.config import Settings, load
 from service.contract.channels import ENDPOINT
 from service.recorder.mcap_file import RecordingError
-from service.recorder.takes import Summary, TakeNameError, draw, path_of, summary, table, takes, there, trim
+from service.recorder.takes import Summary, TakeNameError, draw, path_of, summary, table, takes, there, trim, uncut
 from service.recorder.taking import take
 
 
@@ -30,8 +30,10 @@ def record(args: argparse.Namespace) -> int:
         return _list(args.folder, settings)
     if args.delete:
         path = there(args.folder, args.name)
-        path.unlink()
-        print(f"{path} deleted")
+        gone = [path, *([uncut(path)] if uncut(path).exists() else [])]
+        for one in gone:
+            one.unlink()
+        print(f"{', '.join(map(str, gone))} deleted")
         return 0
     if args.trim is not None:
         start_s, end_s = args.trim
@@ -39,7 +41,7 @@ def record(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"--trim {start_s:g} {end_s:g}: seconds from the start, the first below the second, needed"
             )
-        trim(there(args.folder, args.name), start_s, end_s)
+        print(trim(there(args.folder, args.name), start_s, end_s), file=sys.stderr)
     elif not args.show:
         _take(args, settings or Settings())
     found = summary(there(args.folder, args.name), settings=settings)

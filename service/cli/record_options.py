@@ -11,7 +11,7 @@ ABOUT = (
     "joints/state by its URDF."
 )
 EXAMPLE = """thirdhand record take-1
-  thirdhand record take-1 --trim 0.5 9
+  thirdhand record take-1 --trim 0.3 9
   thirdhand record --list"""
 
 
@@ -30,10 +30,16 @@ def add_options(c: argparse.ArgumentParser) -> None:
         "--until",
         choices=("key", "rest"),
         default="key",
-        help="it ends with Enter or Ctrl-C, or also once hands and tool rest after they moved (rest before and after "
-        "is then left out) (default: %(default)s)",
+        help="it ends with Enter or Ctrl-C, or also once hands and tool rest after they moved: all stay within 15 mm, "
+        "joints within 0.02 rad (rest before and after is then left out but for 0.3 s) (default: %(default)s)",
     )
-    c.add_argument("--rest", metavar="S", type=float, default=1.0, help="so long is rest (default: %(default)g)")
+    c.add_argument(
+        "--rest",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="for so long; slow motion, of less than 15 mm in that time, is rest too (default: %(default)g)",
+    )
     c.add_argument("--seconds", metavar="S", type=float, default=600.0, help="it lasts at most (default: %(default)g)")
     c.add_argument(
         "--wait", metavar="S", type=float, default=30.0, help="for hands and tool to be heard (default: %(default)g)"
@@ -54,6 +60,10 @@ def add_options(c: argparse.ArgumentParser) -> None:
     instead.add_argument("--list", action="store_true", help="the takes that are there, instead")
     instead.add_argument("--show", action="store_true", help="a take that is there, instead")
     instead.add_argument(
-        "--trim", metavar=("FROM", "TO"), nargs=2, type=float, help="cut a take to these seconds, instead"
+        "--trim",
+        metavar=("FROM", "TO"),
+        nargs=2,
+        type=float,
+        help="cut a take to these seconds, instead; as it was it stays beside it as NAME.mcap.uncut",
     )
-    instead.add_argument("--delete", action="store_true", help="a take, instead")
+    instead.add_argument("--delete", action="store_true", help="a take that is there, and its .uncut, instead")

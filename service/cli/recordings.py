@@ -8,6 +8,8 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 
+import msgspec
+
 from service.cli.clients import reached
 from service.cli.progress import progress, steps
 from service.cli.usage import UsageError, check_writable, places_in
@@ -126,7 +128,7 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(table(figures))
+    print(table(msgspec.structs.replace(figures, unsafe=())))  # what is unsafe is in the error
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:

@@ -61,6 +61,12 @@ class Add(_Operation, frozen=True, tag="add"):
     points: Annotated[tuple[ViaPoint, ...], msgspec.Meta(min_length=1, max_length=100)]
     tolerance: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_M
 
+    def __post_init__(self) -> None:
+        names = [point.name for point in self.points]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ValueError(f"$.points[{i}].name: {name!r} given twice, names once each needed")
+
 
 class Remove(_Operation, frozen=True, tag="remove"):
     """Forget via-points by name; all or nothing."""

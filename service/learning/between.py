@@ -23,6 +23,7 @@ from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, Gate, between, nonsense
 from service.learning.judgement import HeldOut
+from service.learning.skill_file import SkillError
 
 EACH = 30  # samples of a demonstration that are learned from, and
 ERRORS_OF_EACH = 40  # that its errors are kept of
@@ -34,6 +35,7 @@ UNSEEN = (0.15, 0.3, 0.45)  # of the way to a pair that was not: the tool stays
 TAUGHT = 1e-4  # deviation of the share at a known pair
 FALSE = 0.005  # of the time may the gate hold: hands that start elsewhere come nearer, and are to be followed
 BETTER = 0.98  # by which share of the error other parameters must be better than the usual ones
+FAR_M = 0.10  # a place that the tool never came so near is told wrong
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
@@ -107,6 +109,36 @@ def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
     inputs[0, :left], inputs[1, :right] = np.arange(left), left + np.arange(right)
     follow = np.array([FOLLOW[p.follow] for p in _ordered(demonstrations[0].places, names)])
     return Task(names, corners, inputs, follow)
+
+
+def places_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
+    """In words, which places the tool never came near in which demonstrations, by their names.
+
+    Raises SkillError for one that it came near in none.
+    """
+    warned = []
+    for place, follow in zip(task.names, task.follow.tolist(), strict=True):
+        off = [_nearest(one, next(_ordered(one.places, (place,))), follow) for one in demonstrations]
+        if min(off) > FAR_M:
+            raise SkillError(
+                f"place {place!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
+                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it told in metres, in frame base, "
+                "where it was in these demonstrations?"
+            )
+        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M]
+        if missed:
+            warned.append(f"place {place!r}: the tool never came near it in {', '.join(missed)}")
+    return warned
+
+
+def _nearest(demonstration: Demonstration, place: ViaPoint, follow: int) -> float:
+    """The tool's least distance from a place [m], there or where it is with the hand it follows."""
+    off = demonstration.tool[:, :3] - place.tool
+    out = float(np.linalg.norm(off, axis=1).min())
+    if follow == NONE:
+        return out
+    hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (place.left, place.right)[follow]
+    return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
 
 
 def merged(task: Task, told: Sequence[Told]) -> Task:

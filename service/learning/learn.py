@@ -8,7 +8,7 @@ regression at sampled inputs, a KMP of that with parameters as given.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from service.config import Reach
 from service.core.frame import Vector
 from service.core.places import Task
 from service.core.skill import LearnedBetween, Skill
-from service.learning.between import Told, learned, task_of
+from service.learning.between import Told, learned, places_never_reached, task_of
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
 from service.learning.gate import deviations, gate
@@ -41,6 +41,7 @@ class Evidence(NamedTuple):
     held_out: Sequence[HeldOut]
 
 
+Looked = TypeVar("Looked")
 Fit = Callable[[Sequence[int]], KMP]  # the primitive of the demonstrations with these indices
 
 
@@ -73,14 +74,15 @@ def learn(
         raise SkillError("no demonstrations given, at least 1 needed")
     if components is None and penalty is not None:
         raise SkillError("a penalty goes with a number of components: without them it is chosen")
-    pairs = [in_phase(demonstration) for demonstration in demonstrations]
-    names = list(names) or [f"demonstration {i + 1}" for i in range(len(pairs))]
+    names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
+    pairs = _of_each(names, in_phase, demonstrations)
     twins = repeated(pairs)
     remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
+    left_out = "".join(f"; {remark}" for remark in remarks)
     kept = [i for i in range(len(pairs)) if i not in twins]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
-    closures = [closure_in_phase(one) for one in demonstrations]
+    closures = _of_each(names, closure_in_phase, demonstrations)
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     task = task_of(demonstrations) if components is None and ell is None else ""
@@ -89,6 +91,7 @@ def learn(
     by_places: LearnedBetween | None = None
     try:
         if isinstance(task, Task):
+            remarks += places_never_reached(task, demonstrations, names)
             progress(f"learning between the places {', '.join(task.names)}")
             primitive, by_places, held_out, found = learned(task, demonstrations, paths, progress)
         else:
@@ -125,7 +128,7 @@ def learn(
         )
     except ValueError as error:
         if isinstance(error, SkillError):
-            raise
+            raise SkillError(f"{error}{left_out}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
     judged = figures(demonstrations, paths, names, held_out, found, reach=reach or Reach(), remarks=remarks)
     judged = msgspec.structs.replace(
@@ -152,6 +155,19 @@ def learn(
     skill = with_file(skill)
     show(Evidence(skill, judged, paths, held_out))
     return skill
+
+
+def _of_each(
+    names: Sequence[str], looked_at: Callable[[Demonstration], Looked], demonstrations: Sequence[Demonstration]
+) -> list[Looked]:
+    """What is found of each demonstration. Raises SkillError, which names the one at fault."""
+    out = []
+    for name, demonstration in zip(names, demonstrations, strict=True):
+        try:
+            out.append(looked_at(demonstration))
+        except SkillError as error:
+            raise SkillError(f"{name}: {error}") from None
+    return out
 
 
 def _inputs(

@@ -18,6 +18,7 @@ from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING, topic
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
 from service.contract.requests import encode_json
+from service.core.far_away import too_far
 from service.core.frame import Vector
 from service.core.intake import FARTHEST_M, UNIT_M
 from service.core.rotation import rotation
@@ -95,9 +96,16 @@ def read_demonstration(
     count = sum(len(track.poses) for track in tracks)
     if recorded.is_ours:  # what the daemon rejects, too
         tracks = [_kept(track, _is_pose(track.poses)) for track in tracks]
+    told = tracks
     tracks, mapped = in_base(path, tracks, settings.hands)
     if recorded.is_ours:
         tracks = [_kept(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
+        for track, before in zip(tracks, told, strict=True):
+            if len(before.poses) and not len(track.poses):
+                why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings.hands)
+                raise RecordingError(
+                    f"{path}: all {len(before.poses)} poses on {before.name} are too far, the first {why}"
+                )
         if left_out := count - sum(len(track.poses) for track in tracks):
             said.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
     if said or mapped:
@@ -139,6 +147,29 @@ def _kept(track: Track, mask: NDArray[np.bool_]) -> Track:
     return track._replace(stamps_ns=track.stamps_ns[mask], logged_ns=track.logged_ns[mask], poses=track.poses[mask])
 
 
+def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
+    """Whether the poses of a stream, `hands/left`, say, are told by the tracker's axes and unit."""
+    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
+    return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in of_hands)
+
+
+def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) in frame `base` [m], of those in the tracker's frame and unit."""
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
+
+
+def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
+    """What is said of a position of a stream, as it was told, that is too far from the base plate;
+    and what to do.
+    """
+    if is_by_tracker(name, frame, hands):
+        return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
+    rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
+    also = ", or name the tracker's frame in it and in [hands] frame: what it names is in [hands] unit"
+    return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
+
+
 def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
     """Tracks of left hand, right hand and tool in frame `base`, and in words which were brought
     there.
@@ -156,16 +187,13 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []
-    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
-    by_tracker = [
-        track.frame not in ("", BASE) or (track.name != ENDINGS["tool"] and track.frame in of_hands) for track in tracks
-    ]
+    by_tracker = [is_by_tracker(track.name, track.frame, hands) for track in tracks]
     if not any(by_tracker):
         return list(tracks), []
     turn, out = Rotation.from_matrix(axes), []
     for track, is_mapped in zip(tracks, by_tracker, strict=True):
         if is_mapped:
-            at = UNIT_M[hands.unit] * track.poses[:, :3] @ axes.T + origin
+            at = from_tracker(track.poses[:, :3], hands)
             turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
             track = track._replace(poses=np.hstack([at, turns]), frame=BASE)  # noqa: PLW2901
         out.append(track)

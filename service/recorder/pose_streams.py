@@ -17,7 +17,7 @@ from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import BASE, PoseStamped, WireError, in_order
-from service.contract.requests import RequestError, ViaPoint, decode_request
+from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.recorder.mcap_file import RecordingError, existing
 from service.recorder.mcap_reader import Fault, Messages
@@ -120,15 +120,16 @@ class Recorded:
 
     def _decoded_places(self, data: bytes) -> tuple[ViaPoint, ...]:
         try:
-            found: tuple[ViaPoint, ...] = decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])
-        except (WireError, RequestError) as error:
+            return Add(decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])).points
+        except (WireError, ValueError) as error:
             raise RecordingError(f"{self.path}: {PLACES}: {error}") from None
-        return found
 
     def _read_bag(self) -> None:
         from rosbags.rosbag1 import Reader as OfRos1  # heavy, and most recordings are MCAP files
         from rosbags.rosbag2 import Reader as OfRos2
 
+        if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
+            raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
         of_ros_1 = self.path.suffix == ".bag"
         try:
             with (OfRos1 if of_ros_1 else OfRos2)(self.path) as bag:

@@ -10,6 +10,7 @@ reading.
 from __future__ import annotations
 
 import contextlib
+import shlex
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -29,6 +30,7 @@ from service.core.outputs import outgoing
 from service.recorder.balls import with_balls
 from service.recorder.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recorder.mcap_reader import Fault, Messages
+from service.recorder.pose_streams import ENDINGS
 from service.recorder.steps import REPLAYED, Gap, Step, steps
 from service.urdf import Urdf
 
@@ -226,6 +228,18 @@ def _quaternion(orientation: Any) -> Quaternion:
     return x, y, z, w
 
 
+def _as_take(path: Path) -> str:
+    """What a file that is no recording is, where it is a take, and what shows it."""
+    topics: list[str] = []
+    with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
+        told = make_reader(stream).get_summary()
+        topics = [f"/{channel.topic}" for channel in told.channels.values()] if told else []
+    if path.suffix != ".mcap" or not all(any(t.endswith(f"/{end}") for t in topics) for end in ENDINGS.values()):
+        return ""
+    name, folder = shlex.quote(path.stem), shlex.quote(str(path.parent))
+    return f"; it is a take: thirdhand record {name} --folder {folder} --show --plot {name}.png"
+
+
 class Recording:
     """A recording on disk: its settings, its skill, and its steps one after the other, however long
     it is.
@@ -256,6 +270,7 @@ class Recording:
                 )
             raise RecordingError(
                 f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
+                + _as_take(path)
             )
         if about.get("format") != FORMAT:
             raise RecordingError(

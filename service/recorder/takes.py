@@ -13,7 +13,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.channels import JOINTS, POSE
 from service.core.frame import Vector
-from service.learning.demonstration import Demonstration
+from service.learning.demonstration import LEAST_M, Demonstration
 from service.recorder.demonstrations import read_demonstration
 from service.recorder.mcap_file import McapFile, RecordingError
 from service.recorder.mcap_reader import Messages
@@ -91,10 +91,22 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     recorded = Recorded.open(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
+    remarks += _still(demonstration)
     for side in SIDES:
         if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
             remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
     return Summary(path, demonstration, streams, tuple(remarks))
+
+
+def _still(demonstration: Demonstration) -> list[str]:
+    """What is said where hands or tool do not move, and nothing can be learned."""
+    found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
+    moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
+    return [
+        f"{name}: no more than {1000 * m:.1f} mm of motion, of which nothing is learned ({1000 * LEAST_M:g} needed)"
+        for name, m in moved
+        if m < LEAST_M
+    ]
 
 
 def _without(path: Path, line: str) -> str:
@@ -186,9 +198,15 @@ def draw(found: Summary, path: Path) -> None:
     figure.savefig(path)
 
 
-def trim(path: Path, start_s: float, end_s: float) -> None:
+def uncut(path: Path) -> Path:
+    """Where a take is kept as it was before it was trimmed: out of reach of `learn *.mcap`."""
+    return path.with_name(f"{path.name}.uncut")
+
+
+def trim(path: Path, start_s: float, end_s: float) -> str:
     """Cuts a take to what was recorded from `start_s` to `end_s` [s] after its first sample, all or
-    nothing. What is no stream of poses or joints stays whole.
+    nothing; in words what was cut. What is no stream of poses or joints stays whole. The take as it
+    was stays beside it, under the name that `uncut` tells, unless there is one already.
 
     Raises RecordingError where nothing that can be learned from would be left.
     """
@@ -199,6 +217,9 @@ def trim(path: Path, start_s: float, end_s: float) -> None:
     streams = {POSE.type, JOINTS.type}
     times_ns = [row[2].log_time for row in rows if row[0] and row[0].name in streams] or [0]
     begin_ns, lasts_s = min(times_ns), (max(times_ns) - min(times_ns)) / 1e9
+    kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
+    if len(kept_s) == len(times_ns):
+        return f"nothing is cut: {path} lasts {lasts_s:.1f} s"
     part = path.with_name(f".{path.name}.part")
     joints = next((len(JOINTS.decode(row[2].data).names) for row in rows if row[0] and row[0].name == JOINTS.type), 0)
     file = McapFile(part, joints=joints)
@@ -222,7 +243,15 @@ def trim(path: Path, start_s: float, end_s: float) -> None:
                 f"{path} lasts {lasts_s:.1f} s: from {start_s:g} to {end_s:g} s too little is left, and it stays as "
                 "it was"
             ) from None
+        whole = uncut(path)
+        was_there = whole.exists()
+        if not was_there:
+            path.replace(whole)
         part.replace(path)
+        return (
+            f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s; "
+            f"the uncut take is {'still' if was_there else 'kept as'} {whole}"
+        )
     except KeyError as error:
         raise RecordingError(f"{path}: messages of type {error} are of no take; it is not trimmed") from None
     finally:

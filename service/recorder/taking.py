@@ -19,13 +19,15 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
 from service.contract.requests import ViaPoint, encode_json
 from service.core.frame import Vector
-from service.core.intake import UNIT_M
+from service.core.intake import FARTHEST_M, UNIT_M
+from service.recorder.demonstrations import far_away, from_tracker, is_by_tracker
 from service.recorder.mcap_file import McapFile, machine
 from service.recorder.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.recorder.tool import tool_poses
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
+ELSEWHERE, MOST_OTHERS = ("**/hands/*", "**/tool/pose"), 8  # what is published in other cells, or misspelt
 REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, and hands tremble
 TOLD = 0.7  # of that time samples have to cover
 MOVED = 5.0  # times that, before rest is the end
@@ -86,7 +88,8 @@ class Take:
         if isinstance(message, PoseStamped):
             if not finite(message.position + message.orientation):
                 raise WireError("a pose that is not finite")
-            return UNIT_M[self.settings.hands.unit if key in HANDS else "m"] * np.array(message.position)
+            is_scaled = is_by_tracker(key, message.frame_id, self.settings.hands)
+            return UNIT_M[self.settings.hands.unit if is_scaled else "m"] * np.array(message.position)
         if key == GRIPPER_STATE:
             return np.array(message.position[:1])
         return np.array(in_order(message, self.settings.joints.names)[0])
@@ -96,6 +99,19 @@ class Take:
         """What has not been heard yet of what a demonstration needs."""
         tool = [] if self.samples[TOOL] or self.samples[JOINT_STATES] else [f"{TOOL} or {JOINT_STATES}"]
         return [key for key in HANDS if not self.samples[key]] + tool
+
+    def check(self) -> None:
+        """Raises TakeError where a hand or the tool is too far away to be meant."""
+        hands = self.settings.hands
+        for key in (*HANDS, TOOL):
+            for sample in self.samples[key][-1:]:
+                pose = channels.POSE.decode(sample.payload)
+                at = np.array(pose.position)
+                if is_by_tracker(key, pose.frame_id, hands):
+                    at = from_tracker(at, hands)
+                if np.linalg.norm(at) > FARTHEST_M:
+                    why = far_away(key, pose.frame_id, pose.position, hands)
+                    raise TakeError(f"{key} is {why}. Nothing is recorded")
 
     @property
     def streams(self) -> dict[str, list[Sample]]:
@@ -128,6 +144,15 @@ class Take:
             if told_s < TOLD * rest_s or _apart(key, np.array(still)) > 1:
                 return False
         return self._moved
+
+    def keep_motion(self) -> tuple[float, float]:
+        """Keeps what came while anything moved, with KEPT_S of rest before and behind; how much was
+        left out before and behind [s].
+        """
+        times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
+        start_ns, end_ns = self.span_of_motion()
+        self.keep(start_ns, end_ns)
+        return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
         """From when to when anything moves [ns], with KEPT_S of rest before and behind."""
@@ -199,6 +224,28 @@ class Take:
         ]
 
 
+class _Others:
+    """The keys under which others publish what could be meant to be the hands and the tool."""
+
+    def __init__(self, session: zenoh.Session, cell: str) -> None:
+        self._keys, self._wanted = set[str](), {channels.key(cell, key) for key in HEARD}
+        self._subscribers = [session.declare_subscriber(key, self._take) for key in ELSEWHERE]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        if key not in self._wanted and len(self._keys) < MOST_OTHERS:
+            self._keys.add(key)
+
+    @property
+    def heard(self) -> list[str]:
+        return sorted(self._keys)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscribers = []
+
+
 def _since(samples: list[Sample], since_ns: int) -> list[Sample]:
     """The last samples, that arrived since a time."""
     at = len(samples)
@@ -230,22 +277,26 @@ def take(
 
     Raises TakeError where they are not heard within `wait_s`.
     """
-    taken = Take(session, cell, settings)
+    taken, others = Take(session, cell, settings), _Others(session, cell)
+    at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()
         say(f"waiting for {', '.join(taken.missing)} of cell {cell}")
         while taken.missing:
             if time.monotonic() - begun_s > wait_s or is_ended():
                 unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in taken.malformed.items())
+                instead = f"; heard instead: {', '.join(others.heard)}" if others.heard else ""
                 raise TakeError(
-                    f"not heard: {', '.join(taken.missing)}{unreadable}. Are tracker and arm running, connected to the "
-                    f"same place, and in cell {cell}?"
+                    f"not heard: {', '.join(taken.missing)}{unreadable}{instead}. Are tracker and arm running, "
+                    f"connected to the same place, and in cell {cell}?"
                 )
             time.sleep(POLL_S)
             taken.collect()
+        others.close()
+        taken.check()
         taken.begin()
         begun_s, told_s = time.monotonic(), 0.0
-        say("recording")
+        say(f"recording{f'; it ends once {at_rest} after they moved' if until == 'rest' else ''}")
         while not is_ended():
             time.sleep(POLL_S)
             taken.collect()
@@ -255,6 +306,7 @@ def take(
                 counts = ", ".join(f"{key} {len(samples)}" for key, samples in taken.streams.items())
                 progress(f"{lasts_s:5.1f} s   {counts}")
             if until == "rest" and taken.is_over(rest_s):
+                say(f"ended by rest: {at_rest}")
                 break
             if lasts_s > longest_s:
                 say(f"ended after {longest_s:g} s")
@@ -266,7 +318,10 @@ def take(
         if taken.missing:
             raise
     finally:
+        others.close()
         taken.close()
     if until == "rest":
-        taken.keep(*taken.span_of_motion())
+        before_s, behind_s = taken.keep_motion()
+        if before_s or behind_s:
+            say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s behind it")
     return taken

@@ -278,8 +278,7 @@ class Requests:
         return self._adopt(self._workshop.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
 
     def _check(self, added: Sequence[ViaPoint]) -> None:
-        """Raises RequestError for names given twice and for via-points that no target may reach."""
-        names = [point.name for point in added]
+        """Raises RequestError for too many via-points, and for those that no target may reach."""
         total = points_made_of(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
         if total > MOST_POINTS:
             raise RequestError(
@@ -288,8 +287,6 @@ class Requests:
         low, high = self._skill.workspace
         reach = self._settings.reach
         for i, point in enumerate(added):
-            if point.name in names[:i]:
-                raise RequestError(f"$.points[{i}].name: {point.name!r} given twice, names once each needed")
             at, given = np.array(point.tool), f"$.points[{i}].tool: {list(point.tool)}"
             if not ((low <= at) & (at <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))

@@ -17,12 +17,12 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
+from service.core.far_away import figures, too_far
 from service.core.frame import Record
-from service.core.intake import FARTHEST_M, FASTEST_JOINT, UNIT_M, Refused
+from service.core.intake import FASTEST_JOINT, Refused
 
 WINDOW_S = 1.0  # over which rates and clocks are told
 TELL_EVERY_S = 10.0  # counts of what goes on being rejected
-PLAUSIBLE_M = (0.05, 2.5)  # a hand is so far from the base plate, in the unit that was meant
 LONGEST_NAME = 64  # of a frame
 TURN_RAD = 7.0  # no joint is farther from its zero
 KEYS = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
@@ -149,18 +149,15 @@ def in_words(refused: Refused, settings: Settings) -> str:
 
 
 def _of_pose(cause: Cause, sample: PoseStamped, settings: Settings) -> str:
-    at, unit = _numbers(sample.position), settings.hands.unit
+    at = figures(sample.position)
     match cause:
         case Cause.NOT_A_ROTATION:
             norm = sum(v * v for v in sample.orientation) ** 0.5
-            return f"orientation {_numbers(sample.orientation)} of norm {norm:.3g}; norm 1 needed, x y z w"
+            return f"orientation {figures(sample.orientation)} of norm {norm:.3g}; norm 1 needed, x y z w"
         case Cause.NOT_FINITE:
-            return f"position {at}, orientation {_numbers(sample.orientation)}; finite numbers needed"
+            return f"position {at}, orientation {figures(sample.orientation)}; finite numbers needed"
         case Cause.OUT_OF_RANGE:
-            far = sum(v * v for v in sample.position) ** 0.5
-            meant = [u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_M[0] < far * m < PLAUSIBLE_M[1]]
-            like = f", which looks like {meant[-1]}" if meant else ""
-            return f"at {at}{like}; [hands] unit is {unit!r}, at most {FARTHEST_M:g} m from the base plate accepted"
+            return too_far(sample.position, settings.hands.unit)
         case Cause.SWAPPED:
             return f"at {at} in the tracker's frame, where the other hand was; left and right look exchanged"
     return f"at {at} in the tracker's frame, from one sample to the next"
@@ -179,8 +176,4 @@ def _of_joints(cause: Cause, sample: JointState, settings: Settings) -> str:
                 return f"{name} at {at:.4g} rad{like}; {low:g} to {high:g} accepted, or 0.2 rad outside"
             if abs(fast) > FASTEST_JOINT:
                 return f"{name} at {fast:.4g} rad/s; up to {FASTEST_JOINT:g} accepted"
-    return f"positions {_numbers(position)}"
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return f"({', '.join(f'{v:.4g}' for v in values)})"
+    return f"positions {figures(position)}"

@@ -43,6 +43,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     assert done.returncode == 1
     assert "is not written: " in done.stderr
     assert "contradict others" in done.stderr
+    assert "unsafe: " not in done.stdout
     assert not out.exists()
 
 

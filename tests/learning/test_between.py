@@ -5,6 +5,7 @@ and what its file may hold.
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from service.contract.requests import ViaPoint
 from service.core.between import _nearest
 from service.core.places import MOST_CORNERS
 from service.core.skill import Skill
-from service.learning.between import task_of
+from service.learning.between import places_never_reached, task_of
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
@@ -123,6 +124,18 @@ def test_what_cannot_be_learned_between_places_says_why(shown: list[Demonstratio
         for one in shown
     ]
     assert "the left hand has 4 places, 3 at most" in str(task_of(fourth))
+
+
+def test_a_place_that_the_tool_never_came_near_is_named(shown: list[Demonstration]) -> None:
+    names = [f"take-{i}" for i in range(len(shown))]
+    task = task_of(shown)
+    assert not isinstance(task, str)
+    assert places_never_reached(task, shown, names) == []
+    wrong = [one._replace(places=moved(one.places, {"glass": (0.0, 0.4, 0.3)})) for one in shown]
+    (said,) = places_never_reached(task, [*shown[:-1], wrong[-1]], names)
+    assert re.fullmatch(r"place 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said)
+    with pytest.raises(SkillError, match=r"place 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"):
+        learn(wrong, names=names)
 
 
 def test_its_file_holds_it_exactly_and_what_does_not_fit_is_refused(between: Skill) -> None:

@@ -71,6 +71,9 @@ def test_demonstrations_that_cannot_be_learned_from_are_refused(taught: list[Dem
     ):
         with pytest.raises(SkillError, match=message):
             learn(wrong)
+    still = one._replace(tool=np.tile(one.tool[0], (len(one.tool), 1)))
+    with pytest.raises(SkillError, match=r"^take-2: a demonstration in which hands or tool move by less than 10 mm"):
+        learn([one, still], names=["take-1", "take-2"])
 
 
 def test_too_few_samples_for_a_mixture_are_counted(taught: list[Demonstration]) -> None:

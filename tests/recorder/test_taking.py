@@ -4,16 +4,21 @@ rest ends a take and is left out, and what was taken is shown, trimmed and delet
 
 from __future__ import annotations
 
+import argparse
+import re
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
+from tests_paths import ROOT
 
 from service.cli.main import main
+from service.cli.record_options import add_options
 from service.cli.usage import free_port
 from service.client import endpoints, open_session
 from service.config import HandSettings, Settings, ToolSettings, robot_description
@@ -22,9 +27,10 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.requests import Add, encode_json
 from service.core.arm import Arm
 from service.recorder.demonstrations import iter_hands, read_demonstration
+from service.recorder.mcap_file import RecordingError
 from service.recorder.pose_streams import Recorded, Source
-from service.recorder.takes import summary, table, trim
-from service.recorder.taking import JOINT_STATES, Sample, Take, TakeError, take
+from service.recorder.takes import summary, table, takes, trim, uncut
+from service.recorder.taking import JOINT_STATES, KEPT_S, MOVED, REST_M, REST_RAD, Sample, Take, TakeError, take
 from sim.scene import Scene
 from sim.teach import perform
 
@@ -98,6 +104,87 @@ def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session
     assert list(tmp_path.iterdir()) == []
 
 
+def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event) -> None:
+    """Publishes positions by key, ever again."""
+    publishers = {key: told.declare_publisher(key) for key in poses}
+    for i in range(2000):
+        for key, at in poses.items():
+            publishers[key].put(cdr.encode_pose(PoseStamped(i + 1, "base", at, (0.0, 0.0, 0.0, 1.0))))
+        if over.wait(0.01):
+            break
+
+
+@pytest.mark.parametrize(
+    ("poses", "wait_s", "words"),
+    [
+        (
+            {"bench/hands/left": (980.0, -320.0, 60.0), "bench/hands/right": (0, 0, 1), "bench/tool/pose": (0, 0, 1)},
+            20.0,
+            r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at most 5 m from the "
+            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing is recorded",
+        ),
+        (
+            {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
+            1.0,
+            r"not heard: hands/left, tool.*; heard instead: bench7/hands/left, thirdhand/hands/Left\. Are",
+        ),
+    ],
+)
+def test_what_is_published_otherwise_than_needed_is_said_before_anything_is_recorded(
+    sessions: tuple[zenoh.Session, zenoh.Session], poses: dict[str, Any], wait_s: float, words: str
+) -> None:
+    over = threading.Event()
+    tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
+    tracker.start()
+    try:
+        with pytest.raises(TakeError, match=words):
+            take(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
+    finally:
+        over.set()
+        tracker.join(10)
+
+
+def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
+    """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
+    taken, path = (
+        Take(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker"))),
+        tmp_path / "a.mcap",
+    )
+    taken.close()
+
+    def told(tool: tuple[str, float]) -> None:
+        for key, frame, scale in (("hands/left", "tracker", 1e3), ("hands/right", "", 1e3), ("tool/pose", *tool)):
+            taken.samples[key] = [
+                Sample(
+                    10**18 + i * 10**7,
+                    cdr.encode_pose(PoseStamped(10**18 + i * 10**7, frame, (0.3 * scale, 0.0, 0.0), (0, 0, 0, 1.0))),
+                    np.zeros(3),
+                )
+                for i in range(9)
+            ]
+        taken.write(path)
+
+    told(("tracker", 1e3))
+    taken.check()
+    found = summary(path)
+    assert found.demonstration.tool[0, :3].tolist() == pytest.approx([0.3, 0.0, 0.0])
+    assert [line.split(":")[0] for line in found.remarks if "of motion" in line] == ["hands", "tool"]
+    told(("base", 1e3))
+    words = (
+        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is in metres, whatever \[hands\] unit says"
+    )
+    with pytest.raises(TakeError, match=f"tool/pose is {words}"):
+        taken.check()
+    with pytest.raises(RecordingError, match=f"all 9 poses on tool/pose are too far, the first {words}"):
+        read_demonstration(path)
+    with pytest.raises(
+        RecordingError, match=r"all 9 poses on hands/left are too far, .* \[hands\] unit is 'm', at most"
+    ):
+        read_demonstration(path, settings=Settings(hands=HandSettings(frame="tracker")))
+
+
 def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
     """A sample each 10 ms up to now, at places (N,) along one axis [m]."""
     times = end_ns - np.arange(len(way))[::-1] * 10_000_000
@@ -116,8 +203,19 @@ def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Sess
     start_ns, end_ns = taken.span_of_motion()
     wanted = now_ns - np.array([(400 - 100 - 5 + 30) * 10**7, (150 + 5 - 30) * 10**7])
     np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, wanted - now_ns, atol=6e7)
-    taken.keep(start_ns, end_ns)
+    assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
     assert 190 < len(taken.samples["tool/pose"]) < 220
+
+
+def test_what_rest_is_is_told_as_it_is() -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    options = " ".join(parser.format_help().split())
+    assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
+    assert f"left out but for {KEPT_S:g} s" in options
+    tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
+    assert MOVED == 5, "the tutorial says five times"
 
 
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
@@ -137,6 +235,9 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     path = tmp_path / "takes" / "take-1.mcap"
     said = capsys.readouterr()
     assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in said.err
+    assert "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after" in said.err
+    assert "ended by rest: hands and tool stay within 15 mm" in said.err
+    assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s behind it", said.err)
     found = summary(path)
     assert said.out.strip() == table(found)
     assert "  places handover, glass, soldering\n" in said.out
@@ -150,8 +251,20 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
         trim(path, 20, 30)
     assert summary(path).lasts_s == found.lasts_s
+    assert trim(path, 0, 20).startswith("nothing is cut: ")
+    whole = path.read_bytes()
     assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
     assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
+    assert re.search(
+        r"\d\.\d s cut to 0\.\d s; the uncut take is kept as .*take-1\.mcap\.uncut", capsys.readouterr().err
+    )
+    assert "the uncut take is still " in trim(path, 0, 0.4)
+    assert uncut(path).read_bytes() == whole
+    assert takes(path.parent) == [path]
+    assert main(["replay", str(path)]) == 1
+    assert f"; it is a take: thirdhand record take-1 --folder {path.parent} --show" in capsys.readouterr().err
+    with pytest.raises(RecordingError, match=r"takes is a folder: give its files, .*takes/\*\.mcap"):
+        read_demonstration(path.parent)
     assert summary(path).demonstration.places == Scene().via_points()
     assert Recorded.open(path).settings == Settings()
     capsys.readouterr()
@@ -164,6 +277,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert "2 takes in" in said.err
     assert main(["record", "take-1", "--delete", *folder]) == 0
     assert not path.exists()
+    assert not uncut(path).exists()
 
 
 @pytest.mark.parametrize(
@@ -176,6 +290,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         (["there"], 1, "is there already: another name needed, or --delete it first"),
         (["a", "--plot", "a.jpg"], 2, "a.jpg: a picture is written as .png: a.png, say"),
         (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
+        (["a", "--places", "PLACES"], 1, "$.points[1].name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
         (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),
     ],
@@ -184,6 +299,9 @@ def test_what_cannot_be_meant_is_said(
     tmp_path: Path, arguments: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "there.mcap").write_bytes(b"")
+    glass = {"name": "glass", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0]}
+    (tmp_path / "places.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
+    arguments = [str(tmp_path / "places.json") if one == "PLACES" else one for one in arguments]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.cli.record.CONNECT_TIMEOUT_S", 0.2)
         assert main(["record", *arguments, "--folder", str(tmp_path)]) == code

@@ -181,7 +181,7 @@ def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> N
     shared_daemon.client.ask("via_points", {"op": "clear"})
 
 
-def test_the_commands_of_a_client(shared_daemon: Any) -> None:
+def test_the_commands_of_a_client(shared_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
     at = ("--connect", shared_daemon.endpoint)
     assert thirdhand("hold", *at).returncode == 0
     status = thirdhand("status", *at)
@@ -194,6 +194,10 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     added = thirdhand("via-points", "add", "my place", *place, *at)
     assert added.returncode == 0, added.stderr
     assert "my place" in added.stdout
+    assert "replaced" not in added.stdout
+    capsys.readouterr()
+    assert main(["via-points", "add", "my place", *place, *at]) == 0
+    assert "replaced, as there was one of this name: my place\n" in capsys.readouterr().out
     assert "1 via-point in force" in thirdhand("via-points", "list", *at).stdout
     refused = thirdhand("via-points", "remove", "other", *at)
     assert refused.returncode == 1
