@@ -35,11 +35,12 @@ if importlib.util.find_spec("pybullet") is None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """In a fresh checkout, compiles what a daemon compiles at its first start.
+    """In a checkout that is fresh to this Python, compiles what a daemon compiles at its first start.
 
     Each test of a daemon would else do so in a process of its own, and time out where several do.
     """
-    compiled = any((Path(rehearsal.__file__).parent / "__pycache__").glob("*.nbi"))
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    compiled = any((Path(rehearsal.__file__).parent / "__pycache__").glob(f"*.{version}.nbi"))
     if compiled or hasattr(config, "workerinput"):
         return
     place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
