@@ -35,7 +35,7 @@ if importlib.util.find_spec("pybullet") is None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """In a checkout that is fresh to this Python, compiles what a daemon compiles at its first start.
+    """In a checkout fresh to this Python, compiles what a daemon compiles at its first start.
 
     Each test of a daemon would else do so in a process of its own, and time out where several do.
     """
