@@ -29,9 +29,7 @@ def why_held(columns: Columns, begin: int, end: int) -> str:
         return _rejected(columns, max(0, begin - _ticks(columns)), end)
     if reason is Reason.OPERATOR:
         return _asked(columns, begin, ("hold",))
-    if reason is Reason.ARM_NOT_READY and not columns.samples["joints/state"]:
-        return "no joint state came at all"
-    return ""
+    return _untold(columns, int(frames["tick"][0])) if reason is Reason.ARM_NOT_READY else ""
 
 
 def what_led(columns: Columns, begin: int) -> list[str]:
@@ -119,6 +117,18 @@ def _unseen(columns: Columns, begin: int, end: int, *, only_stale: bool = False)
         elif longest_ms > stale:
             said.append(f"the {name} hand was not seen for {longest_ms / 1000:.2f} s")
     return "; ".join(said)
+
+
+def _untold(columns: Columns, tick: int) -> str:
+    """Of an arm not ready from a tick on: since when it had told nothing, if that is why."""
+    if not columns.samples["joints/state"]:
+        return "no joint state came at all"
+    heard = columns.silent_since.get(tick)
+    if heard is None:
+        return ""
+    if 1000 * (tick - heard + 1) * columns.period_s > columns.recording.settings.arm.silent_ms:
+        return f"the arm fell silent: no joint states from {columns.seconds(heard):.1f} s on"
+    return "joint states came, but not yet of an arm that rests within its limits"
 
 
 def _rejected(columns: Columns, begin: int, end: int) -> str:

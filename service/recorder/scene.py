@@ -14,9 +14,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from service import palette
 from service.config import Reach, Settings
 from service.contract.records import SIDES, STAGES, Mode, Reason
-from service.recorder import palette
 from service.recorder.arrangement import EYE, LOOK_AT, UP
 from service.recorder.banner import HEIGHT, WIDTH
 
@@ -155,17 +155,17 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
         ("/deviation/target", "target's standard deviation [mm]", palette.TARGET),
-        ("/deviation/hands", "hands off what is known [mm]", palette.NEAREST),
-        ("/deviation/gate", "holds above [mm]", palette.VERMILLION),
+        ("/deviation/hands", "hands off what is known [mm]", palette.OFF),
+        ("/deviation/gate", "holds above [mm]", palette.GATE),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
         ("/joints/error", "largest [rad]", palette.MEASURED),
-        ("/latency/hand", "hand's stamp to command [ms]", palette.PURPLE),
-        ("/timing/lateness", "late by [µs]", palette.ORANGE),
-        ("/timing/work", "work [µs]", palette.SKY),
+        ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
+        ("/timing/lateness", "late by [µs]", palette.LATENESS),
+        ("/timing/work", "work [µs]", palette.WORK),
     ):
         fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_drawn_as(path)))
     for path, words, numbers in (

@@ -39,7 +39,6 @@ FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
 LIVE_MEMORY = "64MiB"
 FLUSH_TIMEOUT_S = 5.0
 REPEAT_S = 10.0  # what is in force is said again to live viewers as often
-ROOM = 1.25  # above what most seconds' curves reach
 
 
 class ViewerError(ExplainedError, RuntimeError):
@@ -140,7 +139,7 @@ class _Destination:
         """Sends what is pending, and to a file how far its curves reach, now that this is known."""
         self.send()
         if self._open and not self._live and self._chunks.end_s > 0:
-            tops = {view: ROOM * float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
+            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
             self._stream.send_blueprint(
                 blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._chunks.end_s),
                 make_active=True,

@@ -18,9 +18,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from service import palette
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration, fingerprint
-from service.recorder import palette
 from service.recorder.demonstrations import read_demonstration
 from service.recorder.mcap_file import RecordingError
 
