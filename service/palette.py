@@ -4,6 +4,8 @@ apart; each thing has one, in the viewer's scene and curves, in reports and besi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from service.contract.records import Mode
 
 Colour = tuple[int, int, int]
@@ -20,6 +22,12 @@ BACKGROUND, TABLE, GRID = (24, 27, 33), (58, 63, 72), (70, 76, 86)
 def faint(colour: Colour, opacity: float) -> tuple[int, int, int, int]:
     """A colour that lets through what is behind it."""
     return (*colour, round(255 * opacity))
+
+
+def light(colour: Sequence[int]) -> Colour:
+    """A colour, its opacity aside, in which a word is read on what is dark."""
+    red, green, blue = (128 + value // 2 for value in colour[:3])
+    return red, green, blue
 
 
 def packed(colour: Colour) -> int:

@@ -152,7 +152,7 @@ def _from_above(report: Report) -> Figure:
     points = {point for _, skill in report.columns.skills for point in skill.via_points}
     for point in sorted(points, key=lambda point: point.name):
         x, y, _ = point.tool
-        axes.plot(x, y, "D", color="black", ms=5)
+        axes.plot(x, y, "D", color=PLACE, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
     axes.plot(0, 0, "s", color=PLACE, ms=10)
     axes.annotate("arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4")

@@ -24,7 +24,7 @@ TABS = ("task", "timing", "learning")
 WINDOW_S, LEGEND_SHARE = 20.0, 0.28  # of live curves; of the axis, kept free for legends
 ROOM = 1.25  # of an axis, times how far most seconds' curves reach
 GATE_FAR = 4.0  # times as high as the curves, the gate would flatten them
-EYE, LOOK_AT, UP = (0.94, -0.80, 0.62), (0.52, 0.0, 0.22), (0.0, 0.0, 1.0)
+EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
 
 
 class Curves(NamedTuple):
@@ -126,7 +126,7 @@ def blueprint(
             column_shares=[3, 2],
         ),
         rrb.Horizontal(_modes(shown), _log(), column_shares=[3, 2]),
-        row_shares=[5, 1],
+        row_shares=[7, 2],
         name="Task",
     )
     timing = rrb.Vertical(

@@ -28,7 +28,7 @@ from service.core.frame import Record
 from service.learning.demonstration import Demonstration
 from service.recorder import taught, things
 from service.recorder.arrangement import blueprint
-from service.recorder.chunks import Chunks, Shown
+from service.recorder.chunks import LOG_NS, Chunks, Shown
 from service.recorder.folder import skills_folder
 from service.recorder.recording import THINGS
 from service.recorder.scene import Trees, log_fixed
@@ -122,11 +122,11 @@ class _Destination:
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Takes in one line of the log."""
-        self.put([self._at(time_ns)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
+        self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
 
-    def _at(self, time_ns: int) -> Callable[..., rr.chunk.Chunk]:
+    def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
         """What makes a chunk of one row at a time [ns]."""
-        index = self._chunks.index(np.array([time_ns], np.int64))
+        index = self._chunks.index(np.array([time_ns], np.int64), to_ns=to_ns)
         return lambda path, *columns: rr.chunk.Chunk.from_columns(path, index, list(columns))
 
     def send(self) -> None:
