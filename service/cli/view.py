@@ -212,11 +212,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             if extent is None:
                 raise ViewerError(f"no picture of {source}: it holds nothing yet")
             _arrange(client, tab)
-            start, end = extent
-            at = end if time is None else start + round(time * 1e9)
-            if at > end:
-                last_s = math.floor(100 * (end - start) / 1e9) / 100
-                raise UsageError(f"--time {time:g}: seconds from 0 to {last_s:g} needed, as long as {source} lasts")
+            at = moment(extent, time)
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
             else:
@@ -230,6 +226,15 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
         hint = "drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers"
         raise ViewerError(f"no picture of {source}: {error} ({hint})") from error
+
+
+def moment(extent: tuple[int, int], time: float | None) -> int:
+    """When `time` [s] after the start is, or the end [ns]. Raises UsageError if later."""
+    start, end = extent
+    at = end if time is None else start + round(time * 1e9)
+    if at > end:
+        raise UsageError(f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed")
+    return at
 
 
 def _arrange(client: Any, tab: str) -> None:

@@ -20,7 +20,8 @@ from test_recording import at_ns, ticks, write
 from wam import JOINT_NAMES
 
 from service.cli.main import main
-from service.cli.view import convert, screenshot
+from service.cli.usage import UsageError
+from service.cli.view import convert, moment, screenshot
 from service.config import WAM, Settings
 from service.contract import cdr
 from service.contract.messages import JointState, Thing
@@ -329,6 +330,13 @@ def views(container: Any) -> Iterator[Any]:
             yield part
         else:
             yield from views(part)
+
+
+def test_a_picture_is_of_a_moment_that_there_is() -> None:
+    extent = (5_000_000_000, 19_258_000_000)
+    assert [moment(extent, time) for time in (None, 0.0, 14.25)] == [extent[1], extent[0], 19_250_000_000]
+    with pytest.raises(UsageError, match=r"--time 99: seconds from 0 to 14\.25 needed"):
+        moment(extent, 99.0)
 
 
 def test_errors_say_what_is_missing(tmp_path: Path) -> None:
