@@ -121,7 +121,7 @@ def blueprint(
                 plot("/deviation"),
                 rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
                 rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
-                row_shares=[3, 3, 3, 4],
+                row_shares=[3, 3, 3, 5],  # the joints have seven names
             ),
             column_shares=[3, 2],
         ),

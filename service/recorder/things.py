@@ -10,7 +10,7 @@ import rerun as rr
 from service import palette
 from service.contract.messages import BASE, Thing
 
-ABOVE_M = 0.06  # of a thing that lies on the bench is its name, clear of those of the places below
+ABOVE_M = 0.06  # a thing is its name, clear of those of places below; of what the tool holds, toward the arm
 Column = Callable[..., rr.chunk.Chunk]
 
 
@@ -35,7 +35,7 @@ def drawn(things: Iterable[Thing], before: Iterable[str], at: Column) -> Iterato
             kind = rr.Boxes3D if thing.shape == "box" else rr.Ellipsoids3D
             yield at(path, *_row(kind, half_sizes=half, **place, **look))
         x, y, z = thing.position
-        over = (x, y, z + (ABOVE_M if thing.frame_id == BASE else 0.0))
+        over = (x, y, z + (ABOVE_M if thing.frame_id == BASE else -ABOVE_M))
         said = {"labels": [thing.name], "show_labels": [True], "colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
         yield at(f"{path}/name", *_row(rr.Points3D, positions=[over], radii=[0.0], **said))
