@@ -18,6 +18,7 @@ from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm import Arm
+from service.recorder.arrangement import curves
 from service.recorder.client import Scribe
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
@@ -60,6 +61,15 @@ def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
     words = "".join(told.about + told.remedy for told in incidents.EVERY.values())
     told += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
     assert {word for pair in told for word in pair if word} <= fields
+
+
+def test_each_view_that_a_document_names_by_its_title_is_there() -> None:
+    titles = {view.title for view in curves(Settings()).values()}
+    for name in ("incidents.md", "viewing.md"):
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        told = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
+        assert told <= titles
+        assert told or name != "incidents.md"
 
 
 def test_the_table_of_signs_is_the_arms() -> None:

@@ -62,7 +62,7 @@ class Latest:
             self._status, self._at = json.loads(sample.payload.to_bytes()), time.monotonic()
 
     def told(self) -> dict[str, Any]:
-        """Mode, reason, age [s] and the rest in one line."""
+        """Mode, reason, its cause and what to do about it, age [s], and the rest in one line."""
         now = self._status
         hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now["hand_age_ms"].items())
         near = f"{100 * now['hand_distance_m']:.0f} cm to the nearest, " if hands else ""
@@ -72,6 +72,8 @@ class Latest:
         return {
             "mode": now["mode"],
             "reason": now["reason"],
+            "because": now["because"],
+            "remedy": now["remedy"],
             "age_s": time.monotonic() - self._at,
             "facts": facts,
         }

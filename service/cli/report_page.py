@@ -11,14 +11,20 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from service import palette
 from service.cli.report_tables import Table, comparison, names_of, summary, tables
 from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
 from service.recorder.report import Report
 
-# Colours of Okabe and Ito, which the colour-blind tell apart.
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
-MODE_COLOURS = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: RED}
+LEFT, RIGHT, TOOL, TARGET, NEAREST, OFF, PLACE, LATENCY, WORK, LATENESS = map(
+    palette.written,
+    (
+        *(palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET, palette.NEAREST),
+        *(palette.OFF, palette.PLACE, palette.LATENCY, palette.WORK, palette.LATENESS),
+    ),
+)
+MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
 WIDE = 0.011  # of the width of a plot has a letter
 POINTS = 1500  # of a curve at most, the least and the greatest of each stretch
 LEAST_US = 10.0  # less is not shown
@@ -98,29 +104,30 @@ def _over_time(report: Report) -> Figure:
         modes.plot([], [], color=colour, lw=6, label=str(mode.name).lower())
 
     seen = (frames["hand_ages"] >= 0).any(axis=1)
-    _curve(near, times, np.where(seen, 100 * frames["hand_distance"], np.nan), BLUE, "nearest hand to the arm")
+    _curve(near, times, np.where(seen, 100 * frames["hand_distance"], np.nan), NEAREST, "nearest hand to the arm")
     near.set(ylabel="[cm]", ylim=(0, None))
 
     following = frames["mode"] == Mode.FOLLOW
     lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
-    _curve(errors, times, np.where(following, lag, np.nan), BLUE, "tool from its target")
-    predicted = frames["deviation"] > 0
-    _curve(errors, times, np.where(predicted, 1000 * frames["deviation"], np.nan), ORANGE, "the target's deviation")
+    _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
+    between = any(skill.between is not None for _, skill in report.columns.skills)
+    look = (OFF, "hands off what is known") if between else (TARGET, "the target's deviation")
+    _curve(errors, times, np.where(frames["deviation"] > 0, 1000 * frames["deviation"], np.nan), *look)
     errors.set(ylabel="[mm]", yscale="log")
 
-    for side, colour in zip(SIDES, (ORANGE, GREEN), strict=True):
+    for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
         found = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
         _curve(speed, times, found, colour, f"{side} hand")
-    _curve(speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), BLUE, "tool's setpoint")
+    _curve(speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint")
     speed.set(ylabel="[m/s]")
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
     for late in others[3:]:
         at = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
         for name, colour, label in (
-            ("latency_us", GREEN, "hand stamped to command published"),
-            ("work_us", BLUE, "work of a tick"),
-            ("lateness_us", ORANGE, "later than its deadline"),
+            ("latency_us", LATENCY, "hand stamped to command published"),
+            ("work_us", WORK, "work of a tick"),
+            ("lateness_us", LATENESS, "later than its deadline"),
         ):
             told = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
             late.plot(*thinned(at, told), ".", color=colour, ms=2, label=label)
@@ -137,18 +144,18 @@ def _from_above(report: Report) -> Figure:
     frames = report.columns.frames
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
-    for side, colour in zip(SIDES, (ORANGE, GREEN), strict=True):
+    for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
         number = SIDES.index(side)
         path = frames["hands"][frames["hand_ages"][:, number] >= 0, number]
         _path(axes, path, colour, f"{side} hand")
-    _path(axes, frames["tool"][frames["commanded"] > 0], BLUE, "tool")
+    _path(axes, frames["tool"][frames["commanded"] > 0], TOOL, "tool")
     points = {point for _, skill in report.columns.skills for point in skill.via_points}
     for point in sorted(points, key=lambda point: point.name):
         x, y, _ = point.tool
-        axes.plot(x, y, "D", color="black", ms=5)
+        axes.plot(x, y, "D", color=PLACE, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
-    axes.plot(0, 0, "s", color=GREY, ms=10)
-    axes.annotate("arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color=GREY)
+    axes.plot(0, 0, "s", color=PLACE, ms=10)
+    axes.annotate("arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="From above")
     axes.set_aspect("equal", adjustable="datalim")
     axes.spines[["top", "right"]].set_visible(False)

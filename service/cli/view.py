@@ -21,6 +21,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+from mcap.writer import MCAP0_MAGIC
 from PIL import Image
 
 from service.cli.clients import ask
@@ -35,6 +36,7 @@ from service.recorder.recording import THINGS, Recording
 from service.recorder.sinks import Viewer, ViewerError
 from service.recorder.steps import Gap
 
+RRD_MAGIC = b"RRF2"
 TITLE_BAR, TINT = 30, 40  # pixels that a window's bar has at least; differences of colour that are none
 FRESH_S, FRESH_TIMEOUT_S = 1.0, 10.0  # a picture of a live view that is older says so
 
@@ -53,8 +55,14 @@ def view(args: argparse.Namespace) -> int:
         raise ExplainedError(f"no such file: {path}")
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
-    if path.suffix == ".rrd":
+    with path.open("rb") as file:
+        begins = file.read(len(MCAP0_MAGIC))
+    if begins.startswith(RRD_MAGIC):
         return _show(str(path), args)
+    if begins != MCAP0_MAGIC:
+        raise ExplainedError(
+            f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed"
+        )
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / f"{path.stem}.rrd"
         with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
@@ -180,7 +188,8 @@ def convert(
 
 def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
     """Saves a picture of one tab of a Rerun file or live view, `time` [s] after its start or at its
-    end. How old the newest in it is [s], for a live view. Raises ViewerError.
+    end. How old the newest in it is [s], for a live view. Raises ViewerError, and UsageError for a
+    time that is not there.
     """
     from rerun.experimental import ViewerClient
 
@@ -189,7 +198,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
         raise ViewerError(f"nothing to picture: there is no {source}")
     if not live:
         with Path(source).open("rb") as file:
-            if file.read(4) != b"RRF2":
+            if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
                 raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
     os.environ.setdefault("RUST_LOG", "error")  # or its remarks cover the picture
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
@@ -203,8 +212,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             if extent is None:
                 raise ViewerError(f"no picture of {source}: it holds nothing yet")
             _arrange(client, tab)
-            start, end = extent
-            at = end if time is None else min(end, start + round(time * 1e9))
+            at = moment(extent, time)
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
             else:
@@ -218,6 +226,15 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
         hint = "drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers"
         raise ViewerError(f"no picture of {source}: {error} ({hint})") from error
+
+
+def moment(extent: tuple[int, int], time: float | None) -> int:
+    """When `time` [s] after the start is, or the end [ns]. Raises UsageError if later."""
+    start, end = extent
+    at = end if time is None else start + round(time * 1e9)
+    if at > end:
+        raise UsageError(f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed")
+    return at
 
 
 def _arrange(client: Any, tab: str) -> None:

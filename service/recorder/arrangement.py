@@ -15,15 +15,16 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import components
 
+from service import palette
 from service.config import Settings
 from service.core.separation import IRRELEVANT
-from service.recorder import palette
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
 WINDOW_S, LEGEND_SHARE = 20.0, 0.28  # of live curves; of the axis, kept free for legends
-GATE_ROOM, GATE_FAR = 1.2, 2.5  # of the axis of deviations; times how far the curve reaches
-EYE, LOOK_AT, UP = (0.97, -1.13, 0.81), (0.44, 0.0, 0.29), (0.0, 0.0, 1.0)
+ROOM = 1.25  # of an axis, times how far most seconds' curves reach
+GATE_FAR = 4.0  # times as high as the curves, the gate would flatten them
+EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
 
 
 class Curves(NamedTuple):
@@ -78,10 +79,12 @@ def blueprint(
     reach up to `tops`; both are known once it is drawn. `gate_m` is the deviation [m] above which
     the skill in force holds.
     """
-    views, tops = curves(settings), dict(tops or {})
-    certain = tops.get("/deviation", views["/deviation"].high)
-    if GATE_ROOM * 1e3 * gate_m < GATE_FAR * certain:  # farther off it would flatten the curve
-        tops["/deviation"] = GATE_ROOM * 1e3 * gate_m
+    views, reached = curves(settings), dict(tops or {})
+    tops = {origin: ROOM * top for origin, top in reached.items()}
+    gate_mm, most_mm = 1e3 * gate_m, GATE_FAR * reached.get("/deviation", views["/deviation"].high)
+    if gate_mm <= most_mm:
+        tops["/deviation"] = ROOM * max(gate_mm, reached.get("/deviation", 0.0))
+    left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
     relative = rrb.TimeRangeBoundary.cursor_relative
     if end_s is None:
         room_s = LEGEND_SHARE * WINDOW_S / (1 - LEGEND_SHARE)
@@ -102,6 +105,7 @@ def blueprint(
         low = view.low if view.fixed or view.low >= 0 else -high
         return rrb.TimeSeriesView(
             origin=origin,
+            contents=["+ $origin/**", *(left_out if origin == "/deviation" else [])],
             name=view.title,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
             axis_x=rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=shown),
@@ -117,12 +121,12 @@ def blueprint(
                 plot("/deviation"),
                 rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
                 rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
-                row_shares=[3, 3, 3, 4],
+                row_shares=[3, 3, 3, 5],  # the joints have seven names
             ),
             column_shares=[3, 2],
         ),
         rrb.Horizontal(_modes(shown), _log(), column_shares=[3, 2]),
-        row_shares=[5, 1],
+        row_shares=[7, 2],
         name="Task",
     )
     timing = rrb.Vertical(

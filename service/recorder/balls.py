@@ -6,8 +6,8 @@ they show these too, without a plug-in or a setting.
 
 from __future__ import annotations
 
+from service import palette
 from service.contract.messages import BASE
-from service.recorder import palette
 
 BALLS = (
     ("left_hand", palette.LEFT, 0.03),

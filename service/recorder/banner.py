@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from service import palette
 from service.contract.records import Mode, Reason
-from service.recorder import palette
 
 WIDTH, HEIGHT = 640, 80  # pixels
 LETTERS, MARGIN = 44, 24

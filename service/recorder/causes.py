@@ -23,15 +23,12 @@ def why_held(columns: Columns, begin: int, end: int) -> str:
     if reason in (Reason.NO_HANDS, Reason.STALE_HAND):
         return _unseen(columns, begin, end)
     if reason is Reason.FAR_FROM_DEMONSTRATIONS:
-        worst, allowed = 1000 * float(frames["deviation"].max()), _threshold(columns, begin)
-        return f"the prediction's standard deviation came to {worst:.0f} mm{allowed}"
+        return _far(columns, begin, 1000 * float(frames["deviation"].max()))
     if reason is Reason.TWO_SOURCES:
         return _rejected(columns, max(0, begin - _ticks(columns)), end)
     if reason is Reason.OPERATOR:
         return _asked(columns, begin, ("hold",))
-    if reason is Reason.ARM_NOT_READY and not columns.samples["joints/state"]:
-        return "no joint state came at all"
-    return ""
+    return _untold(columns, int(frames["tick"][0])) if reason is Reason.ARM_NOT_READY else ""
 
 
 def what_led(columns: Columns, begin: int) -> list[str]:
@@ -121,6 +118,18 @@ def _unseen(columns: Columns, begin: int, end: int, *, only_stale: bool = False)
     return "; ".join(said)
 
 
+def _untold(columns: Columns, tick: int) -> str:
+    """Of an arm not ready from a tick on: since when it had told nothing, if that is why."""
+    if not columns.samples["joints/state"]:
+        return "no joint state came at all"
+    heard = columns.silent_since.get(tick)
+    if heard is None:
+        return ""
+    if 1000 * (tick - heard + 1) * columns.period_s > columns.recording.settings.arm.silent_ms:
+        return f"the arm fell silent: no joint states from {columns.seconds(heard):.1f} s on"
+    return "joint states came, but not yet of an arm that rests within its limits"
+
+
 def _rejected(columns: Columns, begin: int, end: int) -> str:
     """What was rejected over frames [begin, end)."""
     counts = columns.frames["rejected"]
@@ -151,10 +160,13 @@ def _asked(columns: Columns, begin: int, kinds: tuple[str, ...]) -> str:
     return ", ".join(said)
 
 
-def _threshold(columns: Columns, begin: int) -> str:
+def _far(columns: Columns, begin: int, worst_mm: float) -> str:
+    """How far off what is known it was, and what the skill in force at frame `begin` allows."""
     tick = int(columns.frames["tick"][begin])
     at = [skill for since, skill in columns.skills if since <= tick]
-    return f"; {1000 * at[-1].threshold:.0f} mm are allowed" if at else ""
+    between = bool(at) and at[-1].between is not None
+    what = "a hand was off its places by up to" if between else "the target's standard deviation came to"
+    return f"{what} {worst_mm:.0f} mm" + (f"; {1000 * at[-1].threshold:.0f} mm are allowed" if at else "")
 
 
 def _ticks(columns: Columns) -> int:

@@ -28,6 +28,7 @@ TRAIL_BREAK_M = 0.15  # between two corners no hand goes as far: another was tak
 NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
 SAME_M = 1e-5  # by which a deviation and the target's differ at most where they are one, by rounding
 AXIS = (0.0, 0.0, 1.0)  # of the tool, the direction that it points in
+LOG_NS = 100_000_000  # a log's seconds are told to that, so that their column shows all digits
 REPEAT_S = 1.0  # a live view says the mode again as often, for those who come later
 Columns = Callable[..., rr.chunk.Chunk]
 
@@ -78,11 +79,11 @@ class Chunks:
         """From now on the skill holds above this deviation [m]."""
         self._gate = deviation_m
 
-    def index(self, times_ns: NDArray[np.int64]) -> list[rr.TimeColumn]:
-        """The columns of time for what happens at these times [ns]."""
+    def index(self, times_ns: NDArray[np.int64], *, to_ns: int = 1) -> list[rr.TimeColumn]:
+        """The columns of time for what happens at these times [ns], its seconds to so many ns."""
         if self._start_ns is None:
             self._start_ns = int(times_ns[0])
-        since = np.maximum(times_ns - self._start_ns, 0)
+        since = np.maximum(times_ns - self._start_ns, 0) // to_ns * to_ns
         self.end_s = max(self.end_s, float(since[-1]) / 1e9)
         return [
             rr.TimeColumn(TIMELINE, duration=since.view("timedelta64[ns]")),
@@ -97,7 +98,8 @@ class Chunks:
         self.index(times[:1])
 
         def columns(path: str, rows: Any, *what: Any) -> rr.chunk.Chunk:
-            index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows])]
+            to_ns = LOG_NS if path == "/log" else 1
+            index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows], to_ns=to_ns)]
             return rr.chunk.Chunk.from_columns(path, index, [column for part in what for column in part])
 
         seen = frames["hand_ages"] >= 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from service.contract import cdr
 from service.contract.messages import WireError, in_order
-from service.contract.records import Mode
+from service.contract.records import Mode, Reason
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill import Skill
 from service.learning.skill_file import SkillError, decoded
@@ -61,7 +61,8 @@ class Columns:
     """A recording, tick by tick.
 
     `frames` (T,) has the fields `KEPT`, `timing` (M,) those of a Timing; `measured` is what the arm
-    told in the second before the tick of each fault.
+    told in the second before the tick of each fault, `silent_since` the tick when it told anything
+    last before each tick from which on it was not ready.
     """
 
     recording: Recording
@@ -73,6 +74,7 @@ class Columns:
     orders: list[Order] = field(default_factory=list)
     skills: list[InForce] = field(default_factory=list)
     measured: dict[int, list[Measured]] = field(default_factory=dict)
+    silent_since: dict[int, int] = field(default_factory=dict)
     samples: Counter[str] = field(default_factory=Counter)  # that came, by kind
     remarks: list[str] = field(default_factory=list)  # on what could not be read
 
@@ -107,7 +109,8 @@ class _Reading:
         self._names, self._layout = joints.names, frame_layout(len(joints.names))
         self._remembered = round(REMEMBERED_S / recording.settings.period_s)
         self._heard: deque[tuple[int, bytes]] = deque()
-        self._in_fault = False
+        self._heard_at: int | None = None  # the tick of the newest
+        self._in_fault = self._not_ready = False
 
     def columns(self) -> Columns:
         """What is found."""
@@ -155,6 +158,7 @@ class _Reading:
             found.samples[kind] += 1
             if kind == "joints/state":
                 self._heard.append((step.tick, payload))
+                self._heard_at = step.tick
             elif kind == "skill":
                 self._skill(payload, step.tick)
             elif kind in ORDERS:
@@ -172,11 +176,15 @@ class _Reading:
             self._found.skills.append(InForce(tick, skill))
 
     def _watch(self, frame: Record) -> None:
-        """Keeps what the arm told before a fault."""
+        """Keeps what the arm told before a fault, and when it fell silent."""
         fault = int(frame["mode"]) == Mode.FAULT
         if fault and not self._in_fault:
             self._found.measured[int(frame["tick"])] = list(self._states())
         self._in_fault = fault
+        not_ready = int(frame["reason"]) == Reason.ARM_NOT_READY
+        if not_ready and not self._not_ready and self._heard_at is not None:
+            self._found.silent_since[int(frame["tick"])] = self._heard_at
+        self._not_ready = not_ready
 
     def _states(self) -> list[Measured]:
         """What the arm told lately, in the order of the settings; what is not understood is left

@@ -44,6 +44,9 @@ DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
 HUNG_S, END_S = 30, 20  # whole seconds without a turn of the main thread, and for ending; then it is killed
 _PR_SET_PDEATHSIG = 1  # of Linux; Python does not name it
+# What Rerun's own program says on standard error, in plain letters: not that a viewer reads slowly,
+# which is the viewer's matter, as batches that it does not take are dropped.
+RERUN_SAYS = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
 POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
 
 
@@ -256,6 +259,8 @@ def main() -> None:
     """Serves the socket whose descriptor is the only argument."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends when the socket does, with all that was told
+    for name, value in RERUN_SAYS.items():
+        os.environ.setdefault(name, value)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(HUNG_S)
     # Its daemon's death makes it go on where it was stopped, and then it sees the socket's end. The

@@ -14,15 +14,15 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from service import palette
 from service.config import Reach, Settings
 from service.contract.records import SIDES, STAGES, Mode, Reason
-from service.recorder import palette
 from service.recorder.arrangement import EYE, LOOK_AT, UP
 from service.recorder.banner import HEIGHT, WIDTH
 
 GHOST = "measured/"  # before the names of its frames
 ARC_STEPS = 48
-BANNER_AT, BANNER_WIDTH = (-0.55, 0.88, -0.6), 1.0  # [m] right of, above and before where the camera looks
+BANNER_AT, BANNER_WIDTH = (0.55, 0.66, -0.44), 0.74  # right of, above and before where the camera looks, by how far
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 
 
@@ -110,8 +110,8 @@ def _log_surroundings(fix: Any, settings: Settings) -> None:
                 fill_mode=solid,
             ),
         )
-    faint = palette.faint(palette.GREY, 0.08)
-    fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=[0.001]))
+    faint, thin = palette.faint(palette.GREY, 0.08), rr.Radius.ui_points(0.5)  # else thick where it nears the eye
+    fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=thin))
 
 
 def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
@@ -155,17 +155,17 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
         ("/deviation/target", "target's standard deviation [mm]", palette.TARGET),
-        ("/deviation/hands", "hands off what is known [mm]", palette.NEAREST),
-        ("/deviation/gate", "holds above [mm]", palette.VERMILLION),
+        ("/deviation/hands", "hands off what is known [mm]", palette.OFF),
+        ("/deviation/gate", "holds above [mm]", palette.GATE),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
         ("/joints/error", "largest [rad]", palette.MEASURED),
-        ("/latency/hand", "hand's stamp to command [ms]", palette.PURPLE),
-        ("/timing/lateness", "late by [µs]", palette.ORANGE),
-        ("/timing/work", "work [µs]", palette.SKY),
+        ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
+        ("/timing/lateness", "late by [µs]", palette.LATENESS),
+        ("/timing/work", "work [µs]", palette.WORK),
     ):
         fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_drawn_as(path)))
     for path, words, numbers in (
@@ -185,11 +185,12 @@ def _drawn_as(path: str) -> dict[str, Any]:
 
 def _sign() -> rr.Mesh3D:
     """The board behind the arm on which mode and reason are written: it faces the camera."""
-    toward = np.subtract(EYE, LOOK_AT) / np.linalg.norm(np.subtract(EYE, LOOK_AT))
+    far = np.linalg.norm(np.subtract(EYE, LOOK_AT))
+    toward = np.subtract(EYE, LOOK_AT) / far
     right = np.cross(UP, toward) / np.linalg.norm(np.cross(UP, toward))
     up = np.cross(toward, right)
-    centre = LOOK_AT + np.stack([right, up, toward], axis=1) @ BANNER_AT
-    right, up = 0.5 * BANNER_WIDTH * right, 0.5 * BANNER_WIDTH * HEIGHT / WIDTH * up
+    centre = LOOK_AT + np.stack([right, up, toward], axis=1) @ (far * np.array(BANNER_AT))
+    right, up = 0.5 * far * BANNER_WIDTH * right, 0.5 * far * BANNER_WIDTH * HEIGHT / WIDTH * up
     corners = [centre - right - up, centre + right - up, centre + right + up, centre - right + up]
     return rr.Mesh3D(
         vertex_positions=corners,

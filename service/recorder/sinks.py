@@ -28,7 +28,7 @@ from service.core.frame import Record
 from service.learning.demonstration import Demonstration
 from service.recorder import taught, things
 from service.recorder.arrangement import blueprint
-from service.recorder.chunks import Chunks, Shown
+from service.recorder.chunks import LOG_NS, Chunks, Shown
 from service.recorder.folder import skills_folder
 from service.recorder.recording import THINGS
 from service.recorder.scene import Trees, log_fixed
@@ -39,7 +39,6 @@ FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
 LIVE_MEMORY = "64MiB"
 FLUSH_TIMEOUT_S = 5.0
 REPEAT_S = 10.0  # what is in force is said again to live viewers as often
-ROOM = 1.25  # above what most seconds' curves reach
 
 
 class ViewerError(ExplainedError, RuntimeError):
@@ -123,11 +122,11 @@ class _Destination:
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Takes in one line of the log."""
-        self.put([self._at(time_ns)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
+        self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
 
-    def _at(self, time_ns: int) -> Callable[..., rr.chunk.Chunk]:
+    def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
         """What makes a chunk of one row at a time [ns]."""
-        index = self._chunks.index(np.array([time_ns], np.int64))
+        index = self._chunks.index(np.array([time_ns], np.int64), to_ns=to_ns)
         return lambda path, *columns: rr.chunk.Chunk.from_columns(path, index, list(columns))
 
     def send(self) -> None:
@@ -140,7 +139,7 @@ class _Destination:
         """Sends what is pending, and to a file how far its curves reach, now that this is known."""
         self.send()
         if self._open and not self._live and self._chunks.end_s > 0:
-            tops = {view: ROOM * float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
+            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
             self._stream.send_blueprint(
                 blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._chunks.end_s),
                 make_active=True,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service import palette
 from service.config import Settings
 from service.contract.channels import JOINTS, POSE
 from service.core.frame import Vector
@@ -24,7 +25,10 @@ GAP_S = 0.1  # after which the daemon calls a hand stale
 JUMP_M, FASTEST = 0.02, 5.0  # [m, m/s] of a hand, from one sample to the next
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDTH = 60  # letters of the plot
-COLOURS = {"left": "#0072B2", "right": "#D55E00", "tool": "#009E73"}  # of Okabe and Ito
+COLOURS = {
+    side: palette.written(colour)
+    for side, colour in zip(SIDES, (palette.LEFT, palette.RIGHT, palette.TOOL), strict=True)
+}
 
 
 class TakeNameError(RecordingError):
@@ -181,8 +185,8 @@ def draw(found: Summary, path: Path) -> None:
         at = getattr(demonstration, side)
         for i, axis in enumerate(axes):
             axis.plot(seconds, at[:, i], color=COLOURS[side], lw=1.2, label=side)
-        above.plot(at[:, 1], at[:, 0], color=COLOURS[side], lw=1.2, label=side)
-        above.plot(at[0, 1], at[0, 0], "o", color=COLOURS[side], ms=5)
+        above.plot(at[:, 0], at[:, 1], color=COLOURS[side], lw=1.2, label=side)
+        above.plot(at[0, 0], at[0, 1], "o", color=COLOURS[side], ms=5)
     for i, axis in enumerate(axes):
         axis.set_ylabel(f"{'xyz'[i]} [m]")
         axis.label_outer()
@@ -191,9 +195,8 @@ def draw(found: Summary, path: Path) -> None:
                 axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=COLOURS[one.name], alpha=0.15, lw=0)
     axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base")
     axes[-1].set_xlabel("time [s]")
-    above.set(title="from above; dots: the start", xlabel="y [m]", ylabel="x [m]")
+    above.set(title="from above; dots: the start", xlabel="x [m]", ylabel="y [m]")
     above.set_aspect("equal", adjustable="datalim")
-    above.invert_xaxis()  # y is to the arm's left, x ahead
     above.legend(frameon=False)
     figure.savefig(path)
 

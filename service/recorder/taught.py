@@ -18,9 +18,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from service import palette
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration, fingerprint
-from service.recorder import palette
 from service.recorder.demonstrations import read_demonstration
 from service.recorder.mcap_file import RecordingError
 
@@ -161,7 +161,7 @@ def about(skill: Taught, shown: int) -> str:
     if len(skill.reference):
         lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
     lines.append(f"Learned from {shown} demonstrations (faint lines)." if shown else "Its demonstrations are not here.")
-    lines.append(f"It holds where the prediction's standard deviation exceeds {1000 * skill.threshold:.0f} mm.")
+    lines.append(f"It holds where it is off what it knows by more than {1000 * skill.threshold:.0f} mm.")
     lines += ["", "## Places", ""]
     if skill.places:
         lines += ["| place | tool x, y, z [m] | within [mm] of the hands | goes with |", "|---|---|---|---|"]

@@ -7,8 +7,10 @@ from typing import Any
 
 import rerun as rr
 
+from service import palette
 from service.contract.messages import BASE, Thing
 
+ABOVE_M = 0.06  # a thing is its name, clear of those of places below; of what the tool holds, toward the arm
 Column = Callable[..., rr.chunk.Chunk]
 
 
@@ -20,9 +22,8 @@ def drawn(things: Iterable[Thing], before: Iterable[str], at: Column) -> Iterato
     for thing in things:
         path = _path(thing.name)
         names.add(thing.name)
-        colour = tuple(round(255 * value) for value in thing.colour)
-        look: dict[str, Any] = {"colors": [colour], "labels": [thing.name], "show_labels": [False]}
-        look["fill_mode"] = [rr.components.FillMode.Solid]
+        colour = [round(255 * value) for value in thing.colour]
+        look: dict[str, Any] = {"colors": [colour], "fill_mode": [rr.components.FillMode.Solid]}
         place = {"centers": [thing.position], "quaternions": [thing.orientation]}
         half = [tuple(size / 2 for size in thing.size)]
         frame = "tf#/" if thing.frame_id == BASE else thing.frame_id
@@ -33,6 +34,11 @@ def drawn(things: Iterable[Thing], before: Iterable[str], at: Column) -> Iterato
         else:
             kind = rr.Boxes3D if thing.shape == "box" else rr.Ellipsoids3D
             yield at(path, *_row(kind, half_sizes=half, **place, **look))
+        x, y, z = thing.position
+        over = (x, y, z + (ABOVE_M if thing.frame_id == BASE else -ABOVE_M))
+        said = {"labels": [thing.name], "show_labels": [True], "colors": [palette.light(colour)]}
+        yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
+        yield at(f"{path}/name", *_row(rr.Points3D, positions=[over], radii=[0.0], **said))
     for name in set(before) - names:
         yield at(_path(name), *rr.Clear.columns(is_recursive=[True]))
 

@@ -14,6 +14,7 @@ import pytest
 from tests_paths import RECORDINGS, ROOT
 from wam import STATE
 
+from service import palette
 from service.cli.main import main
 from service.cli.report_page import thinned
 from service.config import Settings
@@ -45,6 +46,8 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
     assert [one for one in fetched if not one.startswith("#")] == []
     assert "far_from_demonstrations" in text
+    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.MODES.values()):  # as in the viewer
+        assert palette.written(colour) in text
 
     assert {path.name for path in folder.iterdir()} == {"golden", "golden-2", "comparison.csv"}
     comparison = rows(folder / "comparison.csv")

@@ -5,6 +5,7 @@ drawn; and nobody but the page may ask.
 from __future__ import annotations
 
 import http.client
+import json
 import subprocess
 import sys
 import threading
@@ -84,7 +85,10 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert page.daemon.client.ask("status")["mode"] == "follow"
     code, text = page.ask("POST", "/hold", X_Thirdhand_Token=token)
     assert (code, text.split(" ")[0]) == (200, "hold")
-    assert page.daemon.until(lambda status: status["mode"] == "hold")["reason"] == "operator"
+    held = page.daemon.until(lambda status: status["mode"] == "hold")
+    assert (held["reason"], held["remedy"]) == ("operator", "thirdhand resume")
+    told = json.loads(page.ask("GET", "/status")[1])
+    assert (told["because"], told["remedy"]) == (held["because"], held["remedy"])
     assert page.ask("POST", "/resume", X_Thirdhand_Token=token)[0] == 200
     page.daemon.until(lambda status: status["mode"] == "follow")
 
@@ -128,6 +132,7 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         assert tab.until("document.getElementById('mode').className == 'follow'")
         click("hold", until="hold: operator")
         assert tab.until("document.getElementById('answer').textContent").startswith("hold in force since tick ")
+        assert "What to do: thirdhand resume" in tab.until("document.getElementById('why').textContent")
         click("resume", until="follow")
         assert "/viewer/" in tab.ask("document.querySelector('iframe').src")
         tab.picture(tmp_path / "page.png")

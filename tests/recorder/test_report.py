@@ -59,10 +59,12 @@ class Told:
 
     def inbox(self, k: int) -> Iterable[Event]:
         late = k >= FAULT_AT
-        if k % 5 == 0:
+        if k % 5 == 0 and not (late and self.what == "left alone"):
             yield hand("left", LEFT, k + 1)
             yield hand("right", RIGHT, k + 1)
-        if k % 2 == 0 and not (late and self.what == "silent" and k < 900):
+        if k % 2 == 0 and not (
+            (self.what == "silent" and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+        ):
             q, dq = list(self.joints), [0.0] * 7
             if late and self.what == "pushed":
                 q[3] += min(0.15, 0.003 * (k - FAULT_AT))
@@ -94,7 +96,9 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden:
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
     assert held[Reason.STALE_HAND].why.startswith("the left hand was not seen for 0.5")
     assert held[Reason.OPERATOR].why == "`hold` was asked for"
-    assert "are allowed" in held[Reason.FAR_FROM_DEMONSTRATIONS].why
+    far = held[Reason.FAR_FROM_DEMONSTRATIONS].why
+    assert far.startswith("a hand was off its places by up to ")
+    assert far.endswith(" mm; 104 mm are allowed")
     assert golden.seconds(Mode.FOLLOW) + golden.seconds(Mode.HOLD) == pytest.approx(golden.lasts_s)
     assert (golden.faults, golden.lacks) == ((), ())
 
@@ -161,6 +165,20 @@ def test_a_fault_tells_what_led_to_it_and_how_it_ended(
     why = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
     assert str(reason.name).lower() in why
     assert led in why
+
+
+def test_an_arm_that_fell_silent_while_it_rested_is_not_said_never_to_have_told_where_it_is(
+    skill: Skill, tmp_path: Path
+) -> None:
+    Told(skill, tmp_path / "a.mcap", "left alone")
+    first, *_, alone, last = reported(tmp_path / "a.mcap").spans
+    assert (first.reason, alone.reason, last.reason) == (
+        Reason.ARM_NOT_READY,
+        Reason.STALE_HAND,
+        Reason.ARM_NOT_READY,
+    )
+    assert first.why == "joint states came, but not yet of an arm that rests within its limits"
+    assert last.why == "the arm fell silent: no joint states from 1.7 s on"
 
 
 def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_no_mode(

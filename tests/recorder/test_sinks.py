@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import socket
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from test_recording import at_ns, ticks, write
 from wam import JOINT_NAMES
 
 from service.cli.main import main
-from service.cli.view import convert, screenshot
+from service.cli.usage import UsageError
+from service.cli.view import convert, moment, screenshot
 from service.config import WAM, Settings
 from service.contract import cdr
 from service.contract.messages import JointState, Thing
@@ -28,6 +30,7 @@ from service.contract.requests import ViaPoint, encode_json
 from service.core.pose import CLOSED
 from service.core.skill import Skill
 from service.learning.skill_file import with_file
+from service.recorder.arrangement import blueprint
 from service.recorder.banner import banner
 from service.recorder.mcap_file import RecordingError
 from service.recorder.sentences import sentence
@@ -223,6 +226,9 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx([0.04, 0.025, 0.001])
     assert values(rows["/scene/things/glass"], "Cylinders3D:radii")[0] == pytest.approx([0.05])
     assert values(rows["/scene/things/glass"], "Clear:is_recursive") == [[True]]
+    for name, over in (("board", (0, 0, -0.01)), ("glass", (0.5, 0.38, 0.22))):
+        assert values(rows[f"/scene/things/{name}/name"], "Points3D:labels")[0] == [name]
+        assert values(rows[f"/scene/things/{name}/name"], "Points3D:positions")[0][0] == pytest.approx(over)
     assert ["All that was taught is forgotten."] in values(rows["/log"], "TextLog:text")
 
 
@@ -305,6 +311,34 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
     assert one.problems == []
 
 
+@pytest.mark.parametrize(("curves_mm", "is_shown"), [(30.0, True), (200.0, True), (20.0, False)])
+def test_where_it_holds_is_within_the_axis_or_far_off_and_left_out(curves_mm: float, is_shown: bool) -> None:
+    arranged = blueprint(Settings(), live=False, gate_m=0.104, tops={"/deviation": curves_mm}, end_s=14.0)
+    found = [view for view in views(arranged.root_container) if view.origin == "/deviation"]
+    assert len(found) == 2
+    for view in found:
+        (low, high) = view.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
+        assert low == 0
+        assert high == pytest.approx(1.25 * max(curves_mm, 104.0 if is_shown else 0.0))
+        assert ("- $origin/gate" in view.contents) != is_shown
+
+
+def views(container: Any) -> Iterator[Any]:
+    """The views in a part of an arrangement, and in the parts of that."""
+    for part in getattr(container, "contents", []):
+        if hasattr(part, "origin"):
+            yield part
+        else:
+            yield from views(part)
+
+
+def test_a_picture_is_of_a_moment_that_there_is() -> None:
+    extent = (5_000_000_000, 19_258_000_000)
+    assert [moment(extent, time) for time in (None, 0.0, 14.25)] == [extent[1], extent[0], 19_250_000_000]
+    with pytest.raises(UsageError, match=r"--time 99: seconds from 0 to 14\.25 needed"):
+        moment(extent, 99.0)
+
+
 def test_errors_say_what_is_missing(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"no recording .*a\.mcap"):
         convert(tmp_path / "a.mcap", tmp_path / "a.rrd")
@@ -323,6 +357,7 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
         (["a.rrd", "--web"], "thirdhand view live --web"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
+        (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),
     ],
 )
 def test_what_cannot_be_shown_is_said_in_words(
@@ -333,6 +368,7 @@ def test_what_cannot_be_shown_is_said_in_words(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("press.npz").write_bytes(b"PK")
     assert main(["view", *arguments]) in (1, 2)
     said = capsys.readouterr().err
     assert re.search(error, said)
