@@ -28,7 +28,7 @@ from service.shell.door import MOST_SESSIONS
 
 pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
-SOON_S = 1.0
+SOON_S, AT_ONCE_S = 1.0, 0.010
 
 IDLE_CONNECTIONS = """
 import resource, socket
@@ -212,7 +212,8 @@ def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Dae
         for thread in ahead:
             put(thread, NETWORK_NICE)
     slow = {nice: sorted(times)[9 * len(times) // 10] for nice, times in took.items()}
-    assert slow[NETWORK_NICE] < 0.9 * slow[0], slow
+    # Some schedulers let who slept go first as it is: then there is nothing to be gained.
+    assert slow[NETWORK_NICE] < max(0.9 * slow[0], AT_ONCE_S), slow
 
 
 def put(thread: int, nice: int) -> None:
