@@ -154,7 +154,7 @@ class Obstacles(Section, frozen=True):
     boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
     clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them
     brake: Positive = 2.0  # [m/s²] toward them
-    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 40.0  # the ramp of the braking
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
 
 class Table(Section, frozen=True):

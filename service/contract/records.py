@@ -132,7 +132,6 @@ STATE = (
     # the other hand had been
     Field("doubts", "int64", (2, 4)),
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
-    Field("paces", "float64", (2, 3)),  # of each hand: its velocity without its tremor
     Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`
     Field("covariances", "float64", (2, 3, 3, 3)),
     Field("modes", "float64", (2, 3)),

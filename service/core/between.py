@@ -18,7 +18,6 @@ import numpy as np
 from kmp import KMP
 from kmp.compiled import compiled
 from service.core.frame import Vector
-from service.core.hand_estimator import PACE_S
 from service.core.places import Indices, Layout, Task
 from service.core.taught import NEAR as NEAR_TAUGHT
 
@@ -122,12 +121,12 @@ class Placed:
             _inputs(hand, velocity, self.layout.hands, self.task.inputs, row, away)
         return out, off
 
-    def moving_inputs(self, hands: Vector, velocities: Vector, pace: Vector) -> tuple[Vector, Vector]:
+    def moving_inputs(self, hands: Vector, velocities: Vector, accelerations: Vector) -> tuple[Vector, Vector]:
         """The inputs (F,) of hands (6,) that move so, and the inputs' velocity (F,) [1/s], by
         differences along their motion.
         """
         found = np.empty((2, self.task.width))
-        _moving_inputs(hands, velocities, pace, self.layout.hands, self.task.inputs, found)
+        _moving_inputs(hands, velocities, accelerations, self.layout.hands, self.task.inputs, found)
         return found[0], found[1]
 
     def mean(self, hands: Vector, velocities: Vector) -> Vector:
@@ -149,15 +148,13 @@ class Placed:
         _scatter(inputs, self.seen, self.errors, self.layout.std, out)
         return out
 
-    def moving(
-        self, hands: Vector, velocities: Vector, accelerations: Vector, pace: Vector, *, covariance: bool
-    ) -> Moving:
+    def moving(self, hands: Vector, velocities: Vector, accelerations: Vector, *, covariance: bool) -> Moving:
         """The tool for hands (6,) that move so, by differences along their motion. One that only
         trembles moves nothing.
         """
         motion, scatter = np.empty((3, 3)), np.empty((3, 3))
         known = (*self._arrays, self.seen, self.errors, self.layout.std)
-        off = _moving(*(hands, velocities, accelerations, pace, *known, covariance, motion, scatter))
+        off = _moving(*(hands, velocities, accelerations, *known, covariance, motion, scatter))
         return Moving(motion[0], motion[1], motion[2], scatter if covariance else None, off)
 
     @cached_property
@@ -230,16 +227,15 @@ def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices,
 
 @compiled
 def _moving_inputs(
-    hands: Vector, velocities: Vector, pace: Vector, corners: Vector, inputs: Indices, out: Vector
+    hands: Vector, velocities: Vector, accelerations: Vector, corners: Vector, inputs: Indices, out: Vector
 ) -> None:
     """The shares of both hands (6,) that move so, and their velocity, into `out` (2, F)."""
     ahead, off = np.empty(out.shape[1]), np.empty(2)
-    step, faster = STEP_S * velocities, STEP_S / PACE_S * (velocities - pace)
-    _inputs(hands - step, pace - faster, corners, inputs, out[1], off)
-    _inputs(hands + step, pace + faster, corners, inputs, ahead, off)
+    _inputs(hands - STEP_S * velocities, velocities - STEP_S * accelerations, corners, inputs, out[1], off)
+    _inputs(hands + STEP_S * velocities, velocities + STEP_S * accelerations, corners, inputs, ahead, off)
     for i in range(len(ahead)):
         out[1, i] = (ahead[i] - out[1, i]) / (2.0 * STEP_S)
-    _inputs(hands, pace, corners, inputs, out[0], off)
+    _inputs(hands, velocities, corners, inputs, out[0], off)
 
 
 @compiled
@@ -305,7 +301,6 @@ def _moving(
     hands: Vector,
     velocities: Vector,
     accelerations: Vector,
-    pace: Vector,
     corners: Vector,
     places: Vector,
     inputs: Indices,
@@ -337,7 +332,7 @@ def _moving(
     for k in (0, 2, 1):
         way = k - 1.0
         where = hands + way * step + abs(way) * bend
-        faster = pace + way * STEP_S / PACE_S * (velocities - pace)
+        faster = velocities + way * STEP_S * accelerations
         _tool(
             where, faster, corners, places, inputs, at, follow, scale, centres, weights, prior, taught, pulls,
             tools[k], off,
@@ -349,7 +344,7 @@ def _moving(
         motion[2, i] = min(max(bent, -LARGEST_MPS2), LARGEST_MPS2)
     if wanted:
         query = np.empty(centres.shape[1])
-        _inputs(hands, pace, corners, inputs, query, off)
+        _inputs(hands, velocities, corners, inputs, query, off)
         _scatter(query, seen, errors, std, scatter)
     return float(max(off[0], off[1]))
 

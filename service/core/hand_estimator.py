@@ -38,7 +38,6 @@ SURPRISE = 9.0  # times the noise variance: as much as one difference may say
 JUMP_M, JUMP_MPS, JUMP_NOISE = 0.04, 1.0, 6.0  # what is farther from where a hand was expected than this, and than this
 # for each second since it was seen, and than so many of its noise's standard deviations, has jumped
 START_SPEED, START_ACCELERATION = 0.3, 1.0  # [m/s], [m/s²] of a hand of which one sample is known
-PACE_S = 0.15  # over which a velocity is averaged: a tremor of 8 to 12 Hz is gone from it
 LEAST_PROBABILITY = 1e-4  # of a mode
 FARTHEST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
 
@@ -62,8 +61,7 @@ class HandEstimator:
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Moves both hands on by some ticks; one that is not seen stands still."""
         transition, noise = self._model(ticks)
-        share = 1.0 - math.exp(-ticks * self._period_s / PACE_S)
-        _advance_both(as_array(state), stale_ticks, transition, noise, share)
+        _advance_both(as_array(state), stale_ticks, transition, noise)
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
@@ -211,7 +209,7 @@ def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector, share: float) -> None:
+def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector) -> None:
     state = states[0]
     for side in range(2):
         if is_fresh(states, side, stale_ticks):
@@ -220,8 +218,6 @@ def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: 
         else:
             state.means[side, :, 1:] = 0.0
             state.hands[side, 1:] = 0.0
-        for axis in range(3):
-            state.paces[side, axis] += share * (state.hands[side, 1, axis] - state.paces[side, axis])
 
 
 @compiled

@@ -81,13 +81,10 @@ class Skill:
         hands: Vector,
         velocities: Vector,
         accelerations: Vector,
-        paces: Vector | None = None,
         *,
         before: Known | None = None,
     ) -> Prediction:
-        """The prediction for hands (2, 3) [m] that move so; `paces` (2, 3) [m/s] are their
-        velocities without tremor, if known, by which hands at rest are told from those on their
-        way.
+        """The prediction for hands (2, 3) [m] that move so.
 
         Equation (8) of Huang et al. 2019, its derivatives along the motion, its covariance.
         Covariances take as long as all else; what was predicted just `before` may be given.
@@ -96,29 +93,30 @@ class Skill:
         that follows.
         """
         moving = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
-        pace = moving[1] if paces is None else paces.reshape(6)
         found: MotionPrediction | Moving
         if self.placed is None:
             found = self.primitive.predict_motion(*moving, covariance=before is None)
         else:
-            found = self.placed.moving(*moving, pace, covariance=before is None)
+            found = self.placed.moving(*moving, covariance=before is None)
         given = before[0] if before is not None else found.covariance
         assert given is not None
         motion, rounded = np.empty((3, 3)), np.empty((3, 3))
         deviation = _round(found.mean, found.velocity, found.acceleration, given, motion, rounded)
         if isinstance(found, Moving):
             deviation = round(found.off * MOTION_STEPS) / MOTION_STEPS
-        turn, closure = self._beside(*moving[:2], pace, before)
+        turn, closure = self._beside(*moving, before)
         return Prediction(motion[0], motion[1], motion[2], rounded, deviation, turn, closure)
 
-    def _beside(self, hands: Vector, velocities: Vector, pace: Vector, before: Known | None) -> tuple[Turn, float]:
+    def _beside(
+        self, hands: Vector, velocities: Vector, accelerations: Vector, before: Known | None
+    ) -> tuple[Turn, float]:
         """The orientation, learned or constant, and the closure of the gripper."""
         if self.turn is None and self.gripper is None:
             return self.constant_turn, NO_GRIPPER
         if self.placed is None:
             at, moving = hands, velocities
         else:
-            at, moving = self.placed.moving_inputs(hands, velocities, pace)
+            at, moving = self.placed.moving_inputs(hands, velocities, accelerations)
         turn = self.constant_turn
         if self.turn is not None:
             turn = self.turn.predict(at, moving, covariance=None if before is None else before[1])

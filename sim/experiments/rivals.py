@@ -53,13 +53,7 @@ class Rival(Skill):
     law: Law = field(kw_only=True)
 
     def predict(
-        self,
-        hands: Array,
-        velocities: Array,
-        accelerations: Array,
-        paces: Array | None = None,
-        *,
-        before: Known | None = None,
+        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
     ) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
@@ -77,13 +71,7 @@ class TimeDriven(Skill):
     bench: Bench = field(kw_only=True)
 
     def predict(
-        self,
-        hands: Array,
-        velocities: Array,
-        accelerations: Array,
-        paces: Array | None = None,
-        *,
-        before: Known | None = None,
+        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
     ) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s

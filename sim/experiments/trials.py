@@ -19,7 +19,6 @@ from scipy.stats import chi2
 from service.config import Settings
 from service.contract.messages import BASE, PoseStamped
 from service.core.frame import blank, state_layout
-from service.core.hand_estimator import PACE_S
 from service.core.intake import Intake
 from service.core.setpoint import SetpointGenerator
 from service.core.stops import fastest_stop
@@ -90,7 +89,6 @@ class Seen:
     session: Session
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
-    paces: Array  # (T, 6) velocities without tremor
     fresh: Mask  # (T,) whether both hands are seen, by one source
     swapped: Mask  # (T,) whether left is taken for right
     hands: Array  # (T, 6) as they are
@@ -117,7 +115,7 @@ def seen(session: Session) -> Seen:
     samples = session.samples()
     at = [np.ceil(stamps * RATE_HZ - 1e-9).astype(int) for stamps, _ in samples]
     upto = [0, 0]
-    estimates, paces, fresh = np.zeros((ticks, 3, 6)), np.zeros((ticks, 6)), np.zeros(ticks, bool)
+    estimates, fresh = np.zeros((ticks, 3, 6)), np.zeros(ticks, bool)
     for k in range(ticks):
         intake.advance(state, 1)
         for side in (0, 1):
@@ -127,11 +125,11 @@ def seen(session: Session) -> Seen:
                 stamp_ns = START_NS + round(1e9 * float(samples[side][0][i]))
                 intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, (x, y, z), (0.0, 0.0, 0.0, 1.0)))
                 upto[side] += 1
-        estimates[k], paces[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["paces"].reshape(6)
+        estimates[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6)
         fresh[k] = intake.are_fresh(state) and not intake.is_contested(state, already=bool(k and not fresh[k - 1]))
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(session, times, estimates, paces, fresh, swapped, session.hands(times), session.tool(times))
+    return Seen(session, times, estimates, fresh, swapped, session.hands(times), session.tool(times))
 
 
 def workspace(demonstrations: Sequence[Shown]) -> Array:
@@ -243,11 +241,11 @@ def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]
         before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
         velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
         return predicted, velocity, np.zeros_like(velocity)
-    predicted, p = placed.predict(s, one.paces), one.paces
+    predicted = placed.predict(s, v)
     speed = np.repeat(np.linalg.norm(v.reshape(-1, 2, 3), axis=2), 3, axis=1)
     goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
     step, curve = STEP_S * goes * v, STEP_S**2 / 2 * goes * a
-    behind, ahead = (placed.mean(s + way * step + curve, p + way * STEP_S / PACE_S * (v - p)) for way in (-1, 1))
+    behind, ahead = (placed.mean(s + way * step + curve, v + way * STEP_S * a) for way in (-1, 1))
     most = settings().tool.max_acceleration
     acceleration = np.clip((ahead - 2 * predicted.mean + behind) / STEP_S**2, -most, most)
     return predicted, (ahead - behind) / (2 * STEP_S), acceleration
