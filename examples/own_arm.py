@@ -74,7 +74,8 @@ def command_in(sample: zenoh.Sample | None, names: tuple[str, ...]) -> tuple[Joi
 
 def main() -> None:
     """Drives a fake arm until Ctrl-C."""
-    endpoint, cell = (*sys.argv[1:], *("tcp/127.0.0.1:7447", "thirdhand")[len(sys.argv) - 1 :])
+    endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
+    cell = sys.argv[2] if len(sys.argv) > 2 else "thirdhand"
     with contextlib.suppress(KeyboardInterrupt), open_session(connect=[endpoint]) as session:
         names = tuple(Client(session, cell).ask("status")["joints"])
         arm = FakeArm(names, (0.0, 0.8, 0.0, 2.2, 0.0, -1.0, 0.0)[: len(names)])

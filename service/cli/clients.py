@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 
 from service.cli.here import still
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, added_in
 from service.client import Client, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
@@ -55,9 +55,7 @@ def _names(request: Any) -> list[str]:
 
 def _add(args: argparse.Namespace) -> Any:
     if args.file:
-        return requests.decode_request(
-            sys.stdin.buffer.read() if args.file == "-" else Path(args.file).read_bytes(), requests.Add
-        )
+        return added_in(Path(args.file))
     if args.here and args.name:
         for name, place in still(args).items():
             setattr(args, name, getattr(args, name) or place)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
@@ -55,7 +55,7 @@ def judged(fine: bool, what: str, found: str, wanted: str, remedy: str) -> Findi
 
 
 def findings(
-    before: Status, now: Status, *, own_ns: int, own_version: str, published: Collection[str] = ()
+    before: Status, now: Status, *, own_ns: int, own_version: str, published: Sequence[str] = ()
 ) -> Iterator[Finding]:
     """What is to be said of a cell; `own_ns` and `own_version` are time and version here, and
     `published` the keys on which hands and joints were heard, in whatever cell.
@@ -84,7 +84,7 @@ def _mode(now: Status) -> Finding:
     return Finding(level, "mode", told + (f": {now.because}" if now.because else ""), "follow", now.remedy)
 
 
-def _source(before: Status, now: Status, name: str, published: Collection[str]) -> Iterator[Finding]:
+def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
     source, what = now.sources[name], SOURCE_NAMES[name]
     least, most = map(int, re.findall(r"\d+", BY_KEY[KEYS[name]].rate))
     wanted = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
@@ -96,7 +96,7 @@ def _source(before: Status, now: Status, name: str, published: Collection[str]) 
         told = "nothing comes" if source.age_ms is None else f"nothing came for {source.age_ms / 1000:.1f} s"
         group = KEYS[name].rpartition("/")[0]
         ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
-        others = [one for one in sorted(published) if f"/{group}/" in one and one not in ours][:MOST_OTHERS]
+        others = [one for one in published if f"/{group}/" in one and one not in ours][:MOST_OTHERS]
         told += f", but on {', '.join(others)}" if others else ""
         start = f"start {'the driver' if name == 'arm' else 'the tracker'}, connected to "
         rename = f"let it publish {key(now.cell, KEYS[name])}; or " if others else ""

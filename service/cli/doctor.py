@@ -17,7 +17,7 @@ import msgspec
 from service.cli.diagnosis import Finding, findings, wrong
 from service.cli.status import heard
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError
-from service.client import UnreachableError, open_session
+from service.client import Overheard, UnreachableError, open_session
 from service.contract.channels import ENDPOINT
 
 PROBE_S = 1.0
@@ -48,11 +48,7 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
     except UnreachableError as error:
         yield from (unreachable(endpoint, str(error)) for endpoint in connect)
         return
-    published: set[str] = set()
-    with session:
-        listening = [
-            session.declare_subscriber(key, lambda sample: published.add(str(sample.key_expr))) for key in PUBLISHED
-        ]
+    with session, Overheard(session, *PUBLISHED) as published:
         try:
             with contextlib.closing(heard(session, args.cell)) as told:
                 before = now = next(told)
@@ -73,11 +69,7 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
         except msgspec.ValidationError as error:
             yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")
             return
-        for subscriber in listening:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
-    yield from findings(
-        before, now, own_ns=time.time_ns(), own_version=version("thirdhand"), published=frozenset(published)
-    )
+    yield from findings(before, now, own_ns=time.time_ns(), own_version=version("thirdhand"), published=published.keys)
 
 
 def unreachable(endpoint: str, said: str) -> Finding:

@@ -17,13 +17,9 @@ from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
 from service.recorder.report import Report
 
-LEFT, RIGHT, TOOL, TARGET, NEAREST, OFF, PLACE, LATENCY, WORK, LATENESS = map(
-    palette.written,
-    (
-        *(palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET, palette.NEAREST),
-        *(palette.OFF, palette.PLACE, palette.LATENCY, palette.WORK, palette.LATENESS),
-    ),
-)
+LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
+NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
+LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
 WIDE = 0.011  # of the width of a plot has a letter
 POINTS = 1500  # of a curve at most, the least and the greatest of each stretch

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
-    from service.contract.requests import ViaPoint
+    from service.contract.requests import Add, ViaPoint
     from service.core.skill import Skill
 
 CONNECT_TIMEOUT_S = 3.0
@@ -58,17 +58,22 @@ def check_writable(path: Path) -> None:
         raise UsageError(f"{path} cannot be written: no permission")
 
 
+def added_in(path: Path) -> Add:
+    """What a file asks to add; - is standard input. Raises RequestError, OSError."""
+    from service.contract.requests import Add, decode_request  # heavy
+
+    told: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+    return told
+
+
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
-    """The places in a file as `via-points add --file` takes it; - is standard input. Raises
-    RequestError, which names the file, and OSError.
-    """
-    from service.contract.requests import Add, RequestError, decode_request  # heavy
+    """The places in such a file. Raises RequestError, which names the file, and OSError."""
+    from service.contract.requests import RequestError  # heavy
 
     try:
-        told: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+        return added_in(path).points
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
-    return told.points
 
 
 def recordings() -> Path:

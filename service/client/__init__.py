@@ -3,7 +3,7 @@ and which daemons there are.
 """
 
 from service.client.calls import Client
-from service.client.presence import Cell, cells, living
+from service.client.presence import Cell, Overheard, cells, living
 from service.client.session import (
     AUTHORITY,
     CERTIFICATE,
@@ -27,6 +27,7 @@ __all__ = [
     "Client",
     "Command",
     "Follower",
+    "Overheard",
     "RefusedError",
     "Tracker",
     "UnreachableError",

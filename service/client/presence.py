@@ -1,8 +1,11 @@
-"""Which daemons are there, by the liveliness token that each holds, and what each says."""
+"""Which daemons are there, by the liveliness token that each holds, and what each says; and what is
+published, under whatever key.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from types import TracebackType
+from typing import NamedTuple, Self
 
 import msgspec
 import zenoh
@@ -11,6 +14,7 @@ from service.contract import channels
 from service.contract.requests import Status
 
 TIMEOUT_S = 5.0
+MOST_KEYS = 1000  # that are remembered
 
 
 class Cell(NamedTuple):
@@ -48,6 +52,37 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
             if reply.ok is not None and reply.replier_id is not None:
                 told[str(reply.replier_id.zid)] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
     return tuple(Cell(name, own, told.get(own)) for name, own in found)
+
+
+class Overheard:
+    """The keys under some expressions on which something is published, while its context lasts."""
+
+    def __init__(self, session: zenoh.Session, *expressions: str) -> None:
+        self._keys: set[str] = set()
+        self._subscribers = [session.declare_subscriber(one, self._take) for one in expressions]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def keys(self) -> list[str]:
+        """Those heard so far, in order."""
+        return sorted(self._keys.copy())
+
+    def close(self) -> None:
+        """Hears no more."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscribers = []
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if len(self._keys) < MOST_KEYS:
+            self._keys.add(str(sample.key_expr))
 
 
 def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:

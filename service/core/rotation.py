@@ -1,5 +1,5 @@
-"""Quaternions x y z w: as rotation matrices and from them, the turn from one to another, and one
-that was turned on.
+"""Quaternions x y z w: as rotation matrices and from them, the turn from one to another and its
+angle, and one that was turned on.
 """
 
 from __future__ import annotations
@@ -28,6 +28,27 @@ def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def angles(a: Vector, b: Vector) -> Vector:
+    """Angles (...) [rad] of the turns between quaternions (..., 4) of norm 1."""
+    return np.asarray(2.0 * np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0.0, 1.0)))
+
+
+def off_target(tool: Vector, target: Vector, *, direction: bool) -> Vector:
+    """By how much tools (..., 4) are turned from their targets [rad]; only of where +z points, if
+    that `direction` alone is followed.
+    """
+    if not direction:
+        return angles(tool, target)
+    cosines = (_axes(tool) * _axes(target)).sum(axis=-1)
+    return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+
+def _axes(quaternions: Vector) -> Vector:
+    """Where quaternions (..., 4) of norm 1 turn +z, (..., 3)."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 @compiled

@@ -152,7 +152,7 @@ class Skill:
         deviation, root mean square over the axes; between places, how far a hand is off them.
         """
         if self.placed is None:
-            return np.asarray(np.sqrt(np.trace(self.covariances(hands), axis1=1, axis2=2) / 3))
+            return standard_deviations(self.covariances(hands))
         return np.asarray(self.placed.inputs(hands, np.zeros_like(hands))[1].max(axis=1))
 
     @property
@@ -181,6 +181,11 @@ class Skill:
     def digest(self) -> bytes:
         """16 bytes that tell this skill from any other."""
         return hashlib.blake2b(self.file, digest_size=16).digest()
+
+
+def standard_deviations(covariances: Vector) -> Vector:
+    """Standard deviations (...) of covariances (..., 3, 3), root mean square over the axes."""
+    return np.asarray(np.sqrt(np.maximum(np.trace(covariances, axis1=-2, axis2=-1), 0.0) / 3))
 
 
 @compiled

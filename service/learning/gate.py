@@ -12,6 +12,7 @@ import numpy as np
 
 from kmp import KMP, Gaussians
 from service.core.frame import Vector
+from service.core.skill import standard_deviations
 from service.learning.skill_file import HIGHEST_GATE_M
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
@@ -73,4 +74,4 @@ def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
 
 def deviations(predicted: Gaussians) -> Vector:
     """Standard deviations (M,) [m] of M predictions, root mean square over the axes."""
-    return np.asarray(np.sqrt(np.trace(predicted.covariance, axis1=1, axis2=2) / 3))
+    return standard_deviations(predicted.covariance)

@@ -19,6 +19,7 @@ from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector
 from service.core.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
+from service.core.rotation import angles
 from service.learning.choice import Choice, Parameters, rms
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned
@@ -98,11 +99,6 @@ def mean_orientation(quaternions: ArrayLike) -> Vector:
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     mean = np.linalg.eigh(q.T @ q)[1][:, -1]
     return np.asarray(mean * (1 if mean[3] >= 0 else -1))
-
-
-def angles(a: Vector, b: Vector) -> Vector:
-    """Angles (...) [rad] of the turns between quaternions (..., 4) of norm 1."""
-    return np.asarray(2.0 * np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0.0, 1.0)))
 
 
 def _learned_turn(

@@ -15,8 +15,9 @@ from kmp.orientation import OrientationKMP, log
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.pose import LearnedGripper, LearnedOrientation
+from service.core.rotation import angles
 from service.core.skill import Skill
-from service.learning.pose import angles, flat_gripper, flat_orientation, is_flat
+from service.learning.pose import flat_gripper, flat_orientation, is_flat
 from service.learning.skill_file import SkillError
 
 STD_RAD, STD_CLOSURE = 0.004, 0.02  # with which an orientation and a gripper are taught

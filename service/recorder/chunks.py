@@ -17,7 +17,9 @@ from service.core.body import body_of
 from service.core.capsules import between_segments, place
 from service.core.frame import TIMING, Record
 from service.core.pose import CLOSED, UNKNOWN
+from service.core.rotation import off_target
 from service.core.separation import FARTHEST
+from service.core.skill import standard_deviations
 from service.recorder.arrangement import TIMELINE
 from service.recorder.banner import banner, title
 from service.recorder.scene import Trees
@@ -27,7 +29,6 @@ TRAIL_S, TRAIL_HZ = 3.0, 20
 TRAIL_BREAK_M = 0.15  # between two corners no hand goes as far: another was taken for it
 NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
 SAME_M = 1e-5  # by which a deviation and the target's differ at most where they are one, by rounding
-AXIS = (0.0, 0.0, 1.0)  # of the tool, the direction that it points in
 LOG_NS = 100_000_000  # a log's seconds are told to that, so that their column shows all digits
 REPEAT_S = 1.0  # a live view says the mode again as often, for those who come later
 Columns = Callable[..., rr.chunk.Chunk]
@@ -144,7 +145,7 @@ class Chunks:
         self._followed = bool(following[-1])
         yield from scalars("/error/target", np.flatnonzero(following | ended), off_mm, "/error")
         yield from scalars("/turn/target", np.flatnonzero(following | ended), self._turned(frames, following), "/turn")
-        std_m, std_deg = (root_mean_trace(frames[name]) for name in ("covariance", "orientation_covariance"))
+        std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
         known = seen.all(axis=1)
         yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
         gripping = known & (frames["closure"] >= 0)
@@ -185,14 +186,8 @@ class Chunks:
         angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
         for name in names:  # a frame may be damaged
             following = following & (np.linalg.norm(frames[name], axis=1) > 0.5)
-        if not following.any():
-            return angles
-        tool, target = (Rotation.from_quat(frames[name][following]) for name in names)
-        if self._direction:
-            along = np.sum(tool.apply(AXIS) * target.apply(AXIS), axis=1)
-            angles[following] = np.degrees(np.arccos(np.clip(along, -1.0, 1.0)))
-        else:
-            angles[following] = np.degrees((target.inv() * tool).magnitude())
+        tool, target = (frames[name][following] for name in names)
+        angles[following] = np.degrees(off_target(tool, target, direction=self._direction))
         return angles
 
     def _modes(self, frames: NDArray[Any], times: NDArray[np.int64], columns: Columns) -> Iterator[rr.chunk.Chunk]:
@@ -296,8 +291,3 @@ class Chunks:
                     strips.append(np.array(trail, np.float32).reshape(-1, 3))
             if shown:
                 yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
-
-
-def root_mean_trace(covariances: NDArray[Any]) -> NDArray[Any]:
-    """Standard deviations (T,) of covariances (T, 3, 3), root mean square over the axes."""
-    return np.asarray(np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0) / 3))

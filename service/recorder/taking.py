@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import zenoh
 
+from service.client import Overheard
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
@@ -224,28 +225,6 @@ class Take:
         ]
 
 
-class _Others:
-    """The keys under which others publish what could be meant to be the hands and the tool."""
-
-    def __init__(self, session: zenoh.Session, cell: str) -> None:
-        self._keys, self._wanted = set[str](), {channels.key(cell, key) for key in HEARD}
-        self._subscribers = [session.declare_subscriber(key, self._take) for key in ELSEWHERE]
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        if key not in self._wanted and len(self._keys) < MOST_OTHERS:
-            self._keys.add(key)
-
-    @property
-    def heard(self) -> list[str]:
-        return sorted(self._keys)
-
-    def close(self) -> None:
-        for subscriber in self._subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
-        self._subscribers = []
-
-
 def _since(samples: list[Sample], since_ns: int) -> list[Sample]:
     """The last samples, that arrived since a time."""
     at = len(samples)
@@ -277,7 +256,7 @@ def take(
 
     Raises TakeError where they are not heard within `wait_s`.
     """
-    taken, others = Take(session, cell, settings), _Others(session, cell)
+    taken, others = Take(session, cell, settings), Overheard(session, *ELSEWHERE)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()
@@ -285,7 +264,9 @@ def take(
         while taken.missing:
             if time.monotonic() - begun_s > wait_s or is_ended():
                 unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in taken.malformed.items())
-                instead = f"; heard instead: {', '.join(others.heard)}" if others.heard else ""
+                meant = {channels.key(cell, key) for key in HEARD}
+                elsewhere = [key for key in others.keys if key not in meant][:MOST_OTHERS]
+                instead = f"; heard instead: {', '.join(elsewhere)}" if elsewhere else ""
                 raise TakeError(
                     f"not heard: {', '.join(taken.missing)}{unreadable}{instead}. Are tracker and arm running, "
                     f"connected to the same place, and in cell {cell}?"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from service.config import Settings
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, remedy
@@ -17,7 +14,8 @@ from service.core.frame import Frame, Record
 from service.core.intake import REST_S
 from service.core.plausibility import SCATTERED_M, SETTLED
 from service.core.pose import CLOSED, OPEN
-from service.core.rotation import rotation
+from service.core.rotation import off_target
+from service.core.skill import standard_deviations
 from service.shell.sources import KEYS, frames
 
 
@@ -73,12 +71,8 @@ class Survey(NamedTuple):
 
     def _turned(self) -> float:
         """By how much the tool is turned from its target, or points elsewhere [rad]."""
-        tool, target = (rotation(tuple(self.frame[name].tolist())) for name in ("tool_orientation", "orientation"))
-        if self.settings.tool.orientation == "direction":
-            cosine = float(tool[:, 2] @ target[:, 2])
-        else:
-            cosine = (float(np.trace(target.T @ tool)) - 1.0) / 2.0
-        return round(math.acos(min(max(cosine, -1.0), 1.0)), 5)
+        tool, target = self.frame["tool_orientation"], self.frame["orientation"]
+        return round(float(off_target(tool, target, direction=self.settings.tool.orientation == "direction")), 5)
 
     def remedy(self, word: str) -> str:
         """What to do about a reason; where it comes of rejected samples, about these."""
@@ -175,8 +169,7 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
 
 
 def _std(covariance: Any) -> float:
-    """The standard deviation of a covariance (3, 3), root mean square over the axes."""
-    return round(math.sqrt(max(float(covariance.trace()) / 3, 0.0)), 5)
+    return round(float(standard_deviations(covariance)), 5)
 
 
 def _point(values: Any) -> Vector3:

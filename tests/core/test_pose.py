@@ -23,7 +23,7 @@ from service.core.limiter import Limiter
 from service.core.orientation_setpoint import SPEED_SHARE, OrientationSetpoint
 from service.core.outputs import outgoing
 from service.core.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
-from service.core.rotation import axis_of, quaternion_of, swing, turn_between, turn_on
+from service.core.rotation import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.skill import Skill
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
@@ -55,6 +55,15 @@ def test_rotations_are_those_of_scipy() -> None:
         np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(axis), to, atol=1e-7)
         turn_on(a, turn)
         assert abs(a @ (Rotation.from_rotvec(turn) * one).as_quat()) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_a_tool_is_off_by_its_whole_turn_or_by_where_it_points() -> None:
+    tools, targets = random_rotations(50, 5), random_rotations(50, 6)
+    given = tools.as_quat(), targets.as_quat()
+    turns = (tools * targets.inv()).magnitude()
+    np.testing.assert_allclose(off_target(*given, direction=False), turns, atol=1e-7)
+    between = np.sum(tools.apply((0, 0, 1)) * targets.apply((0, 0, 1)), axis=1)
+    np.testing.assert_allclose(off_target(*given, direction=True), np.arccos(between), atol=1e-7)
 
 
 def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> None:
