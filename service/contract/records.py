@@ -132,6 +132,8 @@ STATE = (
     # the other hand had been
     Field("doubts", "int64", (2, 4)),
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
+    Field("paces", "float64", (2, 3)),  # their velocities without tremor; see `core.rest`
+    Field("repose", "float64", (2,)),  # how much each hand rests
     Field("means", "float64", (2, 3, 3, 3)),  # of each hand's three modes; see `core.hand_estimator`
     Field("covariances", "float64", (2, 3, 3, 3)),
     Field("modes", "float64", (2, 3)),

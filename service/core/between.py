@@ -19,12 +19,12 @@ from kmp import KMP
 from kmp.compiled import compiled
 from service.core.frame import Vector
 from service.core.places import Indices, Layout, Task
+from service.core.rest import RESTING
 from service.core.taught import NEAR as NEAR_TAUGHT
 
 SHARPNESS = 4.0  # power of a resting hand's shares
-REST_MPS = 0.12  # a hand this fast is on its way
 ALMOST = 1e-4  # share that every place has, so that none is of an undefined power
-FOLLOWED_M = 0.25  # within which of a place the tool goes with the hand
+FOLLOWED = 4  # power of the share of a place with which the tool goes with the hand there
 FLAT = 1e-6  # [m²] what a triangle's edges are taken to be longer by, as it may be none
 NEAR = 0.25  # width, in shares, of what is near to a moment when scatter is looked up
 LEAST_STD_M = 0.003
@@ -110,30 +110,31 @@ class Placed:
 
     def at_rest(self, hands: Vector) -> Vector:
         """`mean` of hands (T, 6) that rest."""
-        return self.mean(hands, np.zeros_like(hands))
+        return self.mean(hands, np.ones((len(hands), 2)))
 
-    def inputs(self, hands: Vector, velocities: Vector) -> tuple[Vector, Vector]:
-        """Inputs (T, F) of hands and velocities (T, 6), and how far each hand (T, 2) is off its
-        places [m].
+    def inputs(self, hands: Vector, rest: Vector | None = None) -> tuple[Vector, Vector]:
+        """Inputs (T, F) of hands (T, 6) that rest so much (T, 2), or wholly, and how far each hand
+        (T, 2) is off its places [m].
         """
         out, off = np.empty((len(hands), self.task.width)), np.empty((len(hands), 2))
-        for hand, velocity, row, away in zip(hands, velocities, out, off, strict=True):
-            _inputs(hand, velocity, self.layout.hands, self.task.inputs, row, away)
+        resting = np.ones((len(hands), 2)) if rest is None else rest
+        for hand, some, row, away in zip(hands, resting, out, off, strict=True):
+            _inputs(hand, some, self.layout.hands, self.task.inputs, row, away)
         return out, off
 
-    def moving_inputs(self, hands: Vector, velocities: Vector, accelerations: Vector) -> tuple[Vector, Vector]:
+    def moving_inputs(self, hands: Vector, velocities: Vector, rest: Vector) -> tuple[Vector, Vector]:
         """The inputs (F,) of hands (6,) that move so, and the inputs' velocity (F,) [1/s], by
         differences along their motion.
         """
         found = np.empty((2, self.task.width))
-        _moving_inputs(hands, velocities, accelerations, self.layout.hands, self.task.inputs, found)
+        _moving_inputs(hands, velocities, rest, self.layout.hands, self.task.inputs, found)
         return found[0], found[1]
 
-    def mean(self, hands: Vector, velocities: Vector) -> Vector:
-        """The tool (T, 3) [m] for hands and velocities (T, 6)."""
+    def mean(self, hands: Vector, rest: Vector) -> Vector:
+        """The tool (T, 3) [m] for hands (T, 6) that rest so much (T, 2)."""
         out = np.empty((len(hands), 3))
-        for hand, velocity, row in zip(hands, velocities, out, strict=True):
-            _tool(*(hand, velocity, *self._arrays, row, np.empty(2)))
+        for hand, some, row in zip(hands, rest, out, strict=True):
+            _tool(*(hand, some, *self._arrays, row, np.empty(2)))
         return out
 
     def corners_of_hands(self) -> Vector:
@@ -148,13 +149,15 @@ class Placed:
         _scatter(inputs, self.seen, self.errors, self.layout.std, out)
         return out
 
-    def moving(self, hands: Vector, velocities: Vector, accelerations: Vector, *, covariance: bool) -> Moving:
-        """The tool for hands (6,) that move so, by differences along their motion. One that only
-        trembles moves nothing.
+    def moving(
+        self, hands: Vector, velocities: Vector, accelerations: Vector, rest: Vector = RESTING, *, covariance: bool
+    ) -> Moving:
+        """The tool for hands (6,) that move and rest (2,) so, by differences along their motion.
+        One that only trembles moves nothing.
         """
         motion, scatter = np.empty((3, 3)), np.empty((3, 3))
         known = (*self._arrays, self.seen, self.errors, self.layout.std)
-        off = _moving(*(hands, velocities, accelerations, *known, covariance, motion, scatter))
+        off = _moving(*(hands, velocities, accelerations, rest, *known, covariance, motion, scatter))
         return Moving(motion[0], motion[1], motion[2], scatter if covariance else None, off)
 
     @cached_property
@@ -205,7 +208,7 @@ def _nearest(point: Vector, corners: Vector, count: int, out: Vector) -> float:
 
 
 @compiled
-def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices, out: Vector, off: Vector) -> None:
+def _inputs(hands: Vector, rest: Vector, corners: Vector, inputs: Indices, out: Vector, off: Vector) -> None:
     """The shares of both hands (6,) into `out` (F,), how far each is off into `off` (2,)."""
     out[:] = 0.0
     share = np.empty(3)
@@ -215,8 +218,7 @@ def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices,
             count += 1
         first = 3 * side
         off[side] = _nearest(hands[first : first + 3], corners[side], count, share)
-        speed = math.sqrt((velocities[first : first + 3] ** 2).sum())
-        power = 1.0 + (SHARPNESS - 1.0) * math.exp(-((speed / REST_MPS) ** 4))
+        power = 1.0 + (SHARPNESS - 1.0) * rest[side]
         total = 0.0
         for i in range(count):
             share[i] = (share[i] + ALMOST) ** power
@@ -227,15 +229,15 @@ def _inputs(hands: Vector, velocities: Vector, corners: Vector, inputs: Indices,
 
 @compiled
 def _moving_inputs(
-    hands: Vector, velocities: Vector, accelerations: Vector, corners: Vector, inputs: Indices, out: Vector
+    hands: Vector, velocities: Vector, rest: Vector, corners: Vector, inputs: Indices, out: Vector
 ) -> None:
     """The shares of both hands (6,) that move so, and their velocity, into `out` (2, F)."""
     ahead, off = np.empty(out.shape[1]), np.empty(2)
-    _inputs(hands - STEP_S * velocities, velocities - STEP_S * accelerations, corners, inputs, out[1], off)
-    _inputs(hands + STEP_S * velocities, velocities + STEP_S * accelerations, corners, inputs, ahead, off)
+    _inputs(hands - STEP_S * velocities, rest, corners, inputs, out[1], off)
+    _inputs(hands + STEP_S * velocities, rest, corners, inputs, ahead, off)
     for i in range(len(ahead)):
         out[1, i] = (ahead[i] - out[1, i]) / (2.0 * STEP_S)
-    _inputs(hands, velocities, corners, inputs, out[0], off)
+    _inputs(hands, rest, corners, inputs, out[0], off)
 
 
 @compiled
@@ -245,14 +247,13 @@ def _add_followed(hands: Vector, shares: Vector, corners: Vector, at: Indices, f
         side = follow[place]
         if side >= 0:
             off = hands[3 * side : 3 * side + 3] - corners[side, at[place, side]]
-            near = math.exp(-(((off * off).sum() / FOLLOWED_M**2) ** 2))
-            out += min(max(shares[place], 0.0), 1.0) * near * off
+            out += min(max(shares[place], 0.0), 1.0) ** FOLLOWED * off
 
 
 @compiled
 def _tool(
     hands: Vector,
-    velocities: Vector,
+    rest: Vector,
     corners: Vector,
     places: Vector,
     inputs: Indices,
@@ -270,7 +271,7 @@ def _tool(
     """The tool into `out` (3,): equation (8) of Huang et al. 2019 of the shares, and back."""
     width, count = centres.shape[1], len(places)
     query, shares, found = np.empty(width), np.empty(count), prior.copy()
-    _inputs(hands, velocities, corners, inputs, query, off)
+    _inputs(hands, rest, corners, inputs, query, off)
     for r in range(len(centres)):
         square = 0.0
         for i in range(width):
@@ -301,6 +302,7 @@ def _moving(
     hands: Vector,
     velocities: Vector,
     accelerations: Vector,
+    rest: Vector,
     corners: Vector,
     places: Vector,
     inputs: Indices,
@@ -332,9 +334,8 @@ def _moving(
     for k in (0, 2, 1):
         way = k - 1.0
         where = hands + way * step + abs(way) * bend
-        faster = velocities + way * STEP_S * accelerations
         _tool(
-            where, faster, corners, places, inputs, at, follow, scale, centres, weights, prior, taught, pulls,
+            where, rest, corners, places, inputs, at, follow, scale, centres, weights, prior, taught, pulls,
             tools[k], off,
         )  # fmt: skip
     for i in range(3):
@@ -344,7 +345,7 @@ def _moving(
         motion[2, i] = min(max(bent, -LARGEST_MPS2), LARGEST_MPS2)
     if wanted:
         query = np.empty(centres.shape[1])
-        _inputs(hands, velocities, corners, inputs, query, off)
+        _inputs(hands, rest, corners, inputs, query, off)
         _scatter(query, seen, errors, std, scatter)
     return float(max(off[0], off[1]))
 

@@ -192,7 +192,7 @@ class Controller:
         hands, known = state["hands"], state["covariance"]
         is_new = int(state["tick"]) in state["hand_ticks"].tolist() or known[0, 0] == 0.0
         before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
-        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], before=before)
+        prediction = self._skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], state["repose"], before=before)
         if is_new:
             state["covariance"], state["orientation_covariance"] = prediction.covariance, prediction.turn.covariance
             state["closure"] = prediction.closure

@@ -26,6 +26,7 @@ from scipy.linalg import expm
 
 from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
+from service.core.rest import RESTING, rest_on, shares
 
 MODES = 3
 REVERT_A, REVERT_V = 15.0, 100.0  # [1/s], [1/s²]
@@ -51,17 +52,17 @@ class HandEstimator:
         self._period_s = period_s
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
-    def _model_over(self, ticks: int) -> tuple[Vector, Vector]:
-        return model(ticks * self._period_s)
+    def _model_over(self, ticks: int) -> tuple[Vector, Vector, Vector]:
+        return *model(ticks * self._period_s), shares(ticks * self._period_s)
 
     def begin(self, state: Record) -> None:
         """Sets what no sample has told yet."""
         state["noise"][:, 0] = self._noise
+        state["repose"] = RESTING
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Moves both hands on by some ticks; one that is not seen stands still."""
-        transition, noise = self._model(ticks)
-        _advance_both(as_array(state), stale_ticks, transition, noise)
+        _advance_both(as_array(state), stale_ticks, *self._model(ticks))
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
@@ -209,7 +210,7 @@ def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector) -> None:
+def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector, shares: Vector) -> None:
     state = states[0]
     for side in range(2):
         if is_fresh(states, side, stale_ticks):
@@ -218,6 +219,7 @@ def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: 
         else:
             state.means[side, :, 1:] = 0.0
             state.hands[side, 1:] = 0.0
+        state.repose[side] = rest_on(state.hands[side, 1], shares, state.paces[side], state.repose[side])
 
 
 @compiled

@@ -136,10 +136,11 @@ def keep_under(
     there are `count`; whether it was not there.
 
     By the dual active-set method of Goldfarb and Idnani (Mathematical Programming 27, 1983), with
-    the bounds as further rows. Bounds and limits hold 0: were the method to end early, as its
-    rounds are bounded, the joints are slowed down together until they keep them all.
+    the bounds as further rows. Bounds hold 0, and so do limits but for those that want to be left:
+    were the method to end early, as its rounds are bounded or as not all can be left at once, the
+    joints are slowed down together until they keep the others, and approach none.
     """
-    if _share_within(bounds, rows, limits, count, x) == 1.0:
+    if _farthest(bounds, rows, limits, count, x, LEAST_EXCESS) < 0:
         return False
     joints = len(x)
     turned, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
@@ -157,7 +158,7 @@ def keep_under(
     entering, pushed = -1, 0.0
     for _ in range(ROUNDS):
         if entering < 0:
-            entering, pushed = _farthest(bounds, rows, limits, count, x), 0.0
+            entering, pushed = _farthest(bounds, rows, limits, count, x, 0.1 * LEAST_EXCESS), 0.0
             if entering < 0:
                 break
         limit = _constraint(entering, bounds, rows, limits, normal)
@@ -176,7 +177,7 @@ def keep_under(
         if slope > LEAST_SLOPE and size < joints and beyond <= step * slope:
             leaving, step = -1, beyond / slope
         elif leaving < 0:
-            break  # only by rounding: 0 keeps them all
+            break  # by rounding, or as not all can be left at once
         if slope > LEAST_SLOPE:
             for j in range(joints):
                 x[j] -= step * way[j]
@@ -200,7 +201,7 @@ def keep_under(
 
 @compiled
 def _share_within(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector) -> float:
-    """How much of x (J,) keeps bounds and limits, which hold 0."""
+    """How much of x (J,) keeps bounds and limits, those below 0 as if they were 0."""
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]
@@ -210,17 +211,18 @@ def _share_within(bounds: Vector, rows: Vector, limits: Vector, count: int, x: V
         along = 0.0
         for j in range(len(x)):
             along += rows[k, j] * x[j]
-        if along > limits[k] + LEAST_EXCESS:
-            share = min(share, max(limits[k], 0.0) / along)
+        limit = max(limits[k], 0.0)
+        if along > limit + LEAST_EXCESS:
+            share = min(share, limit / along)
     return share
 
 
 @compiled
-def _farthest(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector) -> int:
-    """The number of the constraint that x (J,) passes by most, -1 if none: upper bounds first, then
-    lower ones, then rows.
+def _farthest(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector, least: float) -> int:
+    """The number of the constraint that x (J,) passes by most, -1 if none by more than `least`:
+    upper bounds first, then lower ones, then rows.
     """
-    joints, found, most = len(x), -1, 0.1 * LEAST_EXCESS
+    joints, found, most = len(x), -1, least
     for j in range(joints):
         if x[j] - bounds[1, j] > most:
             found, most = j, x[j] - bounds[1, j]

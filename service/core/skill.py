@@ -20,6 +20,7 @@ from service.core.between import Moving, Placed
 from service.core.frame import Vector
 from service.core.places import Places, Task
 from service.core.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
+from service.core.rest import RESTING
 from service.core.taught import bent
 
 MOTION_STEPS, COVARIANCE_STEPS = 1e6, 1e10  # [1/m], [1/m²] to which a prediction is rounded
@@ -81,10 +82,11 @@ class Skill:
         hands: Vector,
         velocities: Vector,
         accelerations: Vector,
+        rest: Vector = RESTING,
         *,
         before: Known | None = None,
     ) -> Prediction:
-        """The prediction for hands (2, 3) [m] that move so.
+        """The prediction for hands (2, 3) [m] that move so, and rest so much (2,), see `core.rest`.
 
         Equation (8) of Huang et al. 2019, its derivatives along the motion, its covariance.
         Covariances take as long as all else; what was predicted just `before` may be given.
@@ -97,26 +99,24 @@ class Skill:
         if self.placed is None:
             found = self.primitive.predict_motion(*moving, covariance=before is None)
         else:
-            found = self.placed.moving(*moving, covariance=before is None)
+            found = self.placed.moving(*moving, rest, covariance=before is None)
         given = before[0] if before is not None else found.covariance
         assert given is not None
         motion, rounded = np.empty((3, 3)), np.empty((3, 3))
         deviation = _round(found.mean, found.velocity, found.acceleration, given, motion, rounded)
         if isinstance(found, Moving):
             deviation = round(found.off * MOTION_STEPS) / MOTION_STEPS
-        turn, closure = self._beside(*moving, before)
+        turn, closure = self._beside(*moving[:2], rest, before)
         return Prediction(motion[0], motion[1], motion[2], rounded, deviation, turn, closure)
 
-    def _beside(
-        self, hands: Vector, velocities: Vector, accelerations: Vector, before: Known | None
-    ) -> tuple[Turn, float]:
+    def _beside(self, hands: Vector, velocities: Vector, rest: Vector, before: Known | None) -> tuple[Turn, float]:
         """The orientation, learned or constant, and the closure of the gripper."""
         if self.turn is None and self.gripper is None:
             return self.constant_turn, NO_GRIPPER
         if self.placed is None:
             at, moving = hands, velocities
         else:
-            at, moving = self.placed.moving_inputs(hands, velocities, accelerations)
+            at, moving = self.placed.moving_inputs(hands, velocities, rest)
         turn = self.constant_turn
         if self.turn is not None:
             turn = self.turn.predict(at, moving, covariance=None if before is None else before[1])
@@ -126,25 +126,25 @@ class Skill:
 
     def inputs(self, hands: Vector) -> Vector:
         """The primitives' inputs (T, I) of hands (T, 6) [m] at rest."""
-        return hands if self.placed is None else self.placed.inputs(hands, np.zeros_like(hands))[0]
+        return hands if self.placed is None else self.placed.inputs(hands)[0]
 
     @cached_property
     def constant_turn(self) -> Turn:
         """What is predicted where no orientation was learned."""
         return Turn(np.ascontiguousarray(self.orientation, np.float64), np.zeros(3), np.zeros((3, 3)))
 
-    def mean(self, hands: Vector, velocities: Vector | None = None) -> Vector:
-        """The tool (T, 3) [m] for hands (T, 6) [m] at rest, or that move so [m/s]."""
+    def mean(self, hands: Vector, rest: Vector | None = None) -> Vector:
+        """The tool (T, 3) [m] for hands (T, 6) [m] that rest, wholly or so much (T, 2)."""
         hands = np.asarray(hands, np.float64)
         if self.placed is None:
             return self.primitive.mean(hands)
-        return self.placed.at_rest(hands) if velocities is None else self.placed.mean(hands, velocities)
+        return self.placed.at_rest(hands) if rest is None else self.placed.mean(hands, rest)
 
-    def covariances(self, hands: Vector, velocities: Vector | None = None) -> Vector:
+    def covariances(self, hands: Vector, rest: Vector | None = None) -> Vector:
         """How sure `mean` is, (T, 3, 3) [m²]."""
         if self.placed is None:
             return self.primitive.predict(hands).covariance
-        inputs, _ = self.placed.inputs(hands, np.zeros_like(hands) if velocities is None else velocities)
+        inputs, _ = self.placed.inputs(hands, rest)
         return np.array([self.placed.covariance(row) for row in inputs])
 
     def deviations(self, hands: Vector) -> Vector:
@@ -153,7 +153,7 @@ class Skill:
         """
         if self.placed is None:
             return standard_deviations(self.covariances(hands))
-        return np.asarray(self.placed.inputs(hands, np.zeros_like(hands))[1].max(axis=1))
+        return np.asarray(self.placed.inputs(hands)[1].max(axis=1))
 
     @property
     def hands(self) -> Vector:

@@ -6,6 +6,7 @@ were left out.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from service.contract.requests import ViaPoint
 from service.core.between import Placed, with_hands
 from service.core.frame import Vector
 from service.core.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
+from service.core.rest import rested
 from service.core.skill import LearnedBetween
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
@@ -58,7 +60,7 @@ class Told:
 
     layout: Layout
     hands: Vector
-    velocities: Vector
+    rest: Vector  # (T, 2) how much each hand rests
     tool: Vector
     inputs: Vector
     off: Vector  # (T, 2) [m] of each hand from its places
@@ -72,16 +74,16 @@ class Told:
         """The demonstration whose hands (T, 6) and tool (T, 3) are in phase."""
         period_s = demonstration.period_s
         hands = _smoothed(hands, round(SMOOTHED_S / period_s))
-        velocities = np.gradient(hands, period_s, axis=0)
+        rest = rested(np.gradient(hands, period_s, axis=0), period_s)
         layout = task.layout(Places.of(demonstration.places))
-        inputs, off = Placed.of(task, layout).inputs(hands, velocities)
+        inputs, off = Placed.of(task, layout).inputs(hands, rest)
         shares = _along(tool, layout.tool)
         deviation = tool - shares @ layout.tool - with_hands(hands, shares, task, layout)
         steps = np.linalg.norm(np.diff(np.hstack([inputs, 3.0 * tool]), axis=0), axis=1) + 0.05 * period_s
         way = np.concatenate([[0.0], np.cumsum(steps)])
         rows = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], EACH)).clip(0, len(way) - 1))
         wanted = np.hstack([shares[:, 1:], deviation])
-        return Told(layout, hands, velocities, tool, inputs, off, shares, rows, wanted, period_s)
+        return Told(layout, hands, rest, tool, inputs, off, shares, rows, wanted, period_s)
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
@@ -141,24 +143,41 @@ def _nearest(demonstration: Demonstration, place: ViaPoint, follow: int) -> floa
     return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
 
 
-def merged(task: Task, told: Sequence[Told]) -> Task:
-    """The task with places of a hand as one input that make no difference to the tool: wherever
-    the other hand was while it was at either, the tool was at the same place.
+def merged(task: Task, told_of: Callable[[Task], list[Told]]) -> tuple[Task, list[Told]]:
+    """The task with places of a hand as one input, as long as that predicts demonstrations that are
+    left out better; and the demonstrations, which `told_of` a task says in its inputs.
     """
-    known = _known(told, task)
-    inputs = task.inputs.copy()
+    told = told_of(task)
+    least = rms(np.concatenate(_left_out(task, told, USUAL)))
+    while True:
+        best = None
+        for side, a, b in _alike(task, _known(told, task)):
+            one = _as_one(task, side, a, b)
+            found = told_of(one)
+            error = rms(np.concatenate(_left_out(one, found, USUAL)))
+            if error < least:
+                best, least = (one, found), error
+        if best is None:
+            return task, told
+        task, told = best
+
+
+def _alike(task: Task, known: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
+    """Side and two inputs, for places of a hand of which nothing shows that the tool tells them
+    apart.
+    """
+    out = []
     for side in (0, 1):
-        count = int((inputs[side] >= 0).sum())
-        for b in range(count):
-            for a in range(b):
-                at = [
-                    {pair[1 - side]: place for pair, place in known.items() if pair[side] == task.inputs[side, corner]}
-                    for corner in (a, b)
-                ]
-                both = at[0].keys() & at[1].keys()
-                if both and all(at[0][other] == at[1][other] for other in both):
-                    inputs[side, b] = inputs[side, a]
-                    break
+        for a, b in itertools.combinations(sorted({i for i in task.inputs[side].tolist() if i >= 0}), 2):
+            at = [{pair[1 - side]: place for pair, place in known.items() if pair[side] == i} for i in (a, b)]
+            if all(at[0][other] == at[1][other] for other in at[0].keys() & at[1].keys()):
+                out.append((side, a, b))
+    return out
+
+
+def _as_one(task: Task, side: int, a: int, b: int) -> Task:
+    inputs = task.inputs.copy()
+    inputs[side, inputs[side] == b] = a
     _, renumbered = np.unique(inputs[inputs >= 0], return_inverse=True)
     inputs[inputs >= 0] = renumbered
     return task._replace(inputs=inputs)
@@ -285,8 +304,8 @@ def learned(
 ) -> Learned:
     """What demonstrations, whose hands (T, 6) and tool (T, 3) are in phase, tell of their task."""
     pairs = list(zip(demonstrations, paths, strict=True))
-    task = merged(task, [Told.of(task, one, *path) for one, path in pairs])
-    told = [Told.of(task, one, *path) for one, path in pairs]
+    progress("which places make a difference")
+    task, told = merged(task, lambda of: [Told.of(of, one, *path) for one, path in pairs])
     errors: list[Vector] = []
     parameters, least = USUAL, np.inf
     for i, tried in enumerate(TRIED):
@@ -324,7 +343,7 @@ def _left_out(task: Task, told: Sequence[Told], parameters: Parameters) -> list[
     out = []
     for i, one in enumerate(told):
         without = fitted(task, [*told[:i], *told[i + 1 :]] or told, parameters)
-        out.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.velocities))
+        out.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.rest))
     return out
 
 
@@ -333,6 +352,6 @@ def _gate(task: Task, told: Sequence[Told]) -> Gate:
     wrong: list[list[Vector]] = [[], [], []]
     for one in told:
         for off, hands in zip(wrong, nonsense(one.hands[:: max(1, len(one.hands) // 50)]), strict=True):
-            off.append(Placed.of(task, one.layout).inputs(hands, np.zeros_like(hands))[1].max(axis=1))
+            off.append(Placed.of(task, one.layout).inputs(hands)[1].max(axis=1))
     held_out = np.concatenate([one.off.max(axis=1) for one in told])
     return between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M, false=FALSE)

@@ -73,11 +73,11 @@ class LearnedMixture:
         """The same: it cannot be told."""
         return self
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """As `trials.Placed`."""
         return self.mixture.regress(hands).mean
 
-    def predict(self, hands: Array, velocities: Array) -> Predicted:
+    def predict(self, hands: Array, rest: Array) -> Predicted:
         """As `trials.Placed`; far where such hands were not seen."""
         found = self.mixture.regress(hands)
         return Predicted(found.mean, found.covariance, log_density(self.mixture, hands) < self.threshold)
@@ -261,11 +261,11 @@ class PlacedInteraction:
         """Log density (T,) of hands (T, 6) at the likeliest phase."""
         return np.asarray(self._likelihoods(hands).max(axis=1))
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """As `trials.Placed`."""
-        return self.predict(hands, velocities).mean
+        return self.predict(hands, rest).mean
 
-    def predict(self, hands: Array, velocities: Array) -> Predicted:
+    def predict(self, hands: Array, rest: Array) -> Predicted:
         """As `trials.Placed`."""
         logs = self._likelihoods(hands)
         beliefs = self._phases(logs)  # (T, Z)

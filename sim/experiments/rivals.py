@@ -21,6 +21,7 @@ from scipy.spatial.distance import cdist
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
 from service.core.pose import NO_GRIPPER, Turn
+from service.core.rest import RESTING
 from service.core.skill import Known, Prediction, Skill
 from service.core.taught import neighbourhoods
 from service.learning.demonstration import Demonstration
@@ -53,7 +54,13 @@ class Rival(Skill):
     law: Law = field(kw_only=True)
 
     def predict(
-        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
+        self,
+        hands: Array,
+        velocities: Array,
+        accelerations: Array,
+        rest: Array = RESTING,
+        *,
+        before: Known | None = None,
     ) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
@@ -71,7 +78,13 @@ class TimeDriven(Skill):
     bench: Bench = field(kw_only=True)
 
     def predict(
-        self, hands: Array, velocities: Array, accelerations: Array, *, before: Known | None = None
+        self,
+        hands: Array,
+        velocities: Array,
+        accelerations: Array,
+        rest: Array = RESTING,
+        *,
+        before: Known | None = None,
     ) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s

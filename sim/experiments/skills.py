@@ -81,16 +81,16 @@ class PlacedSkill:
     skill: Skill
     memoryless = True
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """As `trials.Placed`."""
-        return self.skill.mean(hands, velocities)
+        return self.skill.mean(hands, rest)
 
-    def predict(self, hands: Array, velocities: Array) -> Predicted:
+    def predict(self, hands: Array, rest: Array) -> Predicted:
         """As `trials.Placed`; far is what the service's gate says."""
-        some = self.skill.covariances(hands[::COVARIANCE_EVERY], velocities[::COVARIANCE_EVERY])
+        some = self.skill.covariances(hands[::COVARIANCE_EVERY], rest[::COVARIANCE_EVERY])
         covariance = np.repeat(some, COVARIANCE_EVERY, axis=0)[: len(hands)] + 1e-12 * np.eye(3)
         far = self.skill.deviations(hands) > self.skill.threshold
-        return Predicted(self.mean(hands, velocities), covariance, far)
+        return Predicted(self.mean(hands, rest), covariance, far)
 
 
 @dataclass(frozen=True)
@@ -137,11 +137,11 @@ class PlacedLookUp:
     method: LookUp
     memoryless = True
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """As `trials.Placed`."""
         return self._weighed(hands)[0]
 
-    def predict(self, hands: Array, velocities: Array) -> Predicted:
+    def predict(self, hands: Array, rest: Array) -> Predicted:
         """As `trials.Placed`; the covariance is that of the weighted tools, and a constant."""
         mean, weights, tools = self._weighed(hands)
         off = tools - mean[:, None]
@@ -309,11 +309,11 @@ class PlacedProcess:
             rows[:, self.scene] += kernel(hands, self.inputs[self.scene])
         return rows
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """As `trials.Placed`."""
         return np.asarray(self._rows(hands) @ self.weights + self.centre)
 
-    def predict(self, hands: Array, velocities: Array) -> PredictedWithDeviation:
+    def predict(self, hands: Array, rest: Array) -> PredictedWithDeviation:
         """As `trials.Placed`."""
         rows = self._rows(hands)
         white = solve_triangular(self.root[0], rows[::COVARIANCE_EVERY].T, lower=True)

@@ -57,14 +57,14 @@ class Placed(Protocol):
 
     @property
     def memoryless(self) -> bool:
-        """Whether a prediction depends on the hands of its moment and their velocity alone."""
+        """Whether a prediction depends on the hands of its moment alone, and how they rest."""
 
-    def predict(self, hands: Array, velocities: Array) -> Predicted:
-        """The tool for both hands (T, 6) [m] and velocities (T, 6) [m/s], one row a tick, in the
-        order of time.
+    def predict(self, hands: Array, rest: Array) -> Predicted:
+        """The tool for both hands (T, 6) [m] that rest so much (T, 2), one row a tick, in the order
+        of time.
         """
 
-    def mean(self, hands: Array, velocities: Array) -> Array:
+    def mean(self, hands: Array, rest: Array) -> Array:
         """The means alone (T, 3) [m]; asked of what is memoryless."""
 
 
@@ -89,6 +89,7 @@ class Seen:
     session: Session
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
+    rest: Array  # (T, 2) how much each hand rests
     fresh: Mask  # (T,) whether both hands are seen, by one source
     swapped: Mask  # (T,) whether left is taken for right
     hands: Array  # (T, 6) as they are
@@ -115,7 +116,7 @@ def seen(session: Session) -> Seen:
     samples = session.samples()
     at = [np.ceil(stamps * RATE_HZ - 1e-9).astype(int) for stamps, _ in samples]
     upto = [0, 0]
-    estimates, fresh = np.zeros((ticks, 3, 6)), np.zeros(ticks, bool)
+    estimates, rest, fresh = np.zeros((ticks, 3, 6)), np.zeros((ticks, 2)), np.zeros(ticks, bool)
     for k in range(ticks):
         intake.advance(state, 1)
         for side in (0, 1):
@@ -125,11 +126,11 @@ def seen(session: Session) -> Seen:
                 stamp_ns = START_NS + round(1e9 * float(samples[side][0][i]))
                 intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, (x, y, z), (0.0, 0.0, 0.0, 1.0)))
                 upto[side] += 1
-        estimates[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6)
+        estimates[k], rest[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["repose"]
         fresh[k] = intake.are_fresh(state) and not intake.is_contested(state, already=bool(k and not fresh[k - 1]))
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(session, times, estimates, fresh, swapped, session.hands(times), session.tool(times))
+    return Seen(session, times, estimates, rest, fresh, swapped, session.hands(times), session.tool(times))
 
 
 def workspace(demonstrations: Sequence[Shown]) -> Array:
@@ -237,15 +238,15 @@ def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]
                 as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool)
             )
         else:
-            predicted = placed.predict(s, v)
+            predicted = placed.predict(s, one.rest)
         before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
         velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
         return predicted, velocity, np.zeros_like(velocity)
-    predicted = placed.predict(s, v)
+    predicted = placed.predict(s, one.rest)
     speed = np.repeat(np.linalg.norm(v.reshape(-1, 2, 3), axis=2), 3, axis=1)
     goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
     step, curve = STEP_S * goes * v, STEP_S**2 / 2 * goes * a
-    behind, ahead = (placed.mean(s + way * step + curve, v + way * STEP_S * a) for way in (-1, 1))
+    behind, ahead = (placed.mean(s + way * step + curve, one.rest) for way in (-1, 1))
     most = settings().tool.max_acceleration
     acceleration = np.clip((ahead - 2 * predicted.mean + behind) / STEP_S**2, -most, most)
     return predicted, (ahead - behind) / (2 * STEP_S), acceleration

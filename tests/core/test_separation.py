@@ -160,6 +160,10 @@ def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int)
     rows, limits = random.normal(size=(count, 7)), np.maximum(0.2 * random.normal(size=count), 0)
     if seed % 3 == 0 and count > 1:
         rows[1], limits[1] = 2 * rows[0], 2 * limits[0]  # said twice
+    if seed % 5 == 0:
+        limits[0] = 0.3 * rows[0] @ np.where(rows[0] > 0, bounds[0], bounds[1])  # it is to be left
+        count = min(count, 3)
+        rows, limits = rows[:count], limits[:count]
     found = np.empty(7)
     least_squares(tasks, wanted, posture, damping, bounds, found)
     before = found.copy()
@@ -180,6 +184,18 @@ def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int)
         options={"ftol": 1e-14, "maxiter": 500},
     )
     assert cost(found) <= best.fun + 1e-6
+
+
+def test_what_cannot_all_be_left_is_not_approached() -> None:
+    """Between two things, each of which it is to leave by its own way back."""
+    random = np.random.default_rng(3)
+    tasks, wanted, bounds = random.normal(size=(5, 7)), random.normal(size=5), np.tile([[-1.0], [1.0]], 7)
+    rows, limits = np.array([tasks[0], -tasks[0], tasks[1]]), np.array([-0.2, -0.3, 0.0])
+    found = np.empty(7)
+    least_squares(tasks, wanted, np.zeros(7), 1e-5, bounds, found)
+    assert keep_under(tasks, wanted, np.zeros(7), 1e-5, bounds, rows, limits, 3, found)
+    assert np.abs(found).max() <= 1
+    assert (rows @ found <= 1e-8).all()
 
 
 def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tuple[Vector, Vector, Vector, Vector]:
@@ -261,7 +277,7 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
                 corners = np.array([[0.35, -0.6, -0.73], [1.25, 0.6, 0.27]])
             for k in np.flatnonzero(BODY.links):
                 apart = to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near) - BODY.radii[k]
-                assert apart > settings.obstacles.clearance - 0.003, (k, apart)
+                assert apart > settings.obstacles.clearance - 0.001, (k, apart)
 
 
 def test_motion_that_leaves_a_hand_is_not_slowed() -> None:

@@ -122,13 +122,11 @@ class Still:
     def __init__(self, at: np.ndarray, *, far: bool) -> None:
         self.at, self.far = at, far
 
-    def mean(self, hands: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
         return np.tile(self.at, (len(hands), 1))
 
-    def predict(self, hands: np.ndarray, velocities: np.ndarray) -> Predicted:
-        return Predicted(
-            self.mean(hands, velocities), np.tile(np.eye(3), (len(hands), 1, 1)), np.full(len(hands), self.far)
-        )
+    def predict(self, hands: np.ndarray, rest: np.ndarray) -> Predicted:
+        return Predicted(self.mean(hands, rest), np.tile(np.eye(3), (len(hands), 1, 1)), np.full(len(hands), self.far))
 
 
 class TestJudging:
@@ -158,7 +156,7 @@ class TestJudging:
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
         class Onto(Still):
-            def mean(self, hands: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+            def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
                 return hands[:, :3] + 0.02 * np.sin(12 * np.arange(len(hands)) / RATE_HZ)[:, None]
 
         assert judge(Onto(np.zeros(3), far=False), as_seen, workspace(demonstrations(1))).too_near
@@ -171,10 +169,11 @@ def test_skills_go_to_the_places_they_are_told(
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
     hands = frames(places)[1:, :6]
-    np.testing.assert_allclose(placed.mean(hands, 0 * hands), frames(places)[1:, 6:], atol=0.008)
-    np.testing.assert_allclose(placed.predict(hands, 0 * hands).mean, placed.mean(hands, 0 * hands), atol=1e-9)
+    rest = np.ones((len(hands), 2))
+    np.testing.assert_allclose(placed.mean(hands, rest), frames(places)[1:, 6:], atol=0.008)
+    np.testing.assert_allclose(placed.predict(hands, rest).mean, placed.mean(hands, rest), atol=1e-9)
     hands[:, 0] += 0.01  # only at the handover the tool goes with the left hand
-    moved = placed.mean(hands, 0 * hands) - frames(places)[1:, 6:]
+    moved = placed.mean(hands, rest) - frames(places)[1:, 6:]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.0, 0.0], atol=0.003)
 
 
