@@ -31,7 +31,9 @@ class CompiledQuery(Immutable):
     (0, I), where all are values."""
     columns: Array | None
     """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c Sigma
-    = L L^T (R O, R O); None: the covariance is the solution's own."""
+    = L L^T (R A, R A); None: the covariance is the solution's own."""
+    apart: int
+    """A, the outputs that the factor holds each for itself: all, or 1 for all."""
 
     @classmethod
     def of(cls, query: Query) -> CompiledQuery | None:
@@ -40,7 +42,9 @@ class CompiledQuery(Immutable):
             return None
         solution = query.solution
         along = solution.functionals.along * query.stretch if query.derivatives else np.empty((0, len(query.stretch)))
-        return cls(query, frozen(along), _packed(solution) if isinstance(solution, Dense) else None)
+        if not isinstance(solution, Dense):
+            return cls(query, frozen(along), None, 0)
+        return cls(query, frozen(along), _packed(solution), solution.apart)
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -79,18 +83,17 @@ class CompiledQuery(Immutable):
         q = self.query
         if self.columns is None:
             return q.covariance(values)
-        outputs = len(q.prior_mean)
-        found = np.empty((outputs, outputs))
-        if not _posterior(values, self.columns, np.zeros((outputs, len(values) * outputs)), found):
+        found = np.empty((self.apart, self.apart))
+        if not _posterior(values, self.columns, np.zeros((self.apart, len(values) * self.apart)), found):
             found = nearest_positive_semidefinite(found[None])[0]
         found *= q.covariance_scale
-        return found
+        return found if self.apart > 1 else found[0, 0] * np.eye(len(q.prior_mean))
 
 
 def _packed(solution: Dense) -> Array:
     inverse, _ = lapack.dtrtri(solution._covariance_factor, lower=1)
-    o = solution.hyperparameters.outputs
-    return frozen(np.concatenate([inverse[i - i % o :, i] for i in range(len(inverse))]))
+    a = solution.apart
+    return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
 
 
 @compiled

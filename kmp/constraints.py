@@ -13,7 +13,6 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 from scipy.optimize import nnls
 
 from kmp.checks import Array, numbers
@@ -114,7 +113,8 @@ class Constrained(Immutable):
         points = constraints.functionals
         across = between(kernel, self.solution.functionals, points).reshape(-1, c, len(points), c)
         pulls = np.einsum("ncje,jed->ncdj", across, normals).reshape(-1, len(points))
-        back = lapack.dpotrs(self.solution._factor, pulls, lower=1)[0]  # (N O, J)
+        stacked = pulls.reshape(len(self.database), outputs, -1)
+        back = self.solution.times_inverse(stacked).reshape(pulls.shape)  # (N O, J)
         within = between(kernel, points, points).reshape(len(points), c, len(points), c)
         stiffness = np.einsum("icd,icje,jed->ij", normals, within, normals) - pulls.T @ back
 

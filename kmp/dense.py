@@ -1,4 +1,8 @@
-"""The exact solution of equation (9), by one Cholesky factor of K + lambda Sigma with N O rows."""
+"""The exact solution of equation (9), by one Cholesky factor of K + lambda Sigma.
+
+It has N O rows; or N C, where no covariance tells the D outputs of a channel apart: what is
+factorised is then the same matrix D times over.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ _COLUMNS = 64  # of a factor, copied at once
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Dense(Immutable):
-    """The solution for N points, N O x N O numbers; the factors are made when first asked for.
+    """The solution for N points; the factors are made when first asked for.
 
     The members are those of `Solution`.
     """
@@ -55,9 +59,15 @@ class Dense(Immutable):
     @cached_property
     def weights(self) -> Array:
         """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        right = self.database.deviations(self.hyperparameters.prior_mean)
-        solution, _ = lapack.dpotrs(self._factor, right.ravel(), lower=1)
-        return frozen(np.ascontiguousarray(solution).reshape(right.shape))
+        return frozen(self.times_inverse(self.database.deviations(self.hyperparameters.prior_mean)))
+
+    def times_inverse(self, right: Array) -> Array:
+        """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
+        size = len(self._factor)
+        alike = self.hyperparameters.outputs * len(right) // size
+        split = right.reshape(size, alike, -1)
+        solution, _ = lapack.dpotrs(self._factor, split.reshape(size, -1), lower=1)
+        return np.ascontiguousarray(solution).reshape(right.shape)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
@@ -66,12 +76,12 @@ class Dense(Immutable):
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self._inverse_factor.times_one(row.T)
-        own = self._prior_covariance if prior is None else kron_identity(prior, self.hyperparameters.channel_outputs)
-        return np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1))
+        own = self._prior_covariance if prior is None else kron_identity(prior, self.apart)
+        return self._of_all(np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1)))
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self._inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
-        return np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots)
+        return self._of_all(np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots))
 
     def adapted(self, changes: Changes) -> Dense:
         """The base's solution with these changes; they share the points before the first change."""
@@ -86,13 +96,25 @@ class Dense(Immutable):
         return {}
 
     @cached_property
+    def apart(self) -> int:
+        """Outputs of a channel that the factors hold each for itself: all D, or 1 for all."""
+        c, d = self.hyperparameters.kernel.channels, self.hyperparameters.channel_outputs
+        covariance = self.database.reference.covariance
+        first = covariance.reshape(-1, c, d, c, d)[:, :, 0, :, 0]
+        return 1 if np.array_equal(covariance, kron_identity(first, d)) else d
+
+    def _of_all(self, covariance: Array) -> Array:
+        """Covariances (..., O, O) of those (..., C apart, C apart) of the outputs held apart."""
+        alike = self.hyperparameters.channel_outputs // self.apart
+        return kron_identity(covariance, alike) if alike > 1 else covariance
+
+    @cached_property
     def _prior_covariance(self) -> Array:
-        parameters = self.hyperparameters
-        return frozen(kron_identity(parameters.kernel.prior_variance, parameters.channel_outputs))
+        return frozen(kron_identity(self.hyperparameters.kernel.prior_variance, self.apart))
 
     @cached_property
     def _inverse_factor(self) -> InverseCholeskyFactor:
-        return InverseCholeskyFactor.of(self._covariance_factor, self.hyperparameters.channel_outputs)
+        return InverseCholeskyFactor.of(self._covariance_factor, self.apart)
 
     @cached_property
     def _factor(self) -> Array:
@@ -122,15 +144,18 @@ class Dense(Immutable):
             )
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
-        """The lower Cholesky factor (N O, N O) of K (x) I + lambda Sigma."""
+        """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""
         rows = self._rows(penalty)
+        if base_factor is not None and self.base is not None and self.base.apart != self.apart:
+            d = self.hyperparameters.channel_outputs
+            base_factor = kron_identity(base_factor, d) if self.apart == d else base_factor[::d, ::d]
         if base_factor is None or self.same == 0:
             # In place: the rows are symmetric, so that their transpose is as LAPACK reads it.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
         else:
             factor, info = _bordered(base_factor, rows)
         if info:
-            point = self.same + (info - 1) // self.hyperparameters.outputs
+            point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.apart)
             raise ValueError(
                 f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
                 f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
@@ -138,9 +163,10 @@ class Dense(Immutable):
         return frozen(factor)
 
     def _rows(self, penalty: float) -> Array:
-        """The rows of K (x) I + lambda Sigma that the base does not share: ((N - same) O, N O)."""
-        kernel, o = self.hyperparameters.kernel, self.hyperparameters.outputs
-        c, d, same = kernel.channels, self.hyperparameters.channel_outputs, self.same
+        """The rows of K (x) I + lambda Sigma that the base does not share: all columns."""
+        kernel, same = self.hyperparameters.kernel, self.same
+        c, d, every = kernel.channels, self.apart, self.hyperparameters.channel_outputs
+        o = c * d
         points, count, changed = self.database.functionals, len(self.database), len(self.database) - same
         rows = np.zeros((changed, c, d, count, c, d))
         k = between(kernel, points.take(slice(same, None)), points).reshape(changed, c, count, c)
@@ -148,7 +174,8 @@ class Dense(Immutable):
             rows[:, :, i, :, :, i] = k
         diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        blocks[diagonal, :, diagonal + same, :] += penalty * self.database.reference.covariance[same:]
+        covariance = self.database.reference.covariance[same:].reshape(changed, c, every, c, every)[:, :, :d, :, :d]
+        blocks[diagonal, :, diagonal + same, :] += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)
 
 

@@ -58,14 +58,15 @@ class Choice:
     inputs: Vector
     outputs: Vector
     owner: NDArray[np.intp]
+    alike: bool = False  # whether each point is as sure about all outputs: a covariance is found in a ninth of the time
 
     @classmethod
-    def of(cls, pairs: Sequence[tuple[Vector, Vector]], points: int) -> Choice:
+    def of(cls, pairs: Sequence[tuple[Vector, Vector]], points: int, *, alike: bool = False) -> Choice:
         """About so many points of the demonstrations' hands (T, 6) and tools (T, 3) [m]."""
         each = max(4, points // len(pairs))
         parts = [thinned(hands, tool, each) for hands, tool in pairs]
         owner = np.repeat(np.arange(len(parts), dtype=np.intp), [len(hands) for hands, _ in parts])
-        return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner)
+        return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner, alike)
 
     @cached_property
     def _prior(self) -> Vector:
@@ -137,6 +138,8 @@ class Choice:
         near = np.exp(-0.5 * self._squares[np.ix_(kept, kept)] / LOCAL_M**2)
         near /= near.sum(axis=1, keepdims=True)
         local = np.einsum("nm,mi,mj->nij", near, known, known)
+        if self.alike:
+            local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         local = (1 - SHARED) * local + SHARED * max((known**2).mean(), 1e-12) * np.eye(3)
         return np.asarray(local / (np.trace(local, axis1=1, axis2=2).mean() / 3))
 

@@ -109,7 +109,7 @@ def _learned_turn(
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None
     zetas = [log(_near(q, mean), mean) for q in unit]
-    choice = Choice.of(list(zip(inputs, zetas, strict=True)), points)
+    choice = Choice.of(list(zip(inputs, zetas, strict=True)), points, alike=True)
     parameters = choice.parameters() if len(zetas) > 1 else ALONE
     residuals = choice.residuals(parameters.ell, parameters.noise)
     error_deg = math.degrees(2.0 * rms(residuals)) if len(zetas) > 1 else None

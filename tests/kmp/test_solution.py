@@ -5,8 +5,9 @@ import inspect
 import numpy as np
 import pytest
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
 from kmp.dense import Dense
+from kmp.linear_algebra import kron_identity
 from kmp.low_rank import LowRank
 from kmp.low_rank.conditioned import Conditioned
 from kmp.solution import Solution, mean_at
@@ -107,3 +108,56 @@ def test_pivots_that_rounding_does_not_tell_apart_are_refused():
     says = rf"pivots: {len(pivots)} given, and rounding tells only {len(pivots) - 1} apart"
     with pytest.raises(ValueError, match=says):
         KMP.from_arrays(arrays | {"pivots": pivots})
+
+
+def leaning(count):
+    """Covariances that tell the outputs apart."""
+    return np.tile([[0.01, 0.004], [0.004, 0.02]], (count, 1, 1))
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
+@pytest.mark.parametrize("kernel", [GaussianKernel(0.05), VelocityKernel(0.05)], ids=["one", "two"])
+def test_outputs_that_nothing_tells_apart_are_solved_as_one_with_the_same_result(kernel):
+    """Against the same points, one of which is so slightly unsure otherwise that all are apart."""
+    inputs = S[:, :1] if kernel.channels == 2 else S
+    random, o = np.random.default_rng(1), 2 * kernel.channels
+    mean = random.normal(size=(40, o))
+    covariance = np.tile(kron_identity(0.01 * np.eye(kernel.channels), 2), (40, 1, 1))
+    other = covariance.copy()
+    other[0, 0, 0] *= 1 + 1e-13
+    options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 2.0, "representation": "dense"}
+    one, apart = (KMP.fit(inputs, Gaussians(mean, c), **options) for c in (covariance, other))
+    assert (one._solution.apart, apart._solution.apart) == (1, 2)
+    assert 2 * len(one._solution._factor) == len(apart._solution._factor)
+    queries = inputs[:7] + 0.1
+    adapted = [x.adapt(queries, via(7, o), tolerance=0) for x in (one, apart)]
+    for a, b in ((one, apart), adapted):
+        np.testing.assert_allclose(a.mean(queries), b.mean(queries), atol=1e-9)
+        np.testing.assert_allclose(a.predict(queries).covariance, b.predict(queries).covariance, atol=1e-9)
+        for query in queries:
+            alone, too = a.predict(query[None]), b.predict(query[None])
+            np.testing.assert_allclose(alone.covariance, too.covariance, atol=1e-9)
+        joint = (x.predict_joint(queries[:3]).covariance for x in (a, b))
+        np.testing.assert_allclose(*joint, atol=1e-9)
+
+
+def via(count, outputs):
+    return Gaussians(np.ones((count, outputs)), np.tile(1e-3 * np.eye(outputs), (count, 1, 1)))
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
+@pytest.mark.parametrize("first", ["alike", "apart"])
+def test_adapting_changes_whether_outputs_are_solved_as_one(first):
+    alike, apart = np.tile(0.01 * np.eye(2), (3, 1, 1)), leaning(3)
+    mixed = Gaussians(REFERENCE.mean, np.concatenate([alike[:1].repeat(37, axis=0), apart]))
+    options = {"kernel": GaussianKernel(0.05), "lambda_mean": 1.0, "representation": "dense"}
+    base = KMP.fit(S, REFERENCE if first == "alike" else mixed, **options)
+    points = Gaussians(np.ones((3, 2)), apart if first == "alike" else alike)
+    where = S[:3] + 0.01 if first == "alike" else S[37:]  # in the place of those that tell them apart
+    adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
+    assert (base._solution.apart, adapted._solution.apart) == ((1, 2) if first == "alike" else (2, 1))
+    anew = KMP.fit(adapted.inputs, adapted.reference, **options)
+    assert adapted._solution.same > 0
+    np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
+    one, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
+    np.testing.assert_allclose(one, other, atol=1e-10)
