@@ -49,7 +49,7 @@ class Parameters(NamedTuple):
 
 
 USUAL = Parameters(4.0, 0.05)
-TRIED = (USUAL, *(Parameters(ell, d) for ell in (2.0, 4.0, 8.0) for d in (0.05, 0.15) if (ell, d) != USUAL))
+TRIED = (USUAL, *(Parameters(ell, d) for ell in (0.5, 1.0, 2.0, 4.0, 8.0) for d in (0.05, 0.15, 0.4)))
 
 
 @dataclass(frozen=True, eq=False)
