@@ -299,14 +299,16 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
     labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
     colours = {**dict(zip(METHODS, SERIES, strict=False)), TEACHER: "#444444"}
     bars = (
-        ("success", 100.0, "success [%]"),
+        ("success", 100.0, "success [%]\n(dark: on the teacher's way all through)"),
         ("path_rms_mm", 1.0, "target off the teacher's tool,\nrms [mm]"),
         ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
     )
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
         for i, (method, one) in enumerate(found.items()):
             mean, low, high = (scale * one[name][value] for value in ("mean", "low", "high"))
-            ax.barh(i, mean, color=colours[method], height=0.65)
+            kept = 100.0 * one["success_on_the_way"]["mean"] if name == "success" else mean
+            ax.barh(i, mean, color=colours[method], height=0.65, alpha=1.0 if kept == mean else 0.4)
+            ax.barh(i, kept, color=colours[method], height=0.65)
             ax.plot((low, high), (i, i), color="black", lw=1.2)
             ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
         ax.set(xlabel=label)

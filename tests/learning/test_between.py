@@ -57,6 +57,16 @@ def test_places_of_a_hand_that_are_one_and_that_make_no_difference_are_found(bet
     assert task.follow.tolist() == [-1, 0, -1, -1]
 
 
+def test_what_makes_no_difference_is_found_by_demonstrations_that_are_left_out(
+    shown: list[Demonstration], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where nobody waited at any pair of places for long."""
+    monkeypatch.setattr("service.learning.between.LEAST_SAMPLES_S", np.inf)
+    found = learn(shown, name="hasty").between
+    assert found is not None
+    assert found.task.inputs.tolist() == [[0, 1, 2], [3, 3, 4]]
+
+
 def test_the_tool_goes_to_the_places_that_are_told_and_with_the_hand_where_it_follows(
     between: Skill, shown: list[Demonstration]
 ) -> None:
