@@ -3,7 +3,7 @@ the places are, and the way back from what it says to a tool.
 
 A hand becomes its shares of the places it goes between (barycentric coordinates of the point of
 their triangle that is nearest to it); so does the tool, with a deviation from them. A hand that
-rests belongs to the place it rests nearest to; one that moves is on its way.
+rests near a place belongs to it; one that moves, or waits far from all, is on its way.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from service.core.places import Indices, Layout, Task
 from service.core.rest import RESTING
 from service.core.taught import NEAR as NEAR_TAUGHT
 
-SHARPNESS = 4.0  # power of a resting hand's shares
+SHARPNESS = 4.0  # power of the shares of a hand that rests
+AT_M, AWAY_M = 0.12, 0.17  # as near to a place or nearer, and not at all as far: one that rests between places waits
 ALMOST = 1e-4  # share that every place has, so that none is of an undefined power
 FOLLOWED = 4  # power of the share of a place with which the tool goes with the hand there
 FLAT = 1e-6  # [m²] what a triangle's edges are taken to be longer by, as it may be none
@@ -218,7 +219,11 @@ def _inputs(hands: Vector, rest: Vector, corners: Vector, inputs: Indices, out: 
             count += 1
         first = 3 * side
         off[side] = _nearest(hands[first : first + 3], corners[side], count, share)
-        power = 1.0 + (SHARPNESS - 1.0) * rest[side]
+        nearest = math.inf
+        for i in range(count):
+            nearest = min(nearest, ((hands[first : first + 3] - corners[side, i]) ** 2).sum())
+        near = min(max((AWAY_M - math.sqrt(nearest)) / (AWAY_M - AT_M), 0.0), 1.0)
+        power = 1.0 + (SHARPNESS - 1.0) * near * rest[side]
         total = 0.0
         for i in range(count):
             share[i] = (share[i] + ALMOST) ** power
