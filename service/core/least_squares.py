@@ -135,13 +135,37 @@ def keep_under(
     """Brings the solution x (J,) of `least_squares` under rows (K, J) x <= limits (K,), of which
     there are `count`; whether it was not there.
 
-    By the dual active-set method of Goldfarb and Idnani (Mathematical Programming 27, 1983), with
-    the bounds as further rows. Bounds hold 0, and so do limits but for those that want to be left:
-    were the method to end early, as its rounds are bounded or as not all can be left at once, the
-    joints are slowed down together until they keep the others, and approach none.
+    Bounds hold 0. Limits below 0, of what is to be left, are for where all can be kept: else they
+    are taken to be 0. Were the method to end early even so, as its rounds are bounded, the joints
+    are slowed down together until they keep them all.
     """
     if _farthest(bounds, rows, limits, count, x, LEAST_EXCESS) < 0:
         return False
+    _solve_under(tasks, wanted, posture, damping, bounds, rows, limits, count, x)
+    if limits[:count].min() < 0.0 and _farthest(bounds, rows, limits, count, x, LEAST_EXCESS) >= 0:
+        least = np.maximum(limits, 0.0)
+        _solve_under(tasks, wanted, posture, damping, bounds, rows, least, count, x)
+    share = _share_within(bounds, rows, limits, count, x)
+    for j in range(len(x)):
+        x[j] = min(max(share * x[j], bounds[0, j]), bounds[1, j])
+    return True
+
+
+@compiled
+def _solve_under(
+    tasks: Vector,
+    wanted: Vector,
+    posture: Vector,
+    damping: float,
+    bounds: Vector,
+    rows: Vector,
+    limits: Vector,
+    count: int,
+    x: Vector,
+) -> None:
+    """`keep_under` by the dual active-set method of Goldfarb and Idnani (Mathematical Programming
+    27, 1983), with the bounds as further rows; as far as it comes where not all can be kept.
+    """
     joints = len(x)
     turned, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
     for j in range(joints):
@@ -177,7 +201,7 @@ def keep_under(
         if slope > LEAST_SLOPE and size < joints and beyond <= step * slope:
             leaving, step = -1, beyond / slope
         elif leaving < 0:
-            break  # by rounding, or as not all can be left at once
+            break  # by rounding, or as not all can be kept
         if slope > LEAST_SLOPE:
             for j in range(joints):
                 x[j] -= step * way[j]
@@ -193,15 +217,11 @@ def keep_under(
             size -= 1
             for k in range(leaving, size):
                 met[k], force[k], normals[k], moved[k] = met[k + 1], force[k + 1], normals[k + 1], moved[k + 1]
-    share = _share_within(bounds, rows, limits, count, x)
-    for j in range(joints):
-        x[j] = min(max(share * x[j], bounds[0, j]), bounds[1, j])
-    return True
 
 
 @compiled
 def _share_within(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector) -> float:
-    """How much of x (J,) keeps bounds and limits, those below 0 as if they were 0."""
+    """How much of x (J,) keeps bounds and limits, those below 0 taken to be 0."""
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]

@@ -31,7 +31,9 @@ IRRELEVANT = 1.5  # [m/s] nothing on the arm is as fast: pairs that may do this 
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM, THINGS_ROOM = 0.01, 0.005  # [m] kept more where motion is planned ...
 PLAN_SHARE = 0.8  # ... and of the braking: its ramps need that
-RETURN = 5.0  # [1/s] of what a thing's clearance lacks: along a thing, small errors add up
+COMES = 5.0  # [1/s] of the way to a thing's clearance; and back to it where it lacks, as small errors add up ...
+LEAVES = 0.02  # [m/s] ... at most so fast, twice as fast as joints may slip,
+LEVER = 0.1  # [m/s] ... and only by what the joints can move so fast
 SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
 NEAR_PLACE = 0.02  # [m] beside a place's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
@@ -199,8 +201,10 @@ def _look(
                 distance = to_box(here[capsule], share, boxes[box], near) - radii[capsule]
                 twice = where > 0 and share == inner
                 if not twice and _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
-                    plan[count] = min(plan[count], RETURN * (distance - things[2]))
+                    plan[count] = min(plan[count], max(COMES * (distance - things[2]), -LEAVES))
                     _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
+                    if plan[count] < 0.0 and not _may_pass(rows[count], LEVER, fastest):
+                        plan[count] = 0.0
                     if links[capsule] == len(q):
                         told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
                     count += _may_pass(rows[count], plan[count], fastest)

@@ -186,16 +186,12 @@ def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int)
     assert cost(found) <= best.fun + 1e-6
 
 
-def test_what_cannot_all_be_left_is_not_approached() -> None:
-    """Between two things, each of which it is to leave by its own way back."""
-    random = np.random.default_rng(3)
-    tasks, wanted, bounds = random.normal(size=(5, 7)), random.normal(size=5), np.tile([[-1.0], [1.0]], 7)
-    rows, limits = np.array([tasks[0], -tasks[0], tasks[1]]), np.array([-0.2, -0.3, 0.0])
-    found = np.empty(7)
-    least_squares(tasks, wanted, np.zeros(7), 1e-5, bounds, found)
-    assert keep_under(tasks, wanted, np.zeros(7), 1e-5, bounds, rows, limits, 3, found)
-    assert np.abs(found).max() <= 1
-    assert (rows @ found <= 1e-8).all()
+def test_between_two_things_that_cannot_both_be_left_the_way_along_them_is_free() -> None:
+    tasks, wanted, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
+    rows, found = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
+    least_squares(tasks, wanted, np.zeros(3), 1e-3, bounds, found)
+    assert keep_under(tasks, wanted, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), 2, found)
+    np.testing.assert_allclose(found, [0.3, 0.0, 0.0], atol=1e-3)
 
 
 def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tuple[Vector, Vector, Vector, Vector]:
@@ -278,6 +274,23 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
             for k in np.flatnonzero(BODY.links):
                 apart = to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near) - BODY.radii[k]
                 assert apart > settings.obstacles.clearance - 0.001, (k, apart)
+
+
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        (Box(centre=(0.0, 0.0, 0.05), half_size=(0.15, 0.15, 0.25)),),  # about the pedestal, which cannot leave it
+        tuple(Box(centre=(0.45, -0.05 + y, 0.354), half_size=(0.03, 0.01, 0.03)) for y in (-0.058, 0.058)),
+    ],
+    ids=["pedestal", "slot"],
+)
+def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(taught: Skill, boxes: tuple[Box, ...]) -> None:
+    settings = msgspec.structs.replace(ASSUMED, obstacles=Obstacles(boxes=boxes))
+    ticks = [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 6.0)]
+    seen, free = (frames(Controller(s, taught, urdf=URDF), ticks) for s in (settings, ASSUMED))
+    assert (seen["mode"] == Mode.FOLLOW).all()
+    assert np.linalg.norm(seen["tool"][-1] - free["tool"][-1]) < 0.05
+    assert np.linalg.norm(free["tool"] - free["tool"][0], axis=1).max() > 0.2
 
 
 def test_motion_that_leaves_a_hand_is_not_slowed() -> None:

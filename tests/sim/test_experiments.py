@@ -141,8 +141,8 @@ class TestExperiments:
         found = numbers("hands", tmp_path)
         assert found["figures"] == ["hands-stages.png", "hands.png"]
         worth = {name: one["error_median_mm"] for name, one in found["beside_the_paper"].items()}
-        assert min(worth, key=lambda name: worth[name]) == "as shipped"
-        assert worth["one point a place"] > 3 * worth["as shipped"]
+        assert min(worth, key=lambda name: worth[name]) == "ours"
+        assert worth["one point a place"] > 3 * worth["ours"]
 
     def test_statistics_compare_eight_methods_in_the_same_scenes(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
