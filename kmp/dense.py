@@ -63,10 +63,7 @@ class Dense(Immutable):
 
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
-        size = len(self._factor)
-        alike = self.hyperparameters.outputs * len(right) // size
-        split = right.reshape(size, alike, -1)
-        solution, _ = lapack.dpotrs(self._factor, split.reshape(size, -1), lower=1)
+        solution, _ = lapack.dpotrs(self._factor, right.reshape(len(self._factor), -1), lower=1)
         return np.ascontiguousarray(solution).reshape(right.shape)
 
     def solved(self) -> Self:

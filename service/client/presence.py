@@ -4,7 +4,6 @@ published, under whatever key.
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import msgspec
@@ -64,9 +63,7 @@ class Overheard:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property

@@ -109,17 +109,12 @@ class Placed:
         """The same, that is moved around some hands."""
         return replace(self, taught=np.array(taught, order="C"), pulls=np.array(pulls, order="C"))
 
-    def at_rest(self, hands: Vector) -> Vector:
-        """`mean` of hands (T, 6) that rest."""
-        return self.mean(hands, np.ones((len(hands), 2)))
-
     def inputs(self, hands: Vector, rest: Vector | None = None) -> tuple[Vector, Vector]:
         """Inputs (T, F) of hands (T, 6) that rest so much (T, 2), or wholly, and how far each hand
         (T, 2) is off its places [m].
         """
         out, off = np.empty((len(hands), self.task.width)), np.empty((len(hands), 2))
-        resting = np.ones((len(hands), 2)) if rest is None else rest
-        for hand, some, row, away in zip(hands, resting, out, off, strict=True):
+        for hand, some, row, away in zip(hands, _resting(hands, rest), out, off, strict=True):
             _inputs(hand, some, self.layout.hands, self.task.inputs, row, away)
         return out, off
 
@@ -131,10 +126,10 @@ class Placed:
         _moving_inputs(hands, velocities, rest, self.layout.hands, self.task.inputs, found)
         return found[0], found[1]
 
-    def mean(self, hands: Vector, rest: Vector) -> Vector:
-        """The tool (T, 3) [m] for hands (T, 6) that rest so much (T, 2)."""
+    def mean(self, hands: Vector, rest: Vector | None = None) -> Vector:
+        """The tool (T, 3) [m] for hands (T, 6) that rest so much (T, 2), or wholly."""
         out = np.empty((len(hands), 3))
-        for hand, some, row in zip(hands, rest, out, strict=True):
+        for hand, some, row in zip(hands, _resting(hands, rest), out, strict=True):
             _tool(*(hand, some, *self._arrays, row, np.empty(2)))
         return out
 
@@ -151,7 +146,7 @@ class Placed:
         return out
 
     def moving(
-        self, hands: Vector, velocities: Vector, accelerations: Vector, rest: Vector = RESTING, *, covariance: bool
+        self, hands: Vector, velocities: Vector, accelerations: Vector, rest: Vector, *, covariance: bool
     ) -> Moving:
         """The tool for hands (6,) that move and rest (2,) so, by differences along their motion.
         One that only trembles moves nothing.
@@ -167,6 +162,10 @@ class Placed:
         task, layout = self.task, self.layout
         at = (layout.hands, layout.tool, task.inputs, task.corners, task.follow)
         return (*at, self.scale, self.centres, self.weights, self.prior, self.taught, self.pulls)
+
+
+def _resting(hands: Vector, rest: Vector | None) -> Vector:
+    return np.tile(RESTING, (len(hands), 1)) if rest is None else rest
 
 
 def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vector:

@@ -138,7 +138,7 @@ class Skill:
         hands = np.asarray(hands, np.float64)
         if self.placed is None:
             return self.primitive.mean(hands)
-        return self.placed.at_rest(hands) if rest is None else self.placed.mean(hands, rest)
+        return self.placed.mean(hands, rest)
 
     def covariances(self, hands: Vector, rest: Vector | None = None) -> Vector:
         """How sure `mean` is, (T, 3, 3) [m²]."""
@@ -169,7 +169,7 @@ class Skill:
         layout = task.layout(nominal.told(self.via_points))
         plain = Placed.of(task, layout, self.primitive, seen, errors)
         others = [point for point in self.via_points if point.name not in task.names]
-        return plain.through(*bent(plain.at_rest, plain.corners_of_hands(), others))
+        return plain.through(*bent(plain.mean, plain.corners_of_hands(), others))
 
     @cached_property
     def demonstrated(self) -> Vector:

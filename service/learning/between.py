@@ -49,7 +49,9 @@ class Parameters(NamedTuple):
 
 
 USUAL = Parameters(4.0, 0.05)
-TRIED = (USUAL, *(Parameters(ell, d) for ell in (0.5, 1.0, 2.0, 4.0, 8.0) for d in (0.05, 0.15, 0.4)))
+OTHERS = [
+    tried for ell in (0.5, 1.0, 2.0, 4.0, 8.0) for d in (0.05, 0.15, 0.4) if (tried := Parameters(ell, d)) != USUAL
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,23 +145,23 @@ def _nearest(demonstration: Demonstration, place: ViaPoint, follow: int) -> floa
     return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
 
 
-def merged(task: Task, told_of: Callable[[Task], list[Told]]) -> tuple[Task, list[Told]]:
+def merged(task: Task, told_of: Callable[[Task], list[Told]]) -> tuple[Task, list[Told], list[Vector]]:
     """The task with places of a hand as one input, as long as that predicts demonstrations that are
-    left out better; and the demonstrations, which `told_of` a task says in its inputs.
+    left out better; the demonstrations, which `told_of` a task says in its inputs; and their errors
+    then, with the usual parameters.
     """
-    told = told_of(task)
-    least = rms(np.concatenate(_left_out(task, told, USUAL)))
+
+    def judged(task: Task) -> tuple[Task, list[Told], list[Vector]]:
+        told = told_of(task)
+        return task, told, _left_out(task, told, USUAL)
+
+    best = judged(task)
     while True:
-        best = None
-        for side, a, b in _alike(task, _known(told, task)):
-            one = _as_one(task, side, a, b)
-            found = told_of(one)
-            error = rms(np.concatenate(_left_out(one, found, USUAL)))
-            if error < least:
-                best, least = (one, found), error
-        if best is None:
-            return task, told
-        task, told = best
+        task, told, errors = best
+        for pair in _alike(task, _known(told, task)):
+            best = min(best, judged(_as_one(task, *pair)), key=lambda one: rms(np.concatenate(one[2])))
+        if best[0] is task:
+            return task, told, errors
 
 
 def _alike(task: Task, known: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
@@ -305,15 +307,14 @@ def learned(
     """What demonstrations, whose hands (T, 6) and tool (T, 3) are in phase, tell of their task."""
     pairs = list(zip(demonstrations, paths, strict=True))
     progress("which places make a difference")
-    task, told = merged(task, lambda of: [Told.of(of, one, *path) for one, path in pairs])
-    errors: list[Vector] = []
-    parameters, least = USUAL, np.inf
-    for i, tried in enumerate(TRIED):
-        progress(f"holding out each of {len(told)} demonstrations, parameters {i + 1} of {len(TRIED)}")
+    task, told, errors = merged(task, lambda of: [Told.of(of, one, *path) for one, path in pairs])
+    parameters, least = USUAL, BETTER * rms(np.concatenate(errors))
+    for i, tried in enumerate(OTHERS):
+        progress(f"holding out each of {len(told)} demonstrations, parameters {i + 1} of {len(OTHERS)}")
         found = _left_out(task, told, tried)
         error = rms(np.concatenate(found))
         if error < least:
-            parameters, errors, least = tried, found, BETTER * error if tried == USUAL else error
+            parameters, errors, least = tried, found, error
     progress(f"learning from all {len(told)}")
     primitive = fitted(task, told, parameters)
     rows = [

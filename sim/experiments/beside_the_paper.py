@@ -8,6 +8,7 @@ that come 8 mm an axis beside where they were said to come, and how much of thei
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import msgspec
@@ -20,12 +21,12 @@ from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array
+from sim.experiments.rivals import COMPONENTS
 from sim.experiments.scenes import OFFSET_M, draw
 from sim.scene import GRASP_DISTANCE, TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 
 PAPER_ELL = 0.5  # of its section III-C, which names no unit: taken as metres
-COMPONENTS = 10  # of the mixture that makes the reference, as the paper has it
 SCENES = 40
 
 
@@ -59,18 +60,14 @@ class Reached(NamedTuple):
 
 def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
     """The figures with our numbers, with each difference undone, and with all undone."""
-    demonstrations = demonstrated(5)
-    ours = learn(demonstrations, components=COMPONENTS)
-    soft = learn(demonstrations, components=COMPONENTS, ell=PAPER_ELL)
-    exact = learn(demonstrations, components=COMPONENTS, spread_m=0.0)
+    learned = functools.partial(learn, demonstrated(5), components=COMPONENTS)
+    ours = learned()
     variants = {
         "ours": Variant(ours, bare=False),
-        "ell 0.5": Variant(soft, bare=False),
-        "no spread": Variant(exact, bare=False),
+        "ell 0.5": Variant(learned(ell=PAPER_ELL), bare=False),
+        "no spread": Variant(learned(spread_m=0.0), bare=False),
         "one point a place": Variant(ours, bare=True),
-        "all three: the paper's": Variant(
-            learn(demonstrations, components=COMPONENTS, ell=PAPER_ELL, spread_m=0.0), bare=True
-        ),
+        "all three: the paper's": Variant(learned(ell=PAPER_ELL, spread_m=0.0), bare=True),
     }
     count = max(3, round(SCENES * share))
     return {name: reached(variant, count).numbers() for name, variant in variants.items()}

@@ -306,9 +306,11 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
         for i, (method, one) in enumerate(found.items()):
             mean, low, high = (scale * one[name][value] for value in ("mean", "low", "high"))
-            kept = 100.0 * one["success_on_the_way"]["mean"] if name == "success" else mean
-            ax.barh(i, mean, color=colours[method], height=0.65, alpha=1.0 if kept == mean else 0.4)
-            ax.barh(i, kept, color=colours[method], height=0.65)
+            dark = mean
+            if name == "success":
+                dark = scale * one["success_on_the_way"]["mean"]
+                ax.barh(i, mean, color=colours[method], height=0.65, alpha=0.4)
+            ax.barh(i, dark, color=colours[method], height=0.65)
             ax.plot((low, high), (i, i), color="black", lw=1.2)
             ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
         ax.set(xlabel=label)
