@@ -1,0 +1,139 @@
+"""Adapting a primitive: which points give way, what stays, and what is said of misses."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from primitives import database, kernel, properties, same_bits, seeds, skill, via
+
+from kmp import KMP, Gaussians, ViaPointMissed
+
+
+def test_via_points_of_small_variance_are_met():
+    for seed in range(10):
+        inputs, points = via(seed, 3, std=1e-5)
+        adapted = skill(seed).adapt(inputs, points, tolerance=0.5)
+        np.testing.assert_allclose(adapted.mean(inputs), points.mean, atol=1e-5)
+
+
+def test_a_via_point_far_from_the_others_leaves_the_rest_as_it_was():
+    primitive = skill()
+    adapted = primitive.adapt(np.full((1, 4), 9.0), via(0, 1)[1], tolerance=0.1)
+    queries = np.random.default_rng(3).normal(size=(5, 4))
+    np.testing.assert_allclose(adapted.mean(queries), primitive.mean(queries), atol=1e-9)
+
+
+def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
+    primitive = skill()
+    inputs = np.stack([primitive.inputs[7] + 0.01, np.full(4, 9.0)])
+    adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
+    assert list(adapted._changes.replaced) == [7]
+    assert len(adapted.inputs) == 31
+    np.testing.assert_array_equal(adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs]))
+    np.testing.assert_array_equal(adapted.via_inputs, inputs)
+    assert adapted.base is primitive
+    assert primitive.base is primitive
+    assert len(primitive.via_points) == 0
+
+
+def test_only_the_nearest_of_the_points_within_the_tolerance_is_replaced():
+    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
+    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2)._changes.replaced) == [0]
+
+
+def test_the_tolerance_itself_is_not_near_enough():
+    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
+    point = Gaussians([[5.0]], [[[1e-6]]])
+    assert len(primitive.adapt([[0.25]], point, tolerance=0.25)._changes.replaced) == 0
+    assert list(primitive.adapt([[0.25]], point, tolerance=0.26)._changes.replaced) == [0]
+    assert list(primitive.adapt([[0.5]], point, tolerance=1)._changes.replaced) == [0, 1]
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
+@properties
+@given(seeds, st.floats(0, 3))
+def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
+    primitive = skill(seed)
+    inputs, points = via(seed, 5, std=0.01)
+    inputs[4] = inputs[3] + 0.05
+    order = np.random.default_rng(seed).permutation(5)
+    together = primitive.adapt(inputs, points, tolerance=tolerance)
+    shuffled = primitive.adapt(inputs[order], points.take(order), tolerance=tolerance)
+    singly = primitive
+    for n in range(5):
+        singly = singly.adapt(inputs[n : n + 1], points.take(slice(n, n + 1)), tolerance=tolerance)
+    queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
+    assert np.array_equal(together._changes.replaced, shuffled._changes.replaced)
+    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
+    found, wanted = shuffled.predict(queries).covariance, together.predict(queries).covariance
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    assert same_bits(singly, together, queries)
+
+
+@properties
+@given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
+def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, tolerance):
+    adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
+    lambdas = {"lambda_mean": 2.0, "lambda_covariance": lambda_covariance}
+    fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, **lambdas)
+    queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
+    np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
+    found, wanted = adapted.predict(queries).covariance, fitted.predict(queries).covariance
+    of_base = len(adapted.base.inputs) / len(fitted.inputs)  # N stays the base's
+    np.testing.assert_allclose(found, wanted * of_base, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation):
+    inputs, reference = database()
+    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
+    points = Gaussians(np.zeros((80, 3)), np.tile(1e-4 * np.eye(3), (80, 1, 1)))
+    elsewhere = 40.0 + 3 * np.random.default_rng(0).normal(size=(80, 4))
+    adapted = primitive.adapt(elsewhere, points, tolerance=0.1)
+    assert len(adapted.inputs) == 110
+    queries = np.concatenate([inputs[:5], np.full((1, 4), -50.0)])
+    before = primitive.predict(queries).covariance
+    for again in (adapted, KMP.from_arrays(adapted.to_arrays()), adapted.refitted(reference)):
+        np.testing.assert_allclose(again.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(again.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
+
+
+def test_every_point_of_the_base_may_be_replaced():
+    primitive = skill(count=2)
+    points = via(0, 2)[1]
+    adapted = primitive.adapt(primitive.inputs, points, tolerance=0.1)
+    np.testing.assert_array_equal(adapted.inputs, primitive.inputs)
+    np.testing.assert_allclose(adapted.mean(adapted.inputs), points.mean, atol=1e-4)
+
+
+def test_adapting_the_base_to_nothing_gives_the_base():
+    primitive = skill()
+    adapted = primitive.adapt(*via(0, 2), tolerance=1)
+    assert adapted.base.adapt(*via(0, 0), tolerance=1) is primitive
+
+
+def test_adapting_leaves_the_primitive_as_it_was():
+    primitive, queries = skill(), np.random.default_rng(0).normal(size=(3, 4))
+    before = primitive.predict(queries)
+    primitive.adapt(*via(0, 2), tolerance=1)
+    assert np.array_equal(primitive.predict(queries).covariance, before.covariance)
+    assert np.array_equal(primitive.mean(queries), before.mean)
+
+
+def test_a_via_point_that_is_missed_is_named_with_the_numbers():
+    primitive = skill()
+    near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
+    points = Gaussians([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], np.tile(1e-4 * np.eye(3), (3, 1, 1)))
+    says = r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell"
+    with pytest.warns(ViaPointMissed, match=says) as told:
+        adapted = primitive.adapt(near, points, tolerance=0)
+    assert told[0].filename == __file__
+    miss = np.linalg.norm(adapted.mean(near) - points.mean, axis=1)
+    assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(told[0].message)
+
+
+def test_a_via_point_that_may_be_missed_or_is_missed_by_less_than_a_millimetre_is_not_named():
+    near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
+    for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
+        points = Gaussians([[0.0, 0, 0], [apart, 0, 0]], np.tile(std**2 * np.eye(3), (2, 1, 1)))
+        skill().adapt(near, points, tolerance=0)
