@@ -8,6 +8,7 @@ import contextlib
 import importlib.util
 import json
 import select
+import socket
 import subprocess
 import threading
 import time
@@ -17,7 +18,7 @@ from pathlib import Path
 
 from service.child import python
 from service.contract.explain import ExplainedError
-from service.recorder.client import NOT_RECORDED
+from service.recording.client import NOT_RECORDED
 
 START_TIMEOUT_S, LONG_START_S = 180.0, 6.0
 STOP_TIMEOUT_S = 60.0
@@ -148,3 +149,10 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
         process.kill()
         process.communicate()
     return next((line for line in report.splitlines() if line.startswith("{")), "")
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

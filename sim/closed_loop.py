@@ -14,7 +14,7 @@ from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Tick
-from service.core.pose import CLOSED, UNKNOWN
+from service.core.skill.pose import CLOSED, UNKNOWN
 
 if TYPE_CHECKING:
     from sim.bench import Bench  # PyBullet, which not all who make events have

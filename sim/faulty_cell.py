@@ -1,4 +1,4 @@
-"""A whole cell to be broken: service, scribe, workshop, tracker and network as processes, the
+"""A whole cell to be broken: service, scribe, skill worker, tracker and network as processes, the
 bench's arm in real time, and what they did when something of it failed.
 
 with FaultyCell(folder) as cell:
@@ -20,8 +20,8 @@ import zenoh
 
 from service.client import Client, UnreachableError, open_session
 from service.contract import cdr, channels
+from service.daemon.clock import Deadlines
 from service.launch import Launched, launched
-from service.shell.clock import Deadlines
 from sim.bench import Bench
 from sim.network import Bridge, Live
 from sim.parts import Link, Part, as_usual_afterwards, before_others
@@ -184,8 +184,8 @@ class FaultyCell:
         self.session.declare_subscriber(channels.key(CELL, "joints/command"), keep)
 
     def child(self, what: str) -> int:
-        """The process id of the service's `scribe` or `workshop`."""
-        module = {"scribe": b"service.recorder.process", "workshop": b"service.shell.workshop"}[what]
+        """The process id of the service's `scribe` or `skill_worker`."""
+        module = {"scribe": b"service.recording.process", "skill worker": b"service.daemon.skill_worker"}[what]
         for path in Path(f"/proc/{self.service.process.pid}/task").glob("*/children"):
             for pid in path.read_text().split():
                 if module in Path(f"/proc/{pid}/cmdline").read_bytes():

@@ -24,12 +24,12 @@ from service.contract import cdr
 from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, run
 from service.core.frame import Event, Frame, Tick, differences, order
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
 from service.learning.via_points import adapted
-from service.recorder.mcap_file import RecordingError
-from service.recorder.recording import Recorder, Recording
-from service.recorder.replay import ticks
+from service.recording.mcap_file import RecordingError
+from service.recording.recording import Recorder, Recording
+from service.recording.replay import ticks
 from sim.bench import Bench
 from sim.closed_loop import START_NS, ClosedLoop, hand_event
 from sim.scene import Scene

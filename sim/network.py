@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 
 from service.contract import cdr, channels, messages, requests
-from service.shell.clock import Deadlines
+from service.daemon.clock import Deadlines
 from sim.bench import Bench, Observation, TaskEvent, TaskEvents
 from sim.scene import Scene
 from sim.script import Array

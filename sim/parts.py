@@ -32,7 +32,7 @@ from collections.abc import Iterator
 from service import child
 from service.client import endpoints, open_session
 from service.contract import cdr, channels, messages
-from service.shell.clock import Deadlines
+from service.daemon.clock import Deadlines
 from sim.scene import Scene
 from sim.script import HandScript
 

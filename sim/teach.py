@@ -22,8 +22,8 @@ from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
+from service.demonstrations.files import write_demonstration
 from service.learning.demonstration import Demonstration
-from service.recorder.demonstrations import write_demonstration
 from sim import sessions
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError

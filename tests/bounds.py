@@ -7,7 +7,7 @@ from wam import URDF
 
 from service.config import Settings
 from service.contract.records import Mode, Reason
-from service.core.arm import Arm
+from service.core.arm.arm import Arm
 from service.core.frame import Vector
 
 SETTINGS = Settings()

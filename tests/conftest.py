@@ -15,10 +15,10 @@ from tests_paths import RECORDINGS
 
 from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
-from service.core import rehearsal
-from service.core.skill import Skill
+from service.core import warm_up
+from service.core.skill.skill import Skill
+from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import decoded
-from service.shell.workshop import Workshop
 
 
 class _NoBench:
@@ -40,16 +40,16 @@ def pytest_configure(config: pytest.Config) -> None:
     Each test of a daemon would else do so in a process of its own, and time out where several do.
     """
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    compiled = any((Path(rehearsal.__file__).parent / "__pycache__").glob(f"*.{version}.nbi"))
+    compiled = any((Path(warm_up.__file__).parent / "__pycache__").glob(f"*.{version}.nbi"))
     if compiled or hasattr(config, "workerinput"):
         return
     place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
-    workshop = Workshop()
+    skill_worker = SkillWorker()
     for name in ("soldering.npz", "experiments/as-paper.npz"):
-        loaded = workshop.load(RECORDINGS / name, timeout_s=120.0)
-        for one in (loaded, workshop.adapt(loaded, [place], tolerance=0.05, timeout_s=120.0)):
-            rehearsal.rehearse(Settings(), one, urdf=robot_description(Settings()))
-    workshop.close()
+        loaded = skill_worker.load(RECORDINGS / name, timeout_s=120.0)
+        for one in (loaded, skill_worker.adapt(loaded, [place], tolerance=0.05, timeout_s=120.0)):
+            warm_up.warm_up(Settings(), one, urdf=robot_description(Settings()))
+    skill_worker.close()
 
 
 @pytest.fixture(scope="session")

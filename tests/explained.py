@@ -8,8 +8,7 @@ import numpy as np
 
 from service.config import Settings, ToolSettings
 from service.core.frame import Record, Vector
-from service.core.setpoint import SetpointGenerator
-from service.core.setpoint_bounds import (
+from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_SPANS,
     HULL_TIME_S,
@@ -17,7 +16,8 @@ from service.core.setpoint_bounds import (
     farthest,
     speed_to_come,
 )
-from service.core.workspace import Target
+from service.core.setpoint.setpoint import SetpointGenerator
+from service.core.setpoint.workspace import Target
 
 
 def margin(tool: ToolSettings) -> float:

@@ -23,8 +23,8 @@ from service.contract.records import SIDES
 from service.core.controller import Controller
 from service.core.frame import Frame, Vector
 from service.learning.skill_file import decoded
-from service.recorder.recording import Recording
-from service.recorder.replay import replay, ticks
+from service.recording.recording import Recording
+from service.recording.replay import replay, ticks
 
 QUIET_S = 1.0  # of every two, in which nothing is spoilt
 ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")

@@ -14,22 +14,22 @@ from pathlib import Path
 
 import msgspec
 
-from service.cli.usage import recordings, shipped
 from service.config import ArmSettings, Files, Settings
+from service.daemon import daemon
+from service.daemon.daemon import Daemon
+from service.daemon.saved_via_points import state_folder
+from service.daemon.single_instance import Lock
+from service.daemon.skill_worker import SkillWorker
 from service.network_settings import Network
-from service.recorder.client import Scribe
-from service.shell import daemon
-from service.shell.daemon import Daemon
-from service.shell.door import Lock
-from service.shell.saved_via_points import state_folder
-from service.shell.workshop import Workshop
+from service.recording.client import Scribe
+from service.shipped import recordings, shipped_skill
 
 RATE_HZ, ROS2_DOMAIN = 50, 7
 
 
 def main(folder: Path, endpoint: str, *cells: str) -> None:
     """Serves the cells; each says its name once it is announced."""
-    skill, workshop = shipped(), Workshop()
+    skill, skill_worker = shipped_skill(), SkillWorker()
     daemons = []
     for cell in cells:
         settings = Settings(
@@ -41,8 +41,10 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
         )
         lock = Lock(state_folder(settings), cell)
         scribe = Scribe(settings)
-        daemons.append(Daemon(settings, skill, workshop=workshop, skills=recordings(), scribe=scribe, lock=lock))
-        daemon.rehearse = lambda *_, **__: None  # once a process is enough
+        daemons.append(
+            Daemon(settings, skill, skill_worker=skill_worker, skills=recordings(), scribe=scribe, lock=lock)
+        )
+        daemon.warm_up = lambda *_, **__: None  # once a process is enough
     for one, cell in zip(daemons, cells, strict=True):
         say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
         say.start()

@@ -30,14 +30,14 @@ ENTRY_POINTS = [
     if not path.is_relative_to(ROOT / "tests") and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
 ]
 PLANTED = [
-    ("service/core/intake.py", "import time"),
-    ("service/core/frame.py", "from service.shell.clock import Deadlines"),
+    ("service/core/intake/intake.py", "import time"),
+    ("service/core/frame.py", "from service.daemon.clock import Deadlines"),
     ("service/contract/cdr.py", "import numpy"),
     ("service/contract/channels.py", "from service.core.frame import Tick"),
     ("service/learning/learn.py", "import mcap"),
-    ("service/recorder/client.py", "from service.shell.clock import Deadlines"),
-    ("service/shell/clock.py", "from service.cli.usage import UsageError"),
-    ("service/core/skill.py", "from service.learning.learn import learn"),
+    ("service/recording/client.py", "from service.daemon.clock import Deadlines"),
+    ("service/daemon/clock.py", "from service.cli.usage import UsageError"),
+    ("service/core/skill/skill.py", "from service.learning.learn import learn"),
     ("kmp/gmm.py", "import msgspec"),
     ("kmp/gmm.py", "from service.config import Settings"),
     ("service/config.py", "from sim.scene import Scene"),

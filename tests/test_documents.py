@@ -17,9 +17,9 @@ from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
-from service.core.arm import Arm
-from service.recorder.arrangement import curves
-from service.recorder.client import Scribe
+from service.core.arm.arm import Arm
+from service.recording.client import Scribe
+from service.viewer.blueprint import curves
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]

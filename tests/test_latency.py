@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.cli import bench
+from service.timing import bench
 
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
@@ -21,7 +21,7 @@ PLANTED = """
 from service import one_blas_thread
 import sys, threading, time
 from service.cli.main import main
-from service.shell.daemon import Daemon
+from service.daemon.daemon import Daemon
 
 def busy(seconds):
     until = time.perf_counter() + seconds

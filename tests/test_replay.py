@@ -18,10 +18,10 @@ from wam import URDF
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
-from service.recorder.recording import Recorder, Recording
-from service.recorder.replay import replay
+from service.recording.recording import Recorder, Recording
+from service.recording.replay import replay
 from sim.golden import refresh
 from sim.scene import Scene
 from sim.script import HandScript

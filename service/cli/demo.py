@@ -20,10 +20,10 @@ from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.launch import check_bench, launched, played
-from service.recorder.columns import read
-from service.recorder.recording import Recording
-from service.recorder.report import Report, why_missed
-from service.recorder.report import report as report_of
+from service.recording.recording import Recording
+from service.report.columns import read
+from service.report.report import Report, why_missed
+from service.report.report import report as report_of
 
 START_TIMEOUT_S = 60.0
 AFTER_S = 1.0  # that is looked at behind the nearest that the tool came

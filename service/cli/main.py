@@ -25,23 +25,23 @@ from service.contract.explain import ExplainedError
 from service.contract.roles import DAEMON, ROLES
 
 RUN_BY = {
-    "demo": "demo",
-    "serve": "serve",
-    "play": "recordings",
-    "replay": "recordings",
-    "learn": "recordings",
-    "record": "record",
-    "via-points": "clients",
-    "status": "status",
-    "doctor": "doctor",
-    "hold": "clients",
-    "resume": "clients",
-    "reset": "clients",
-    "cells": "cells",
-    "view": "view",
-    "report": "report",
-    "certificates": "certificates",
-    "bench": "bench",
+    "demo": "cli.demo",
+    "serve": "cli.serve",
+    "play": "cli.recordings",
+    "replay": "cli.recordings",
+    "learn": "cli.recordings",
+    "record": "cli.record",
+    "via-points": "cli.clients",
+    "status": "cli.status",
+    "doctor": "cli.doctor",
+    "hold": "cli.clients",
+    "resume": "cli.clients",
+    "reset": "cli.clients",
+    "cells": "cli.cells",
+    "view": "cli.view",
+    "report": "cli.report",
+    "certificates": "cli.certificates",
+    "bench": "timing.bench",
 }
 SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
 PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them
@@ -273,7 +273,7 @@ def parser() -> argparse.ArgumentParser:
 
     # whatever follows is for `python -m sim`, so none of it is an option here, --help neither
     c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
-    c.set_defaults(run="sim.sim")
+    c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
 
     c = client(
@@ -360,11 +360,11 @@ def _zenoh_config(sub: argparse.ArgumentParser) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """The exit code of a command."""
     args = parser().parse_args(arguments)
-    module, function = args.run.split(".")
+    module, function = args.run.rsplit(".", 1)
     try:
         if "cell" in args and args.cell is not None:  # a wildcard would reach every cell
             check_cell(args.cell)
-        run = getattr(importlib.import_module(f"service.cli.{module}"), function)
+        run = getattr(importlib.import_module(f"service.{module}"), function)
         with interrupt.put_away_first() if args.command in PUT_AWAY_FIRST else contextlib.nullcontext():
             return int(run(args))
     except UsageError as error:

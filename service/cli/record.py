@@ -12,9 +12,20 @@ from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, pla
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
 from service.contract.channels import ENDPOINT
-from service.recorder.mcap_file import RecordingError
-from service.recorder.takes import Summary, TakeNameError, draw, path_of, summary, table, takes, there, trim, uncut
-from service.recorder.taking import take
+from service.demonstrations.capture import take
+from service.demonstrations.takes import (
+    Summary,
+    TakeNameError,
+    draw,
+    path_of,
+    summary,
+    table,
+    takes,
+    there,
+    trim,
+    uncut,
+)
+from service.recording.mcap_file import RecordingError
 
 
 def record(args: argparse.Namespace) -> int:

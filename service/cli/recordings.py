@@ -19,15 +19,15 @@ from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.requests import Status
+from service.demonstrations.files import iter_hands, read_demonstration
+from service.demonstrations.pose_streams import SIDES, Source
 from service.learning.judgement import table
 from service.learning.learn import Evidence
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
-from service.recorder.demonstrations import iter_hands, read_demonstration
-from service.recorder.mcap_file import ends_early
-from service.recorder.pose_streams import SIDES, Source
-from service.recorder.recording import Recording
-from service.recorder.replay import replay as replayed
+from service.recording.mcap_file import ends_early
+from service.recording.recording import Recording
+from service.recording.replay import replay as replayed
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
 

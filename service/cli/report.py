@@ -16,12 +16,12 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from service.cli.progress import progress
-from service.cli.report_tables import Table, comparison, names_of, summary, tables
 from service.cli.usage import UsageError, check_writable
 from service.contract.records import Mode
-from service.recorder.columns import KEPT
-from service.recorder.recording import Recording
-from service.recorder.report import Report, reported
+from service.recording.recording import Recording
+from service.report.columns import KEPT
+from service.report.report import Report, reported
+from service.report.tables import Table, comparison, names_of, summary, tables
 
 BAR = 72  # characters of the line that shows the modes over the time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
@@ -51,7 +51,7 @@ def report(args: argparse.Namespace) -> int:
         write_csv(reports, args.csv)
         console.print(f"tables in {args.csv}")
     if args.html:
-        from service.cli.report_page import page  # draws, which takes a while to import
+        from service.report.page import page  # draws, which takes a while to import
 
         with progress("drawing", unit="recordings", total=len(reports)) as done:
             args.html.write_text(page(reports, progress=done), encoding="utf-8")

@@ -11,12 +11,13 @@ from typing import Any
 
 import msgspec
 
-from service.cli.usage import SHIPPED_SKILL, UsageError
+from service.cli.usage import UsageError
 from service.config import Settings, converted, load
+from service.daemon import daemon
 from service.described_arm import SettingsError
-from service.recorder.client import Scribe
-from service.recorder.folder import skills_folder
-from service.shell import daemon
+from service.recording.client import Scribe
+from service.recording.paths import skills_folder
+from service.shipped import SHIPPED_SKILL
 
 
 def serve(args: argparse.Namespace) -> int:

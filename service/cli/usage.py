@@ -1,6 +1,4 @@
-"""What the commands share: the error of a command line that cannot be meant, and where the shipped
-files are, and free ports.
-"""
+"""What the commands share: the error of a command line that cannot be meant."""
 
 from __future__ import annotations
 
@@ -8,17 +6,14 @@ import argparse
 import difflib
 import os
 import re
-import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from service.contract.requests import Add, ViaPoint
-    from service.core.skill import Skill
 
 CONNECT_TIMEOUT_S = 3.0
-SHIPPED_SKILL = "soldering.npz"
 
 
 class UsageError(ValueError):
@@ -74,25 +69,3 @@ def places_in(path: Path) -> tuple[ViaPoint, ...]:
         return added_in(path).points
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
-
-
-def recordings() -> Path:
-    """The folder of the shipped recordings and their skill."""
-    from service.recorder.folder import shipped_folder  # heavy
-
-    return shipped_folder()
-
-
-def shipped() -> Skill:
-    """The skill that the service runs unless told otherwise."""
-    from service.learning.skill_file import decoded  # heavy, and most commands do without
-
-    path = recordings() / SHIPPED_SKILL
-    return decoded(path.read_bytes(), origin=str(path))
-
-
-def free_port() -> int:
-    """A port of this machine that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -5,7 +5,6 @@ running daemon, in a window or a browser, or a picture taken without a screen.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import io
 import math
 import os
@@ -26,15 +25,16 @@ from PIL import Image
 
 from service.cli.clients import ask
 from service.cli.progress import progress
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, free_port
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
 from service.client import Client, open_session
 from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
+from service.launch import free_port
 from service.network_settings import is_local
-from service.recorder.arrangement import TABS, TIMELINE
-from service.recorder.recording import THINGS, Recording
-from service.recorder.sinks import Viewer, ViewerError
-from service.recorder.steps import Gap
+from service.recording.recording import THINGS, Recording
+from service.recording.steps import Gap
+from service.viewer.blueprint import TABS, TIMELINE
+from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
 TITLE_BAR, TINT = 30, 40  # pixels that a window's bar has at least; differences of colour that are none
@@ -98,7 +98,7 @@ def _serve(args: argparse.Namespace, url: str) -> int:
         open_session(
             connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
         ) as session,
-        web_viewer(executable(), url, free_port()) as viewer,
+        web_viewer(rerun_program(), url, free_port()) as viewer,
     ):
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.ask("status"))
@@ -204,7 +204,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
     try:
         with ViewerClient.spawn(
-            headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(executable())
+            headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(rerun_program())
         ) as client:
             client.open(str(source if live else Path(source).absolute()))
             _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
@@ -281,7 +281,7 @@ def show(source: str | Path) -> int:
     """
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
-    return subprocess.run([executable(), "--bind", "127.0.0.1", str(source)], check=False).returncode
+    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", str(source)], check=False).returncode
 
 
 def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
@@ -310,11 +310,3 @@ def _wait(done: Callable[[], bool], timeout_s: float = 30.0) -> None:
         if clock.monotonic() > deadline:
             return
         clock.sleep(0.3)
-
-
-def executable() -> Path:
-    """The Rerun program that came with the library: it need not be on the path."""
-    found = importlib.util.find_spec("rerun_cli")
-    if found is None or found.origin is None:
-        raise ViewerError("the Rerun program is not installed: pip install rerun-sdk")
-    return Path(found.origin).with_name("rerun.exe" if sys.platform == "win32" else "rerun")

@@ -14,7 +14,8 @@ import numpy as np
 
 from service.config import Settings
 from service.contract.records import SIDES, Flag, Mode, Reason
-from service.core.arm import Arm, Kinematics
+from service.core.arm.arm import Arm, Kinematics
+from service.core.arm.inverse_kinematics import measured_error, slow_down
 from service.core.frame import (
     Frame,
     Lap,
@@ -30,15 +31,14 @@ from service.core.frame import (
     no_lap,
     state_layout,
 )
-from service.core.intake import Intake
-from service.core.inverse_kinematics import measured_error, slow_down
-from service.core.limiter import Limited, Limiter
-from service.core.orientation_setpoint import OrientationSetpoint
-from service.core.pose import NO_GRIPPER, decided
-from service.core.separation import Separation
-from service.core.setpoint import WRONG, SetpointGenerator
-from service.core.skill import Prediction, Skill
-from service.core.workspace import Target, clamp
+from service.core.intake.intake import Intake
+from service.core.limiter.limiter import Limited, Limiter
+from service.core.separation.separation import Separation
+from service.core.setpoint.orientation import OrientationSetpoint
+from service.core.setpoint.setpoint import WRONG, SetpointGenerator
+from service.core.setpoint.workspace import Target, clamp
+from service.core.skill.pose import NO_GRIPPER, decided
+from service.core.skill.skill import Prediction, Skill
 
 READY, RETURNING = 1, 2  # of an arm: within its limits, on its way into them
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
@@ -97,7 +97,7 @@ class Controller:
         """A copy of all that the next frame depends on, but for settings and skill."""
         return copied(self._state)
 
-    def imitate(self, other: Controller) -> None:
+    def copy_from(self, other: Controller) -> None:
         """Takes over what another controller with the same settings remembers, and its skill."""
         if self._skill is not other._skill:
             self._adopt(other._skill)
@@ -305,7 +305,7 @@ class Controller:
         They brake where the tool would pass its greatest speed, and one that does all the same is a
         fault; and where they would approach something too fast, unless that brakes less.
         """
-        state, fastest = self._state, self._settings.tool.max_speed
+        state, max_speed = self._state, self._settings.tool.max_speed
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted)
         limited, excess = moved.limited, self._apart.excess(*moved[1:3], self._jerk)
@@ -314,10 +314,10 @@ class Controller:
             stop = self._limiter.stop(q, dq, ddq)
             stopped = self._apart.excess(*stop[1:3], self._jerk) < excess
             moved, limited = (stop, True) if stopped else (moved, limited)
-        if self._comes_to(moved) > fastest:
+        if self._comes_to(moved) > max_speed:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             speed = self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[0]
-            if speed > fastest:
+            if speed > max_speed:
                 self.measured = self.measured[0], speed
                 state["mode"], state["reason"] = FAULT, Reason.TOOL_SPEED
         state["joints"] = moved[:3]
@@ -327,9 +327,9 @@ class Controller:
         """The greatest speed [m/s] that the tool comes to if the joints stop after a step; near the
         limit also as the arm will stand then, for what joints do to the tool changes on the way.
         """
-        fastest = self._settings.tool.max_speed
+        max_speed = self._settings.tool.max_speed
         speed = self._arm.speeds(self._arm_at(moved.position), *moved[1:3])[1]
-        if not NEAR_SPEED * fastest < speed <= fastest:
+        if not NEAR_SPEED * max_speed < speed <= max_speed:
             return speed
         stop = self._limiter.stop(*moved[:3])
         return max(speed, self._arm.speeds(self._arm.at(stop.position), *stop[1:3])[1])

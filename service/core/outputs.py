@@ -8,7 +8,7 @@ from service.contract import cdr
 from service.contract.channels import Channel, sent_by_the_loop
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.core.frame import Frame
-from service.core.pose import CLOSED, UNKNOWN
+from service.core.skill.pose import CLOSED, UNKNOWN
 
 
 def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Iterator[tuple[Channel, bytes]]:

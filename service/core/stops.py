@@ -15,22 +15,24 @@ LEAST_SHARE, HALVINGS = 1e-3, 40  # of its acceleration with which an axis waits
 
 
 @compiled
-def fastest_stop(velocity: float, acceleration: float, hardest: float, sharpest: float, dt: float, out: Vector) -> None:
-    """The fastest stop of one axis, at most `hardest` in acceleration and `sharpest` in jerk.
+def fastest_stop(
+    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float, dt: float, out: Vector
+) -> None:
+    """The fastest stop of one axis within `max_acceleration` and `max_jerk`.
 
     out (6,): velocity, acceleration and way after dt, least and greatest way until rest, duration.
     """
-    then = velocity + acceleration * abs(acceleration) / (2.0 * sharpest)
+    then = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
     sign = -1.0 if then > 0.0 else 1.0  # with it the stop is a push in positive direction
     v, a = sign * velocity, sign * acceleration
-    peak = math.sqrt(max(0.5 * a * a - sharpest * v, 0.0))
+    peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
     hold = 0.0
-    if a > hardest:  # beyond its limit it comes down to that first
-        peak = hardest
-        hold = max(-v - a * a / (2.0 * sharpest), 0.0) / hardest
-    elif peak > hardest:
-        peak = hardest
-        hold = (-v + (a * a - 2.0 * hardest * hardest) / (2.0 * sharpest)) / hardest
+    if a > max_acceleration:  # beyond its limit it comes down to that first
+        peak = max_acceleration
+        hold = max(-v - a * a / (2.0 * max_jerk), 0.0) / max_acceleration
+    elif peak > max_acceleration:
+        peak = max_acceleration
+        hold = (-v + (a * a - 2.0 * max_acceleration * max_acceleration) / (2.0 * max_jerk)) / max_acceleration
     else:
         peak = max(peak, a)
     x = t = low = high = 0.0
@@ -38,11 +40,11 @@ def fastest_stop(velocity: float, acceleration: float, hardest: float, sharpest:
     after_x = after_v = after_a = 0.0
     for phase in range(3):
         if phase == 0:
-            jerk, lasts = (sharpest, (peak - a) / sharpest) if a <= peak else (-sharpest, (a - peak) / sharpest)
+            jerk, lasts = (max_jerk, (peak - a) / max_jerk) if a <= peak else (-max_jerk, (a - peak) / max_jerk)
         elif phase == 1:
             jerk, lasts = 0.0, hold
         else:
-            jerk, lasts = -sharpest, peak / sharpest
+            jerk, lasts = -max_jerk, peak / max_jerk
         if lasts <= 0.0:
             continue
         if not found and dt <= t + lasts:
@@ -74,7 +76,9 @@ def fastest_stop(velocity: float, acceleration: float, hardest: float, sharpest:
 
 
 @compiled
-def stop_together(velocities: Vector, accelerations: Vector, hardest: Vector, sharpest: Vector, dt: float) -> Vector:
+def stop_together(
+    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, dt: float
+) -> Vector:
     """One dt of a stop at whose end all axes (J,) come to rest at once, as soon as the slowest can.
 
     (3, J): ways, velocities, accelerations. The others brake less than they could, so that what
@@ -84,18 +88,18 @@ def stop_together(velocities: Vector, accelerations: Vector, hardest: Vector, sh
     out, stop = np.zeros((3, count)), np.zeros(6)
     duration = 0.0
     for i in range(count):
-        fastest_stop(velocities[i], accelerations[i], hardest[i], sharpest[i], dt, stop)
+        fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], dt, stop)
         duration = max(duration, stop[5])
     for i in range(count):
         low, share = LEAST_SHARE, 1.0
         if velocities[i] != 0.0 or accelerations[i] != 0.0:
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + share)
-                fastest_stop(velocities[i], accelerations[i], middle * hardest[i], sharpest[i], dt, stop)
+                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], dt, stop)
                 if stop[5] <= duration:
                     share = middle
                 else:
                     low = middle
-        fastest_stop(velocities[i], accelerations[i], share * hardest[i], sharpest[i], dt, stop)
+        fastest_stop(velocities[i], accelerations[i], share * max_acceleration[i], max_jerk[i], dt, stop)
         out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
     return out

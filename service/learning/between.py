@@ -16,11 +16,11 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint
-from service.core.between import Placed, with_hands
 from service.core.frame import Vector
-from service.core.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
-from service.core.rest import rested
-from service.core.skill import LearnedBetween
+from service.core.intake.stillness import rested
+from service.core.skill.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
+from service.core.skill.skill import LearnedBetween
+from service.core.skill.task_parameterized import Placed, with_hands
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, Gate, between, nonsense

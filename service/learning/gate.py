@@ -12,7 +12,7 @@ import numpy as np
 
 from kmp import KMP, Gaussians
 from service.core.frame import Vector
-from service.core.skill import standard_deviations
+from service.core.skill.skill import standard_deviations
 from service.learning.skill_file import HIGHEST_GATE_M
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach

@@ -13,7 +13,7 @@ import numpy as np
 from service.config import Reach
 from service.contract.messages import BASE
 from service.core.frame import Vector
-from service.core.workspace import is_reachable
+from service.core.setpoint.workspace import is_reachable
 from service.learning.choice import REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate

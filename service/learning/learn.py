@@ -16,8 +16,8 @@ import numpy as np
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
 from service.core.frame import Vector
-from service.core.places import Task
-from service.core.skill import LearnedBetween, Skill
+from service.core.skill.places import Task
+from service.core.skill.skill import LearnedBetween, Skill
 from service.learning.between import Told, learned, places_never_reached, task_of
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase

@@ -18,8 +18,8 @@ from kmp import KMP, GaussianKernel, Gaussians
 from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector
-from service.core.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from service.core.rotation import angles
+from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from service.learning.choice import Choice, Parameters, rms
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned

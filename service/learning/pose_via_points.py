@@ -14,9 +14,9 @@ from kmp import KMP, Gaussians
 from kmp.orientation import OrientationKMP, log
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
-from service.core.pose import LearnedGripper, LearnedOrientation
 from service.core.rotation import angles
-from service.core.skill import Skill
+from service.core.skill.pose import LearnedGripper, LearnedOrientation
+from service.core.skill.skill import Skill
 from service.learning.pose import flat_gripper, flat_orientation, is_flat
 from service.learning.skill_file import SkillError
 

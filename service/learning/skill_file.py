@@ -23,9 +23,9 @@ from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import Name, ViaPoint
-from service.core.places import MOST_CORNERS, Places, Task
-from service.core.pose import LearnedGripper, LearnedOrientation
-from service.core.skill import LearnedBetween, Skill
+from service.core.skill.places import MOST_CORNERS, Places, Task
+from service.core.skill.pose import LearnedGripper, LearnedOrientation
+from service.core.skill.skill import LearnedBetween, Skill
 
 # The second holds what was found in learning, the third is of a skill between places, the fourth
 # has orientation or gripper, and may be one between places; a skill of the first stays one, to the

@@ -15,8 +15,8 @@ import numpy as np
 from kmp import Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
-from service.core.skill import Skill
-from service.core.taught import NEIGHBOURS, neighbourhoods
+from service.core.skill.skill import Skill
+from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, with_file
 
@@ -90,7 +90,7 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
     )
 
 
-def misgivings(before: Skill, after: Skill) -> tuple[str, ...]:
+def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
     """What is to be said where one skill takes another's place: which via-points are missed, and
     which that were there already are moved, by more than 5 mm.
     """

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from service.contract.requests import TOLERANCE_M
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from service.contract.requests import TOLERANCE_M
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.via_points import adapted

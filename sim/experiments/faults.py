@@ -1,7 +1,7 @@
 """What happens when something fails: each fault struck for real while the tool is fast, and what it
 cost.
 
-A service, its scribe and workshop, a tracker, and the network between them are processes; PyBullet
+A service, its scribe and skill worker, a tracker, and the network are processes; PyBullet
 is the arm. Taken are when the service decided to stop (from its recording), when the tool came to
 rest and how far it went until then (from the arm), how far it was told to (from the commands that
 left the service), and how many ticks the recording lacks.
@@ -27,8 +27,8 @@ from service.client import RefusedError
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.records import Mode, Reason
-from service.core.arm import Arm
-from service.recorder.recording import Recording
+from service.core.arm.arm import Arm
+from service.recording.recording import Recording
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
 from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
 from sim.parts import PartError
@@ -73,9 +73,9 @@ def _end_the_service(cell: FaultyCell) -> None:
 
 
 def _kill_the_workshop_at_work(cell: FaultyCell) -> None:
-    workshop = cell.child("workshop")
-    os.kill(workshop, signal.SIGSTOP)  # so it is at work when it is killed
-    threading.Timer(0.2, os.kill, [workshop, signal.SIGKILL]).start()
+    skill_worker = cell.child("skill worker")
+    os.kill(skill_worker, signal.SIGSTOP)  # so it is at work when it is killed
+    threading.Timer(0.2, os.kill, [skill_worker, signal.SIGKILL]).start()
     place = {"name": "p", "left": [0.62, -0.28, 0.3], "right": [0.98, 0.32, 0.06], "tool": [0.54, -0.28, 0.38]}
     with contextlib.suppress(RefusedError):
         cell.client.ask("via_points", {"op": "add", "points": [place]})
@@ -111,7 +111,7 @@ FAULTS = {
     "network to the tracker torn": Fault(_signal("to_tracker", KILL), _begin_anew("to_tracker")),
     "network to the arm silent": Fault(_signal("to_arm", STOP), _and_reset(_signal("to_arm", CONT))),
     "network to the arm torn": Fault(_signal("to_arm", KILL), _and_reset(_begin_anew("to_arm"))),
-    "workshop killed": Fault(_kill_the_workshop_at_work, stops=False),
+    "skill worker killed": Fault(_kill_the_workshop_at_work, stops=False),
     "scribe killed": Fault(_stop_or_kill("scribe", KILL), _until_recorded, stops=False, lasts_s=3.0),
     "scribe stopped": Fault(_stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S),
     "disk full": Fault(_fill_the_disk, _empty_the_disk, stops=False, lasts_s=3.0),

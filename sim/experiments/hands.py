@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.cli.usage import shipped
 from service.contract.records import Mode
 from service.learning.demonstration import Demonstration
-from service.recorder.recording import Recording
+from service.recording.recording import Recording
+from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.beside_the_paper import differences
@@ -116,7 +116,7 @@ def _recorded(path: Path) -> Traces:
 
 
 def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
-    skill = shipped()
+    skill = shipped_skill()
     adapt = rivals.ours(skill)(drawn.scene) if taught else lambda bench: skill
     seen = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
     began = int(np.argmax(seen.time_s > 0))
@@ -197,7 +197,7 @@ def _draw_stages(results: Results) -> None:
             shots.append((colours, matrix, Traces(path[:, 0], path[:, 1], path[:, 2])))
             so_far.clear()
 
-    rehearse(MOVED.script(), rivals.ours(shipped())(scene), rate_hz=250, look=look)
+    rehearse(MOVED.script(), rivals.ours(shipped_skill())(scene), rate_hz=250, look=look)
     plt = pyplot()
     figure, grid = plt.subplots(2, 2, figsize=(9, 6.6))
     for axes, (colours, matrix, traces), title in zip(grid.flat, shots, titles, strict=True):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from sim.experiments.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 

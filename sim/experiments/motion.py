@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 import rerun as rr
 
-from service.cli.usage import recordings
 from service.config import Settings
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
+from service.shipped import recordings
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
 from sim.experiments.linear_floor import Floor, best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops

@@ -14,11 +14,11 @@ import numpy as np
 import rerun as rr
 
 from kmp.orientation import exp, log, multiplied
-from service.cli.usage import shipped
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.learn import learn
 from service.learning.via_points import adapted
+from service.shipped import shipped_skill
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
@@ -49,7 +49,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     nominal = scenes["nominal"]
     fixed = rehearse(
         HandScript(nominal, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M),
-        lambda bench: adapted(shipped(), nominal.via_points(), tolerance=TOLERANCE_M),
+        lambda bench: adapted(shipped_skill(), nominal.via_points(), tolerance=TOLERANCE_M),
         rate_hz=RATE_HZ,
         keep=True,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.cli.usage import shipped
+from service.shipped import shipped_skill
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
@@ -24,7 +24,7 @@ SETTLED_S = 0.3  # after the hands have stopped
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     rate_hz = RATE_HZ if options.share == 1 else 250
-    skill, scene = shipped(), Scene()
+    skill, scene = shipped_skill(), Scene()
     adapts = {"ours": rivals.ours(skill), "promp": rivals.promp(skill, demonstrated(5))}
     runs: dict[str, Rehearsed] = {}
     progress: dict[str, Array] = {}

@@ -15,7 +15,7 @@ from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop

@@ -20,10 +20,10 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
-from service.core.pose import NO_GRIPPER, Turn
-from service.core.rest import RESTING
-from service.core.skill import Known, Prediction, Skill
-from service.core.taught import neighbourhoods
+from service.core.intake.stillness import RESTING
+from service.core.skill.pose import NO_GRIPPER, Turn
+from service.core.skill.skill import Known, Prediction, Skill
+from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.via_points import adapted
 from sim.bench import Bench
@@ -253,7 +253,7 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
             "ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    primitive.imitate([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
+    primitive.copy_from([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
         primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))

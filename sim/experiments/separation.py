@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from kmp.compiled import compiled
-from service.cli.usage import shipped
 from service.config import Settings, robot_description
 from service.contract.records import Flag
-from service.core.body import body_of
-from service.core.capsules import between_segments, place
-from service.core.separation import SLIP, Separation, allowed_speed
+from service.core.separation.body import body_of
+from service.core.separation.capsules import between_segments, place
+from service.core.separation.separation import SLIP, Separation, allowed_speed
+from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
@@ -131,7 +131,7 @@ def run_one(task: tuple[str, int]) -> Outcome:
                 (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
             )
 
-    skill_for = rivals.ours(shipped())(drawn.scene)
+    skill_for = rivals.ours(shipped_skill())(drawn.scene)
     if kind == "unheeded":
         with patch.object(Separation, "look"):
             done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)

@@ -17,8 +17,8 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.skill import Skill
-from service.core.taught import neighbourhoods
+from service.core.skill.skill import Skill
+from service.core.skill.via_points import neighbourhoods
 from service.learning.learn import learn
 from service.learning.via_points import adapted
 from sim.experiments.results import Array

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rerun as rr
 
-from service.cli.usage import shipped
+from service.shipped import shipped_skill
 from sim.bench import TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
@@ -59,7 +59,7 @@ def prepare() -> None:
     """Learns what each method needs, once in a process."""
     if _adapts:
         return
-    skill, demonstrations = shipped(), demonstrated(DEMONSTRATIONS)
+    skill, demonstrations = shipped_skill(), demonstrated(DEMONSTRATIONS)
     _adapts["ours"] = rivals.ours(skill)
     _adapts["none"] = rivals.of_model(skill, NoDemonstrations(ell=ELL))
     _adapts["look_up"] = rivals.of_model(skill, LookUp())

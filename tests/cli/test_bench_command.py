@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from cell import thirdhand
 
-from service.cli import loads, soak
-from service.recorder.replay import replay
+from service.recording.replay import replay
+from service.timing import loads, soak
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.timed]
 QUIET = {"say": lambda line: None}
@@ -25,7 +25,7 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
     assert sum(report["whole"]["work_counts"]) == pytest.approx(500, abs=50)
     stages = sum(one["p50"] for one in report["whole"]["stages_us"].values())
     assert 0.2 < stages / report["whole"]["work_us"]["p50"] < 1.1
-    assert {"daemon", "scribe", "workshop"} == set(report["whole"]["processes"])
+    assert {"daemon", "scribe", "skill worker"} == set(report["whole"]["processes"])
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert replay(next(tmp_path.glob("*.mcap"))).exact
     assert next(tmp_path.glob("*.rrd")).stat().st_size > 10_000
@@ -55,7 +55,7 @@ def test_a_leak_is_told_from_noise() -> None:
 
 def test_soak_reports_each_process() -> None:
     report = soak.run(0.12, 500, **QUIET)
-    assert set(report["processes"]) == {"daemon", "scribe", "workshop"}
+    assert set(report["processes"]) == {"daemon", "scribe", "skill worker"}
     assert report["lost"] == report["restarts"] == 0
     assert "MB/h" in soak.text(report)
 

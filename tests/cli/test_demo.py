@@ -77,7 +77,7 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     (scribe,) = (
         process
         for process in psutil.Process(demo.pid).children(recursive=True)
-        if "service.recorder.process" in process.cmdline()
+        if "service.recording.process" in process.cmdline()
     )
     scribe.kill()
     out, _ = demo.communicate(timeout=100)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cell import thirdhand
 
+from service.demonstrations.files import write_demonstration
 from service.learning.skill_file import decoded
-from service.recorder.demonstrations import write_demonstration
 from sim.scene import Scene
 from sim.teach import demonstrations
 

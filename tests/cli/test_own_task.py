@@ -15,8 +15,8 @@ import pytest
 from tests_paths import ROOT
 
 from service.cli.main import main
-from service.cli.usage import free_port
 from service.contract.channels import ENDPOINT
+from service.launch import free_port
 from service.learning.skill_file import decoded
 from sim import teach
 

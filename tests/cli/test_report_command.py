@@ -16,10 +16,10 @@ from wam import STATE
 
 from service import palette
 from service.cli.main import main
-from service.cli.report_page import thinned
 from service.config import Settings
 from service.core.frame import blank
-from service.recorder.recording import Recorder, Recording
+from service.recording.recording import Recorder, Recording
+from service.report.page import thinned
 
 GOLDEN = RECORDINGS / "golden.mcap"
 

@@ -20,7 +20,7 @@ from tests_paths import RECORDINGS
 from wam import URDF
 
 from service.contract.records import SIDES, Cause, Mode
-from service.core.arm import Arm
+from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, order
 from service.learning.skill_file import decoded
@@ -97,7 +97,7 @@ def test_the_tool_keeps_its_speed_following_and_stopping(kind: str, spread_m: fl
 @example_settings(max_examples=MANY, deadline=None, derandomize=True)
 @given(st.floats(0.1, 1.5), st.floats(0.0, 0.003), st.floats(30.0, 500.0), LOOPS, st.integers(0, 10**6))
 def test_a_legal_hand_never_faults_nor_jumps_and_hardly_holds(
-    fastest: float, noise_m: float, rate_hz: float, loop_hz: int, seed: int
+    max_speed: float, noise_m: float, rate_hz: float, loop_hz: int, seed: int
 ) -> None:
     """Reaches there and back at up to 1.5 m/s, with noise, late samples and dropouts of 30 to 90
     ms.
@@ -107,7 +107,7 @@ def test_a_legal_hand_never_faults_nor_jumps_and_hardly_holds(
     controller, ticks = Controller(settings, SKILL, urdf=URDF), round(SECONDS * loop_hz)
     way = random.standard_normal((2, 3))
     way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
-    lasts = 1.875 * np.linalg.norm(way, axis=1).max() / fastest  # of a minimum-jerk reach
+    lasts = 1.875 * np.linalg.norm(way, axis=1).max() / max_speed  # of a minimum-jerk reach
     stamps = np.arange(0.0, SECONDS, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
     for at in random.uniform(0.0, SECONDS, 2):

@@ -19,9 +19,9 @@ from wam import JOINT_NAMES, URDF
 
 from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
-from service.core.arm import Arm
-from service.core.limiter import Limiter
-from service.core.workspace import clamp
+from service.core.arm.arm import Arm
+from service.core.limiter.limiter import Limiter
+from service.core.setpoint.workspace import clamp
 
 Vector = npt.NDArray[np.float64]
 

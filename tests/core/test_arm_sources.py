@@ -19,7 +19,7 @@ from service.config import Settings
 from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 
 SETTINGS = Settings()
 POSTURE = SETTINGS.arm.posture

@@ -17,7 +17,7 @@ from service.contract.records import Flag, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
 from service.core.outputs import outgoing
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import TOOL_FROM_HAND, Scene
@@ -322,7 +322,7 @@ def test_a_twin_decides_the_same_and_leaves_the_other_alone(taught: Skill) -> No
     for tick in ticks[:-1]:
         controller.step(tick)
     before = controller.state.tobytes()
-    twin.imitate(controller)
+    twin.copy_from(controller)
     seen = twin.step(ticks[-1])
     assert controller.state.tobytes() == before
     assert controller.step(ticks[-1]).tobytes() == seen.tobytes()

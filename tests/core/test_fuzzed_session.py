@@ -18,8 +18,8 @@ from service.contract.records import Mode
 from service.contract.requests import RequestError
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, order
-from service.core.skill import Skill
-from service.recorder.recording import Recorder
+from service.core.skill.skill import Skill
+from service.recording.recording import Recorder
 
 SETTINGS = Settings()
 SECONDS, EVERY = 12.0, 5  # between samples [ticks]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from service.core.inverse_kinematics import (
+from service.core.arm.inverse_kinematics import (
     DAMPING,
     GAP_FREE,
     GAP_SLOW,

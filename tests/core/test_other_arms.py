@@ -13,13 +13,13 @@ from in_process import frames, ticks_of
 
 from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
-from service.core.arm import Arm
+from service.core.arm.arm import Arm
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.learn import learn
-from service.recorder.recording import Recorder
-from service.recorder.replay import replay
+from service.recording.recording import Recorder
+from service.recording.replay import replay
 from sim.scene import Scene
 from sim.script import HandScript
 from sim.teach import demonstrations

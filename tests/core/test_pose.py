@@ -16,15 +16,15 @@ from wam import FRAME, URDF
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.config import Settings
 from service.contract import cdr
-from service.core.arm import Arm
+from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import blank, state_layout
-from service.core.limiter import Limiter
-from service.core.orientation_setpoint import SPEED_SHARE, OrientationSetpoint
+from service.core.limiter.limiter import Limiter
 from service.core.outputs import outgoing
-from service.core.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
 from service.core.rotation import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
-from service.core.skill import Skill
+from service.core.setpoint.orientation import SPEED_SHARE, OrientationSetpoint
+from service.core.skill.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
+from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.core.frame import Vector
-from service.core.rest import rested
+from service.core.intake.stillness import rested
 
 HZ = 125
 

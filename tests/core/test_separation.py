@@ -19,14 +19,14 @@ from wam import URDF
 
 from service.config import Box, Obstacles, Settings, Table
 from service.contract.records import Flag, Mode
-from service.core.arm import Arm
-from service.core.body import body_of
-from service.core.capsules import between_segments, nearest_to_box, place, to_box
+from service.core.arm.arm import Arm
+from service.core.arm.least_squares import keep_under, least_squares
 from service.core.controller import Controller, start_state
 from service.core.frame import Tick, Vector
-from service.core.least_squares import keep_under, least_squares
-from service.core.separation import SLIP, Separation, allowed_speed
-from service.core.skill import Skill
+from service.core.separation.body import body_of
+from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
+from service.core.separation.separation import SLIP, Separation, allowed_speed
+from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from sim.experiments.separation import _measure
 from sim.scene import Scene

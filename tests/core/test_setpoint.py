@@ -17,11 +17,11 @@ from wam import STATE
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
 from service.core.frame import Vector, blank
-from service.core.intake import Intake
-from service.core.setpoint import SetpointGenerator, stop_distance, tracker_gains
-from service.core.setpoint_bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
+from service.core.intake.intake import Intake
+from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
+from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
+from service.core.setpoint.workspace import Target
 from service.core.stops import fastest_stop
-from service.core.workspace import Target
 
 PERIOD_S = 0.002
 TOOL = ToolSettings()
@@ -201,25 +201,25 @@ def test_a_setpoint_that_passed_a_bound_is_found() -> None:
 @properties
 @given(st.floats(-0.8, 0.8), st.floats(-4.0, 4.0), st.floats(0.5, 4.0), st.floats(20.0, 200.0))
 def test_the_fastest_stop_of_an_axis_is_that_of_another_implementation(
-    velocity: float, acceleration: float, hardest: float, sharpest: float
+    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float
 ) -> None:
-    acceleration = max(-hardest, min(hardest, acceleration))
-    profile = ruckig_stop(velocity, acceleration, hardest, sharpest)
+    acceleration = max(-max_acceleration, min(max_acceleration, acceleration))
+    profile = ruckig_stop(velocity, acceleration, max_acceleration, max_jerk)
     out = np.empty(6)
-    fastest_stop(velocity, acceleration, hardest, sharpest, PERIOD_S, out)
+    fastest_stop(velocity, acceleration, max_acceleration, max_jerk, PERIOD_S, out)
     position, speed, change = (value[0] for value in profile.at_time(min(PERIOD_S, profile.duration)))
     np.testing.assert_allclose(out[:3], [speed, change, position], atol=1e-7)
     extrema = profile.position_extrema[0]
     np.testing.assert_allclose(out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0), profile.duration], atol=1e-7)
 
 
-def ruckig_stop(velocity: float, acceleration: float, hardest: float, sharpest: float) -> ruckig.Trajectory:
+def ruckig_stop(velocity: float, acceleration: float, max_acceleration: float, max_jerk: float) -> ruckig.Trajectory:
     """Ruckig's stop of one axis from 0."""
     question, profile = ruckig.InputParameter(1), ruckig.Trajectory(1)
     question.control_interface = ruckig.ControlInterface.Velocity
     question.current_velocity, question.current_acceleration = [velocity], [acceleration]
     question.target_velocity = [0.0]
-    question.max_velocity, question.max_acceleration, question.max_jerk = [9.0], [hardest], [sharpest]
+    question.max_velocity, question.max_acceleration, question.max_jerk = [9.0], [max_acceleration], [max_jerk]
     ruckig.Ruckig(1).calculate(question, profile)
     return profile
 

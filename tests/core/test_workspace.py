@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from service.config import Reach
 from service.core.frame import Vector
-from service.core.workspace import clamp, is_reachable
+from service.core.setpoint.workspace import clamp, is_reachable
 
 REACH = Reach()
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])

@@ -6,7 +6,7 @@ import pytest
 from taught_scene import PLACES, demonstrated, quickly
 from tests_paths import RECORDINGS
 
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from sim.scene import Scene

@@ -14,14 +14,14 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.between import _nearest
-from service.core.places import MOST_CORNERS
-from service.core.skill import Skill
+from service.core.skill.places import MOST_CORNERS
+from service.core.skill.skill import Skill
+from service.core.skill.task_parameterized import _nearest
 from service.learning.between import places_never_reached, task_of
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
-from service.learning.via_points import adapted, in_force, misgivings
+from service.learning.via_points import adapted, in_force, warnings_of
 from sim.teach import by_people
 
 AT_REST = np.zeros(6)
@@ -107,7 +107,7 @@ def test_a_via_point_of_another_name_is_added_and_forgotten(between: Skill, show
     assert max(missed.values()) < 0.01
     back = adapted(aimed, places, tolerance=0.05)
     assert back.file == adapted(between, places, tolerance=0.05).file
-    assert misgivings(back, back) == ()
+    assert warnings_of(back, back) == ()
 
 
 def test_shares_are_those_of_the_nearest_point_between_the_places() -> None:

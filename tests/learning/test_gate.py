@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from taught_scene import PLACES, demonstrated, deviations
 
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, HELD_OUT_TIMES, nonsense
 from service.learning.learn import learn

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from taught_scene import demonstrated, deviations, error_m, quickly
 
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import mean_orientation

@@ -10,15 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from taught_scene import PLACES, SCENE
 
-from service.cli.usage import shipped
 from service.contract.requests import RequestError, ViaPoint, decode_request
 from service.core.frame import Vector
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import learned_pose
 from service.learning.skill_file import SkillError, decoded
 from service.learning.via_points import adapted, in_force
+from service.shipped import shipped_skill
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
 
@@ -97,7 +97,7 @@ def test_places_teach_orientation_and_gripper_and_give_them_back(posed: Skill, s
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
     told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
     hands, still = np.array([*told.left, *told.right]).reshape(2, 3), np.zeros((2, 3))
-    for one in (posed, skill, shipped()):  # the last is between places
+    for one in (posed, skill, shipped_skill()):  # the last is between places
         taught = adapted(one, (*PLACES[:2], told), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad

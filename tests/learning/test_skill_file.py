@@ -16,7 +16,7 @@ from taught_scene import PLACES
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import SkillError, decoded, with_file

@@ -12,9 +12,9 @@ import pytest
 from taught_scene import HANDOVER, PLACES, with_hands
 
 from service.contract.requests import ViaPoint
-from service.core.skill import Skill
+from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted, in_force, misgivings
+from service.learning.via_points import adapted, in_force, warnings_of
 
 
 def test_places_are_met(aimed: Skill) -> None:
@@ -88,8 +88,8 @@ def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill
 
 
 def test_places_that_are_met_and_move_none_give_no_misgivings(learned: Skill, aimed: Skill) -> None:
-    assert misgivings(learned, aimed) == ()
-    assert misgivings(aimed, aimed) == ()
+    assert warnings_of(learned, aimed) == ()
+    assert warnings_of(aimed, aimed) == ()
 
 
 def test_a_place_that_is_missed_and_one_that_is_moved_are_told_of_by_name(aimed: Skill) -> None:
@@ -97,9 +97,9 @@ def test_a_place_that_is_missed_and_one_that_is_moved_are_told_of_by_name(aimed:
     after = adapted(aimed, (*PLACES, loose), tolerance=0.05)
     missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")
     assert missed > 0.005
-    assert f"via-point 'loose' is missed by {1000 * missed:.0f} mm" in misgivings(aimed, after)[0]
+    assert f"via-point 'loose' is missed by {1000 * missed:.0f} mm" in warnings_of(aimed, after)[0]
 
     soft = moved(HANDOVER, "soft", hands=0.0, tool=0.0, radius=0.0, std=0.02)
     first = adapted(aimed, (soft,), tolerance=0.05)
     then = adapted(aimed, (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)), tolerance=0.05)
-    assert any("via-point 'soft' is moved by" in text for text in misgivings(first, then))
+    assert any("via-point 'soft' is moved by" in text for text in warnings_of(first, then))

@@ -24,7 +24,7 @@ from wam import JOINT_NAMES
 from service.client import endpoints, open_session
 from service.config import WAM
 from service.contract import cdr, channels, messages
-from service.core.pose import CLOSED, OPEN
+from service.core.skill.pose import CLOSED, OPEN
 from service.learning.learn import learn
 from service.learning.via_points import adapted
 from sim.bench import Bench, Observation

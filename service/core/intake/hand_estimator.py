@@ -1,0 +1,259 @@
+"""A hand's position, velocity and acceleration from its tracker's samples, whatever the tracker's
+noise.
+
+An interacting-multiple-model filter (Blom and Bar-Shalom, IEEE TAC 33(8), 1988) of three modes that
+differ only in how much the motion changes: rest, reach, change. Each is a Kalman filter of
+position, velocity and acceleration, with acceleration and velocity that revert to 0,
+
+    dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
+
+and all share one noise variance, estimated from the third differences of the samples: smooth motion
+leaves nothing in them, white noise of variance r leaves 20 r an axis.
+
+Arrays of one hand: means (3, 3, 3) by mode, then position, velocity and acceleration [m, m/s,
+m/s²], by axis; covariances (3, 3, 3) by mode, alike for the axes; modes (3,) their probabilities;
+noise (4,) the variance [m²], how many past samples are evenly spaced (0 to 3), their interval [s],
+and how many differences have been averaged; past (3, 3) those samples [m], newest first.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from scipy.linalg import expm
+
+from kmp.compiled import compiled
+from service.core.frame import Record, Records, Vector, as_array
+from service.core.intake.stillness import RESTING, rest_on, shares
+
+MODES = 3
+REVERT_A, REVERT_V = 15.0, 100.0  # [1/s], [1/s²]
+INTENSITY = np.array([0.03, 3.0, 30.0])  # [m²/s⁵] of the modes
+PRIOR = np.array([0.4, 0.4, 0.2])  # their probabilities, when nothing is known
+SWITCH_RATE = 3.0  # [1/s] at which a mode is left
+LEAST_NOISE, MOST_NOISE = 7e-4, 5e-2  # [m] bounds of its standard deviation; below the least, hands tremble
+AVERAGED = 60.0  # samples over which the noise is averaged
+SURPRISE = 9.0  # times the noise variance: as much as one difference may say
+JUMP_M, JUMP_MPS, JUMP_NOISE = 0.04, 1.0, 6.0  # what is farther from where a hand was expected than this, and than this
+# for each second since it was seen, and than so many of its noise's standard deviations, has jumped
+START_SPEED, START_ACCELERATION = 0.3, 1.0  # [m/s], [m/s²] of a hand of which one sample is known
+LEAST_PROBABILITY = 1e-4  # of a mode
+FARTHEST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
+
+
+class HandEstimator:
+    """The estimates of both hands, in the state's arrays."""
+
+    def __init__(self, *, noise_std_m: float, period_s: float) -> None:
+        """`noise_std_m` is where the estimate of the noise begins."""
+        self._noise = noise_std_m**2
+        self._period_s = period_s
+        self._model = functools.lru_cache(maxsize=64)(self._model_over)
+
+    def _model_over(self, ticks: int) -> tuple[Vector, Vector, Vector]:
+        return *model(ticks * self._period_s), shares(ticks * self._period_s)
+
+    def begin(self, state: Record) -> None:
+        """Sets what no sample has told yet."""
+        state["noise"][:, 0] = self._noise
+        state["repose"] = RESTING
+
+    def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
+        """Moves both hands on by some ticks; one that is not seen stands still."""
+        _advance_both(as_array(state), stale_ticks, *self._model(ticks))
+
+
+def model(interval_s: float) -> tuple[Vector, Vector]:
+    """Transition (3, 3), and process noise (3, 3) of unit intensity, over an interval (Van Loan,
+    1978).
+    """
+    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -REVERT_V, -REVERT_A]])
+    whole = np.zeros((6, 6))
+    whole[:3, :3], whole[2, 5], whole[3:, 3:] = -dynamics, 1.0, dynamics.T
+    grown = expm(whole * interval_s)
+    transition = np.ascontiguousarray(grown[3:, 3:].T)
+    return transition, np.ascontiguousarray(transition @ grown[:3, 3:])
+
+
+@compiled
+def _start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
+    """A hand of which one sample is known."""
+    means[:] = 0.0
+    covariances[:] = 0.0
+    for mode in range(MODES):
+        for axis in range(3):
+            means[mode, 0, axis] = position[axis]
+        covariances[mode, 0, 0] = noise
+        covariances[mode, 1, 1] = START_SPEED**2
+        covariances[mode, 2, 2] = START_ACCELERATION**2
+        modes[mode] = PRIOR[mode]
+
+
+@compiled
+def _advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
+    """All modes moved on: m = F m, P = F P F' + q Q."""
+    moved, product = np.empty((3, 3)), np.empty((3, 3))
+    for mode in range(MODES):
+        mean, covariance = means[mode], covariances[mode]
+        for row in range(3):
+            for column in range(3):
+                m = p = 0.0
+                for k in range(3):
+                    m += transition[row, k] * mean[k, column]
+                    p += transition[row, k] * covariance[k, column]
+                moved[row, column], product[row, column] = m, p
+        mean[:] = moved
+        for row in range(3):
+            for column in range(row, 3):
+                p = INTENSITY[mode] * noise[row, column]
+                for k in range(3):
+                    p += product[row, k] * transition[column, k]
+                covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def _update_noise(noise: Vector, past: Vector, position: Vector, interval_s: float) -> None:
+    """The noise variance after one more sample; samples after a gap are compared with no earlier
+    ones.
+    """
+    count = int(noise[1])
+    if count >= 2 and abs(interval_s - noise[2]) > 0.5 * noise[2]:
+        count = 1
+    noise[2] = interval_s
+    if count >= 3:
+        square = 0.0
+        for axis in range(3):
+            third = position[axis] - 3.0 * past[0, axis] + 3.0 * past[1, axis] - past[2, axis]
+            square += third * third
+        seen = min(square / 60.0, SURPRISE * noise[0])
+        noise[3] = min(noise[3] + 1.0, AVERAGED)
+        variance = noise[0] + (seen - noise[0]) / (noise[3] + 1.0)
+        noise[0] = min(max(variance, LEAST_NOISE**2), MOST_NOISE**2)
+    for axis in range(3):
+        past[2, axis] = past[1, axis]
+        past[1, axis] = past[0, axis]
+        past[0, axis] = position[axis]
+    noise[1] = min(count + 1, 3)
+
+
+@compiled
+def _normalise(modes: Vector) -> None:
+    total = 0.0
+    for i in range(MODES):
+        total += modes[i]
+    for i in range(MODES):
+        modes[i] /= total
+
+
+@compiled
+def _update(
+    means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, interval_s: float
+) -> None:
+    """One sample filtered in: modes mixed over the interval, each updated, weighed by its
+    likelihood.
+    """
+    stay = math.exp(-SWITCH_RATE * interval_s)
+    expected, likelihood = np.empty(MODES), np.empty(MODES)
+    mixed, spread = np.zeros((MODES, 3, 3)), np.zeros((MODES, 3, 3))
+    for j in range(MODES):
+        expected[j] = stay * modes[j]
+        for i in range(MODES):
+            expected[j] += (1.0 - stay) * PRIOR[j] * modes[i]
+        for i in range(MODES):
+            share = ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0)) * modes[i] / expected[j]
+            for a in range(3):
+                for b in range(3):
+                    mixed[j, a, b] += share * means[i, a, b]
+        for i in range(MODES):
+            share = ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0)) * modes[i] / expected[j]
+            for a in range(3):
+                for b in range(a, 3):
+                    between = 0.0
+                    for k in range(3):
+                        between += (means[i, a, k] - mixed[j, a, k]) * (means[i, b, k] - mixed[j, b, k])
+                    spread[j, a, b] += share * (covariances[i, a, b] + between / 3.0)
+    best = -1e300
+    for i in range(MODES):
+        p, mean = spread[i], mixed[i]
+        variance = p[0, 0] + noise
+        square = 0.0
+        for axis in range(3):
+            innovation = position[axis] - mean[0, axis]
+            square += innovation * innovation
+            for row in range(3):
+                means[i, row, axis] = mean[row, axis] + p[0, row] / variance * innovation
+        for row in range(3):
+            for column in range(row, 3):
+                left = p[row, column] - p[0, row] * p[0, column] / variance
+                covariances[i, row, column] = covariances[i, column, row] = left
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, FARTHEST_INNOVATION)
+        best = max(best, likelihood[i])
+    for i in range(MODES):
+        modes[i] = expected[i] * math.exp(likelihood[i] - best)
+    _normalise(modes)
+    for i in range(MODES):
+        modes[i] = max(modes[i], LEAST_PROBABILITY)
+    _normalise(modes)
+
+
+@compiled
+def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
+    """The estimate (3, 3): position, velocity and acceleration, by axis."""
+    for row in range(3):
+        for axis in range(3):
+            total = 0.0
+            for mode in range(MODES):
+                total += modes[mode] * means[mode, row, axis]
+            estimate[row, axis] = total
+
+
+@compiled
+def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector, shares: Vector) -> None:
+    state = states[0]
+    for side in range(2):
+        if is_fresh(states, side, stale_ticks):
+            _advance(state.means[side], state.covariances[side], transition, noise)
+            _combine(state.means[side], state.modes[side], state.hands[side])
+        else:
+            state.means[side, :, 1:] = 0.0
+            state.hands[side, 1:] = 0.0
+        state.repose[side] = rest_on(state.hands[side, 1], shares, state.paces[side], state.repose[side])
+
+
+@compiled
+def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
+    """Whether a hand has been seen, and lately enough."""
+    seen = states[0].hand_ticks[side]
+    return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
+
+
+@compiled
+def has_jumped(states: Records, side: int, position: Vector, interval_s: float) -> bool:
+    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
+    after the one before.
+    """
+    state = states[0]
+    gate = max(JUMP_M + JUMP_MPS * interval_s, JUMP_NOISE * math.sqrt(state.noise[side, 0]))
+    off = 0.0
+    for axis in range(3):
+        off += (position[axis] - state.hands[side, 0, axis]) ** 2
+    return bool(off > gate * gate)
+
+
+@compiled
+def take(states: Records, side: int, position: Vector, interval_s: float, anew: bool) -> None:
+    """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before, or starts `anew`
+    with it.
+    """
+    state = states[0]
+    noise, hand, means = state.noise[side], state.hands[side], state.means[side]
+    if anew:
+        noise[1] = 0.0
+    _update_noise(noise, state.past[side], position, interval_s)
+    if anew:
+        _start(means, state.covariances[side], state.modes[side], noise[0], position)
+    else:
+        _update(means, state.covariances[side], state.modes[side], noise[0], position, interval_s)
+    _combine(means, state.modes[side], hand)

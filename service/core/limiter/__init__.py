@@ -1,0 +1,1 @@
+"""Stage 7: joint commands that hold every limit, whatever is wanted."""

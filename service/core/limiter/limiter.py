@@ -1,0 +1,194 @@
+"""The last stage: joint commands that hold every limit, whatever is wanted.
+
+Each joint moves by one tick at constant jerk toward the wanted velocity where its limits leave room
+for that, and by Ruckig's time-optimal profile where they do not. A step is taken only if a stop
+after it stays within the position limits; else the joint stops now. As the step before was taken on
+the same condition, that stop is feasible too: the limits hold by induction, for any sequence of
+wanted velocities.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import ruckig
+
+from kmp.compiled import compiled
+from service.config import JointSettings
+from service.core.frame import Vector
+from service.core.stops import fastest_stop, stop_together
+
+STEPS = 1e9  # [1/rad] of the positions: rounded so that a replay on another kind of CPU agrees
+LARGEST = 1e6  # of any number of a state that is calculated with
+BOUNDED, CHASED = 1, 2  # what `_toward` says: the wanted velocity was cut; some joint cannot have it in a tick
+MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
+
+
+class Limited(NamedTuple):
+    """The joints one period later, (J,) each [rad, rad/s, rad/s²]; whether a limit kept them from
+    what was wanted.
+    """
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    limited: bool
+
+
+def approach_gain(limits: JointSettings) -> Vector:
+    """Greatest speed toward a position limit per distance to it, (J,) [1/s].
+
+    Braking along it takes at most half of the acceleration and a quarter of the jerk.
+    """
+    velocity = np.array(limits.velocity)
+    gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))
+    return gain
+
+
+class Limiter:
+    """Position, velocity, acceleration and jerk limits of J joints.
+
+    Keeps nothing from tick to tick: it continues bit for bit from its output. The limits hold from
+    any state that a stop can still save. A joint at rest outside its position limits may move
+    inwards only; one that comes faster than its limits is brought back into them as jerk allows.
+    """
+
+    def __init__(self, limits: JointSettings, period_s: float) -> None:
+        self._period = period_s
+        self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
+        self._limits = np.array([limits.velocity, limits.acceleration, limits.jerk])
+        self._limits[0] *= 1.0 - 1e-12  # leaves room for rounding
+        self._gain = approach_gain(limits)
+        count = len(limits.velocity)
+        self._ruckig = ruckig.Ruckig(count)
+        self._input = ruckig.InputParameter(count)
+        self._input.control_interface = ruckig.ControlInterface.Velocity
+        self._input.synchronization = ruckig.Synchronization.No
+        self._input.max_velocity = list(limits.velocity)
+        self._input.max_acceleration = list(limits.acceleration)
+        self._input.max_jerk = list(limits.jerk)
+        self._trajectory = ruckig.Trajectory(count)
+
+    def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited:
+        """The joints one period later on the way to `velocity`; all (J,) [rad, rad/s, rad/s²].
+
+        A NaN in `velocity` means stop. A state that is not finite stays as it is, at velocity 0.
+        Never raises.
+        """
+        state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.empty(len(q))
+        state[0], state[1], state[2] = q, dq, ddq
+        if not is_usable(state):
+            return _stuck(q)
+        met = _toward(state, velocity, self._within, self._gain, self._limits, self._period, wanted, moved)
+        if met & CHASED:
+            self._chase(state, wanted, moved)
+        safe = _make_safe(state, moved, self._within, self._limits, self._period)
+        return _frozen(moved, limited=met > 0 or not safe)
+
+    def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
+        """The joints one period later on the way to rest, at which all come at once and as soon as
+        they can: so the tool slows down along its way. `limited` until they are there.
+
+        Never raises.
+        """
+        state = np.stack((q, dq, ddq))
+        if not is_usable(state):
+            return _stuck(q)
+        moved = stop_together(state[1], state[2], self._limits[1], self._limits[2], self._period)
+        moved[0] += q
+        _make_safe(state, moved, self._within, self._limits, self._period)
+        return _frozen(moved, limited=bool(moved[1].any()))
+
+    def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
+        """Puts those joints of `moved` (3, J) that are NaN one period along Ruckig's profile to the
+        wanted velocities (J,), or on the fastest stop where there is none.
+        """
+        self._input.current_position, self._input.current_velocity, self._input.current_acceleration = state.tolist()
+        self._input.target_velocity = wanted.tolist()
+        try:
+            self._ruckig.calculate(self._input, self._trajectory)
+        except (ruckig.RuckigError, ValueError):  # ValueError: a result that the binding has no name for
+            return
+        np.copyto(moved, self._trajectory.at_time(self._period), where=np.isnan(moved))
+
+
+@compiled
+def _toward(
+    state: Vector,
+    velocity: Vector,
+    within: Vector,
+    gain: Vector,
+    limits: Vector,
+    dt: float,
+    wanted: Vector,
+    moved: Vector,
+) -> int:
+    """Into `wanted` (J,) the velocity within speed limits, slower near position limits; into
+    `moved` (3, J) each joint one tick on at the jerk that reaches it, NaN where a limit forbids.
+
+    A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
+    profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
+    """
+    met, stopping = 0, False
+    for i in range(len(velocity)):
+        stopping = stopping or math.isnan(velocity[i])
+    for i in range(len(velocity)):
+        q, v, a = state[0, i], state[1, i], state[2, i]
+        max_speed = min(limits[0, i], gain[i] * max(within[1, i] - q, 0.0))
+        slowest = max(-limits[0, i], gain[i] * min(within[0, i] - q, 0.0))
+        wanted[i] = 0.0 if stopping else min(max(velocity[i], slowest), max_speed)
+        if wanted[i] != velocity[i]:
+            met |= BOUNDED
+        acceleration = (wanted[i] - v) / dt
+        v_then = v + 0.5 * dt * (a + acceleration)
+        crest = v_then + acceleration * abs(acceleration) / (2.0 * limits[2, i])  # when acceleration has come to 0
+        if (
+            abs(acceleration - a) <= limits[2, i] * dt
+            and abs(acceleration) <= limits[1, i]
+            and max(abs(v_then), abs(crest)) <= limits[0, i]
+        ):
+            moved[0, i] = q + dt * (v + dt * (a / 3.0 + acceleration / 6.0))
+            moved[1, i], moved[2, i] = v_then, acceleration
+        else:
+            moved[0, i] = moved[1, i] = moved[2, i] = math.nan
+            met |= CHASED
+    return met
+
+
+@compiled
+def _make_safe(state: Vector, moved: Vector, within: Vector, limits: Vector, dt: float) -> bool:
+    """Rounds the moved joints (3, J); those that could not stop within their position limits after
+    it, or that are NaN, go on the fastest stop instead. Whether there were none.
+    """
+    safe, stop = True, np.empty(6)
+    for i in range(moved.shape[1]):
+        moved[0, i] = np.rint(moved[0, i] * STEPS) / STEPS
+        fastest_stop(moved[1, i], moved[2, i], limits[1, i], limits[2, i], dt, stop)
+        lowest, highest = min(within[0, i], state[0, i]), max(within[1, i], state[0, i])
+        if not (moved[0, i] + stop[3] >= lowest and moved[0, i] + stop[4] <= highest):
+            safe = False
+            fastest_stop(state[1, i], state[2, i], limits[1, i], limits[2, i], dt, stop)
+            moved[0, i] = np.rint((state[0, i] + stop[2]) * STEPS) / STEPS
+            moved[1, i], moved[2, i] = stop[0], stop[1]
+    return safe
+
+
+@compiled
+def is_usable(state: Vector) -> bool:
+    """Whether a state (3, J) is finite, and small enough to calculate with: false for NaN too."""
+    for row in state:
+        for value in row:
+            if not abs(value) < LARGEST:
+                return False
+    return True
+
+
+def _stuck(q: Vector) -> Limited:
+    return _frozen(np.stack((q, np.zeros(len(q)), np.zeros(len(q)))), limited=True)
+
+
+def _frozen(moved: Vector, *, limited: bool) -> Limited:
+    moved.setflags(write=False)
+    return Limited(moved[0], moved[1], moved[2], limited)

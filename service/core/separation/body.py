@@ -1,0 +1,129 @@
+"""The arm's body: capsules around the collision shapes of its links, and which of them could meet.
+
+A capsule covers its shape: box and cylinder with the least volume that does. Meshes are not read;
+a link that has no other shape is a capsule from its joint to the next, of a configured radius.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.config import Settings
+from service.core.frame import Vector
+from service.core.rotation import rotation
+from service.core.separation.capsules import between_segments, place
+from service.urdf import Joint, Shape, Urdf
+
+LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
+UNMOVED = 1e-9  # [m]
+FITS = 101  # lengths tried for a capsule
+
+
+class Body(NamedTuple):
+    """Capsules of an arm of J joints, and how they move.
+
+    `frames` (J, 3, 4): each joint in the frame of the one before, at 0; `axes` (J, 3) in its own.
+    `links` (N,): how many joints move a capsule; `ends` (N, 2, 3) [m] in the frame of the last of
+    these joints, or in base; `radii` (N,) [m]. `pairs` (P, 2): capsules that are kept apart.
+    """
+
+    frames: Vector
+    axes: Vector
+    links: Vector
+    ends: Vector
+    radii: Vector
+    pairs: Any
+
+
+def body_of(settings: Settings, description: str) -> Body:
+    """The body of the arm that a URDF describes, with the tool on its plate.
+
+    Kept apart are capsules of links that do not follow each other, but for those that cannot move
+    against each other, and those that belong together: they are nearer than the clearance in the
+    configured posture.
+    """
+    urdf, names = Urdf(description), settings.joints.names
+    chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
+    frames = np.array([_in_joint(urdf, names, joint.parent, _origin(joint))[1] for joint in chain])
+    found: list[tuple[int, Vector, float]] = []
+    for shape in urdf.shapes:
+        if shape.kind != "mesh":
+            ends, radius = _capsule(shape)
+            link, placed = _in_joint(urdf, names, shape.link, np.eye(3, 4))
+            found.append((link, ends @ placed[:, :3].T + placed[:, 3], radius))
+    link, plate = _in_joint(urdf, names, settings.arm.plate, np.eye(3, 4))
+    known = {number for number, _, _ in found}
+    for number in range(len(chain) + 1):
+        if number not in known:
+            end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
+            found.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
+    tool = np.array(settings.tool.plate_from_tool[:3])
+    if math.hypot(*tool) > LEAST_TOOL:
+        found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
+    found.sort(key=lambda one: one[0])
+    links = np.array([number for number, _, _ in found])
+    radii = np.array([radius for _, _, radius in found])
+    body = Body(
+        np.ascontiguousarray(frames),
+        np.array([joint.axis for joint in chain]),
+        links,
+        np.array([ends for _, ends, _ in found]),
+        radii,
+        np.empty((0, 2), np.int64),
+    )
+    postures = np.array([settings.arm.posture, settings.joints.lower, settings.joints.upper])
+    placed, near = np.empty((len(postures), len(links), 2, 3)), np.empty(9)
+    for q, ends in zip(postures, placed, strict=True):
+        place(q, body.frames, body.axes, links, body.ends, ends)
+    pairs = []
+    for i, j in itertools.combinations(range(len(links)), 2):
+        if links[j] - links[i] > 1:
+            apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
+            if apart[0] > settings.obstacles.clearance and np.ptp(apart) > UNMOVED:
+                pairs.append((i, j))
+    return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
+
+
+def _origin(joint: Joint) -> Vector:
+    """Where a joint sits in its parent link (3, 4)."""
+    return np.column_stack((rotation(joint.rotation), joint.translation))
+
+
+def _in_joint(urdf: Urdf, names: tuple[str, ...], link: str, placed: Vector) -> tuple[int, Vector]:
+    """What is placed (3, 4) in a link, in the frame of the joint that moves the link; its number
+    from 1, or 0 for base. Joints without a name among `names` stay at 0.
+    """
+    while (joint := urdf.above(link)) is not None:
+        if joint.name in names:
+            return names.index(joint.name) + 1, placed
+        origin = _origin(joint)
+        placed = np.column_stack((origin[:, :3] @ placed[:, :3], origin[:, :3] @ placed[:, 3] + origin[:, 3]))
+        link = joint.parent
+    return 0, placed
+
+
+def _capsule(shape: Shape) -> tuple[Vector, float]:
+    """Ends (2, 3) in the link's frame and radius [m] of the capsule that covers a shape."""
+    axis, half, radius = 2, 0.0, shape.size[0]
+    if shape.kind == "box":
+        axis = int(np.argmax(shape.size))
+        radius = 0.5 * math.hypot(*(size for i, size in enumerate(shape.size) if i != axis))
+        half, radius = _around(0.5 * shape.size[axis], radius)
+    elif shape.kind == "cylinder":
+        half, radius = _around(0.5 * shape.size[1], radius)
+    elif shape.kind == "capsule":
+        half = 0.5 * shape.size[1]
+    along = rotation(shape.rotation)[:, axis] * half
+    return np.array([shape.translation - along, shape.translation + along]), radius
+
+
+def _around(half: float, radius: float) -> tuple[float, float]:
+    """Half the axis and the radius of the smallest capsule around a cylinder [m]."""
+    axes = np.linspace(0.0, half, FITS)
+    radii = np.hypot(radius, half - axes)
+    best = int(np.argmin(radii**2 * (2.0 * axes + 4.0 / 3.0 * radii)))
+    return float(axes[best]), float(radii[best])

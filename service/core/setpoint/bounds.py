@@ -1,0 +1,166 @@
+"""Where a setpoint may go and how fast: the box around the last targets, the step that can still
+stop in it, and what comes back to it. docs/bounds.md has the proof.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.core.frame import Vector
+from service.core.stops import fastest_stop
+
+HULL_TIME_S, HULL_SPANS, HULL_MARGIN = 0.35, 7, 0.03  # [m]; of the spans one is always being filled
+RETURN_SHARE = 1 / 16  # of the speed it may have with which a setpoint comes back at least, each axis
+ON_BOUND, ROUNDING = 1e-9, 1e-12  # [m] beyond a bound, or away from it, that are rounding
+BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
+
+
+@compiled
+def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int:
+    """Takes a target (3,) into the least and greatest of its span; ticks in the newest span."""
+    if ticks >= span_ticks or ticks == 0:
+        if ticks > 0:
+            for span in range(HULL_SPANS - 1, 0, -1):
+                for axis in range(3):
+                    hull[span, 0, axis], hull[span, 1, axis] = hull[span - 1, 0, axis], hull[span - 1, 1, axis]
+        for axis in range(3):
+            hull[0, 0, axis] = hull[0, 1, axis] = position[axis]
+        return 1
+    for axis in range(3):
+        hull[0, 0, axis] = min(hull[0, 0, axis], position[axis])
+        hull[0, 1, axis] = max(hull[0, 1, axis], position[axis])
+    return ticks + 1
+
+
+@compiled
+def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
+    """Where the setpoint may go: around the last targets, and inside the workspace."""
+    for axis in range(3):
+        least, greatest = hull[0, 0, axis], hull[0, 1, axis]
+        for span in range(1, HULL_SPANS):
+            least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
+        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN)
+        high[axis] = min(box[1, axis], greatest + HULL_MARGIN)
+
+
+@compiled
+def what_is_wrong(
+    setpoint: Vector, before: Vector, hull: Vector, box: Vector, lowest: Vector, limits: Vector, dt: float
+) -> int:
+    """Which of BOUNDS a step from `before` (3, 3) is."""
+    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+    if not np.isfinite(setpoint).all():
+        return 1
+    speed = hardest_now = hardest_before = change = 0.0
+    for i in range(3):
+        speed += setpoint[1, i] ** 2
+        hardest_now, hardest_before = max(hardest_now, abs(setpoint[2, i])), max(hardest_before, abs(before[2, i]))
+        change = max(change, abs(setpoint[2, i] - before[2, i]))
+    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], max_jerk, 0.0)) + 1e-9:
+        return 2
+    if hardest_now > max(max_acceleration, hardest_before) + 1e-9:
+        return 3
+    if change > (max_jerk + 1e-6) * dt:
+        return 4
+    low, high = np.empty(3), np.empty(3)
+    bounds(hull, box, lowest, low, high)
+    farthest = 0.5 * max_speed * max_speed / max_acceleration + max_speed  # of a stop from outside, generously
+    for i in range(3):
+        if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
+            return 5
+        if setpoint[0, i] > max(high[i], before[0, i]) + farthest:
+            return 5
+    return 0
+
+
+@compiled
+def take_safe(
+    setpoint: Vector,
+    ahead: Vector,
+    limits: Vector,
+    costs: Vector,
+    slow: float,
+    low: Vector,
+    high: Vector,
+    dt: float,
+) -> bool:
+    """Moves a setpoint (3, 3) to `ahead` if it keeps every bound after that; else one period on its
+    fastest stop, and false. An axis that would not come back does so.
+    """
+    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+    back = RETURN_SHARE * max_speed
+    dearest = 0.0
+    for i in range(3):
+        for joint in range(costs.shape[2]):
+            dearest = max(dearest, abs(costs[0, i, joint]))
+    due = back * slow / max(1.0, dearest * max_speed) * dt
+    stays = True
+    for i in range(3):
+        for side, bound in ((1.0, high[i]), (-1.0, low[i])):
+            if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
+                continue
+            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + ON_BOUND:
+                stays = False
+                continue
+            here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
+            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + ROUNDING:
+                _fall_back(setpoint, ahead, i, low[i], high[i], max_acceleration, max_jerk, back, dt)
+    if stays and speed_to_come(ahead[1], ahead[2], max_jerk, back) <= max_speed:
+        setpoint[:] = ahead
+        return True
+    if speed_to_come(setpoint[1], setpoint[2], max_jerk, back) > max_speed:
+        back = 0.0  # it began too fast: no axis moves on before that is over
+    for i in range(3):
+        _fall_back(setpoint, setpoint, i, low[i], high[i], max_acceleration, max_jerk, back, dt)
+    return False
+
+
+@compiled
+def _fall_back(
+    setpoint: Vector,
+    out: Vector,
+    axis: int,
+    low: float,
+    high: float,
+    max_acceleration: float,
+    max_jerk: float,
+    back: float,
+    dt: float,
+) -> None:
+    """Into out (3, 3) one axis a period on along its fastest stop; or, where that ends beyond a
+    bound, along the fastest change to `back` [m/s] inwards.
+    """
+    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND
+    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND - low
+    if over and under:  # it crosses the box
+        over = setpoint[1, axis] > 0.0
+        under = not over
+    frame, stop = back * (under - over), np.empty(6)
+    fastest_stop(setpoint[1, axis] - frame, setpoint[2, axis], max_acceleration, max_jerk, dt, stop)
+    out[0, axis] = setpoint[0, axis] + (stop[2] + frame * dt)
+    out[1, axis], out[2, axis] = stop[0] + frame, stop[1]
+
+
+@compiled
+def farthest(setpoint: Vector, axis: int, side: float, max_acceleration: float, max_jerk: float, back: float) -> float:
+    """How far [m] an axis of a setpoint (3, 3) comes in direction `side` (1 or -1) on its fastest
+    change to `back` [m/s] against it, seen from what moves at that; 0: on its fastest stop.
+    """
+    stop = np.empty(6)
+    fastest_stop(side * setpoint[1, axis] + back, side * setpoint[2, axis], max_acceleration, max_jerk, 0.0, stop)
+    return float(side * setpoint[0, axis] + stop[4])
+
+
+@compiled
+def speed_to_come(velocity: Vector, acceleration: Vector, max_jerk: float, least: float) -> float:
+    """Norm [m/s] of the axes' greatest speeds, each `least` or more, if each acceleration is
+    brought to 0 at once.
+    """
+    total = 0.0
+    for i in range(3):
+        then = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * max_jerk)
+        total += max(abs(velocity[i]), abs(then), least) ** 2
+    return math.sqrt(total)

@@ -1,0 +1,307 @@
+"""From the predicted target to a setpoint that the arm can follow, and that can always stop in
+time.
+
+The setpoint is led by a linear-quadratic tracker whose input is jerk: it minimises the integral of
+error² + weight jerk². Along its motion that jerk is bounded so that the setpoint can stop, within
+its limits, where the hands would stop at the soonest (a discrete control barrier function; Agrawal
+and Sreenath, RSS 2017). A step is taken only if the stop after it keeps every limit; else the stop,
+which the step before had made sure of, begins now. So the limits hold by induction, whatever the
+target does:
+
+* speed at most `max_speed` (as a norm), acceleration and jerk each axis at most theirs;
+* never outside the box of the workspace, nor farther than HULL_MARGIN from the box around the last
+  HULL_TIME_S of targets. Where that box has moved away, or began elsewhere, the setpoint comes back
+  to it at RETURN_SHARE of the greatest speed at least: docs/bounds.md has the proof.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from kmp.compiled import compiled
+from service.config import Settings
+from service.core.frame import Record, Vector
+from service.core.setpoint.bounds import (
+    BOUNDS,
+    HULL_SPANS,
+    HULL_TIME_S,
+    bounds,
+    remember,
+    take_safe,
+    what_is_wrong,
+)
+from service.core.setpoint.workspace import Target
+
+REVERT_A, REVERT_V = 5.0, 150.0  # [1/s], [1/s²] with which the tracker expects the target's motion to end
+ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
+STOP_TIME = 0.009  # [s] times the target's speed more, for no hand stops at once ...
+STOP_BRAKE = 16.0  # [m/s²] ... nor brakes harder than this
+FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
+BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
+SHARE, SPEED_SHARE = 0.91, 0.97  # of acceleration and jerk, and of speed, that is planned with
+LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
+PLANNED, STOPPED, WRONG = 1, 2, 3  # what a step says: a bound was met in planning; the stop was begun; one was passed
+DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
+
+
+class SetpointGenerator:
+    """Moves the state's setpoint (3, 3), position, velocity and acceleration by axis, toward
+    targets.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        tool, reach = settings.tool, settings.reach
+        self._period_s = settings.period_s
+        self._gains = tracker_gains(tool.jerk_weight)
+        self._limits = np.array([tool.max_speed, tool.max_acceleration, tool.max_jerk])
+        self._least = np.array([reach.min_x, -np.inf, reach.min_z])
+        self._span_ticks = max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s))
+
+    def begin(self, state: Record, setpoint: Vector) -> None:
+        """Puts the setpoint where the tool is, before there are targets."""
+        state["setpoint"] = setpoint
+        state["hull"] = setpoint[0]
+        state["hull_ticks"] = 0
+
+    def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
+        """Moves the setpoint one period on; 0, or PLANNED or STOPPED where a limit was met, or
+        WRONG where a bound was passed, which cannot be: it then stays where it is.
+
+        box: (2, 3) lower and upper corner [m] of the workspace. costs: (3, 3, J) what a tool
+        velocity, acceleration and jerk cost of each joint's limit, 1 for all of it. slow: share of
+        the speed that is allowed, as the arm is behind.
+        """
+        ticks, said = _lead(
+            state["setpoint"],
+            state["hull"],
+            int(state["hull_ticks"]),
+            self._span_ticks,
+            target.position,
+            target.velocity,
+            target.acceleration,
+            box,
+            self._least,
+            self._gains,
+            self._limits,
+            costs,
+            slow,
+            self._period_s,
+        )
+        state["hull_ticks"] = ticks
+        return int(said)
+
+    def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
+        """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
+
+        They hold by the way a step is made; this looks again, from outside.
+        """
+        return BOUNDS[
+            what_is_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)
+        ]
+
+
+def tracker_gains(jerk_weight: float) -> Vector:
+    """Gains (5,) of the error, of target velocity and acceleration, and of the setpoint's.
+
+    For the jerk that minimises the integral of error² + jerk_weight [s⁶] jerk² while the target's
+    acceleration reverts to 0 as REVERT_A and REVERT_V say.
+    """
+    a = np.zeros((5, 5))  # error, target velocity and acceleration, setpoint velocity and acceleration
+    a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = 1.0, -1.0, 1.0, -REVERT_V, -REVERT_A, 1.0
+    b = np.zeros((5, 1))
+    b[4, 0] = 1.0
+    cost = np.zeros((5, 5))
+    cost[0, 0] = 1.0
+    riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
+    return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], DECIMALS))
+
+
+@compiled
+def _lead(
+    setpoint: Vector,
+    hull: Vector,
+    ticks: int,
+    span_ticks: int,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    box: Vector,
+    lowest: Vector,
+    gains: Vector,
+    limits: Vector,
+    costs: Vector,
+    slow: float,
+    dt: float,
+) -> tuple[int, int]:
+    """One step, in place; ticks in the newest span, and what the step says."""
+    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
+    target[0], target[1], target[2] = position, velocity, acceleration
+    ticks = remember(hull, ticks, position, span_ticks)
+    bounds(hull, box, lowest, low, high)
+    met = _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
+    if what_is_wrong(setpoint, before, hull, box, lowest, limits, dt):
+        setpoint[:] = before
+        return ticks, WRONG
+    return ticks, met
+
+
+@compiled
+def _step(
+    setpoint: Vector,
+    target: Vector,
+    gains: Vector,
+    limits: Vector,
+    costs: Vector,
+    slow: float,
+    low: Vector,
+    high: Vector,
+    dt: float,
+) -> int:
+    """The setpoint (3, 3) one period on, in place."""
+    jerk, ahead = np.empty(3), np.empty((3, 3))
+    met = _track(setpoint, target, gains, limits, costs, slow, dt, jerk)
+    for i in range(3):
+        x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
+        ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
+        ahead[1, i] = v + dt * (a + dt * j / 2.0)
+        ahead[2, i] = a + dt * j
+    if take_safe(setpoint, ahead, limits, costs, slow, low, high, dt):
+        return met
+    return STOPPED
+
+
+@compiled
+def _track(
+    setpoint: Vector,
+    target: Vector,
+    gains: Vector,
+    limits: Vector,
+    costs: Vector,
+    slow: float,
+    dt: float,
+    jerk: Vector,
+) -> int:
+    """The tracker's jerk (3,), less of it along the motion where the stop or the speed asks for
+    that.
+    """
+    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+    speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
+    target_speed = math.sqrt(target[1, 0] ** 2 + target[1, 1] ** 2 + target[1, 2] ** 2)
+    feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
+    for i in range(3):
+        jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
+        if feasible == 1.0:  # what a target does beyond the speed limit is not followed
+            jerk[i] += gains[2] * target[2, i]
+        jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
+    _limit_jerk(jerk, setpoint[2], max_acceleration, max_jerk, costs, dt)
+    if speed <= LEAST_SPEED:
+        return 0
+    along = np.empty(3)
+    steepest = a = u = way = v_target = a_target = 0.0
+    for i in range(3):
+        along[i] = setpoint[1, i] / speed
+        steepest = max(steepest, abs(along[i]))
+        a += along[i] * setpoint[2, i]
+        u += along[i] * jerk[i]
+        way += along[i] * (target[0, i] - setpoint[0, i])
+        v_target += along[i] * feasible * target[1, i]
+        a_target += along[i] * target[2, i]
+    brake = SHARE * min(max_acceleration / steepest, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = SHARE * min(max_jerk / steepest, 1.0 / max(_largest(costs[2], along), 1e-9))
+    top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
+    coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
+    way += ROOM + STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE)
+    # what is left of the room for a stop shrinks at BARRIER_RATE at most; linear between most and
+    # least jerk
+    left = way - stop_distance(speed, a, brake, change)
+    limit = way + min(coming, speed) * dt - (1.0 - BARRIER_RATE * dt) * left
+    v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a - 0.5 * dt * change), 0.0)
+    most = stop_distance(v_u, a + u * dt, brake, change) + speed * dt
+    least = stop_distance(v_d, a - change * dt, brake, change) + speed * dt
+    chosen = _between(u, -change, most, least, limit)
+    # so does what is left to the greatest speed, as it is when the acceleration has come to 0
+    left = top - (speed + a * abs(a) / (2.0 * change))
+    limit = top - (1.0 - BARRIER_RATE * dt) * left
+    a_u, a_d = a + chosen * dt, a - change * dt
+    most = speed + dt * (a + 0.5 * dt * chosen) + a_u * abs(a_u) / (2.0 * change)
+    least = speed + dt * (a - 0.5 * dt * change) + a_d * abs(a_d) / (2.0 * change)
+    chosen = _between(chosen, -change, most, least, limit)
+    if chosen >= u:
+        return 0
+    for i in range(3):
+        jerk[i] += (chosen - u) * along[i]
+    _limit_jerk(jerk, setpoint[2], max_acceleration, max_jerk, costs, dt)
+    return PLANNED
+
+
+@compiled
+def _between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float) -> float:
+    """The greatest jerk up to the wanted one at which something, linear in jerk, stays at its
+    limit.
+    """
+    if at_wanted <= limit:
+        return wanted
+    if at_lowest >= limit or at_wanted - at_lowest < 1e-15:
+        return lowest
+    return lowest + (wanted - lowest) * (limit - at_lowest) / (at_wanted - at_lowest)
+
+
+@compiled
+def _largest(costs: Vector, motion: Vector) -> float:
+    """How much of its limit the busiest joint needs for a tool motion (3,), with costs (3, J)."""
+    largest = 0.0
+    for joint in range(costs.shape[1]):
+        needed = costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
+        largest = max(largest, abs(needed))
+    return largest
+
+
+@compiled
+def _limit_jerk(
+    jerk: Vector, acceleration: Vector, max_acceleration: float, max_jerk: float, costs: Vector, dt: float
+) -> None:
+    """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of axes and
+    joints.
+    """
+    ahead = np.empty(3)
+    excess = 0.0
+    for i in range(3):
+        ahead[i] = acceleration[i] + dt * jerk[i]
+        excess = max(excess, abs(ahead[i]) / max_acceleration)
+    excess = max(excess, _largest(costs[1], ahead))
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
+    excess = _largest(costs[2], jerk)
+    for i in range(3):
+        excess = max(excess, abs(jerk[i]) / max_jerk)
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] /= excess
+    for i in range(3):
+        least, most = (
+            max(-max_jerk, (-max_acceleration - acceleration[i]) / dt),
+            min(max_jerk, (max_acceleration - acceleration[i]) / dt),
+        )
+        jerk[i] = min(most, max(least, jerk[i]))
+
+
+@compiled
+def stop_distance(speed: float, acceleration: float, brake: float, change: float) -> float:
+    """Way [m] to rest along the motion, braking by `brake` [m/s²] after ramps of jerk `change`
+    [m/s³].
+    """
+    if acceleration >= 0.0:
+        t = acceleration / change
+        speed_then = speed + 0.5 * acceleration * t
+        way = t * (speed + acceleration * t / 3.0)
+    else:  # as if the braking had begun from the crest before
+        t = min(-acceleration, brake) / change
+        speed_then = speed + 0.5 * change * t * t
+        way = -(speed_then * t - change * t * t * t / 6.0)
+    if speed_then >= brake * brake / change:
+        return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+    return way + speed_then * math.sqrt(speed_then / change)

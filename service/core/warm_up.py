@@ -1,0 +1,74 @@
+"""A rehearsal before there is a deadline: what the loop compiles, or loads compiled from disk, is
+then there.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from kmp import KMP, GaussianKernel, Gaussians
+from service.config import Settings
+from service.contract.messages import JointState, PoseStamped
+from service.contract.records import SIDES
+from service.core.controller import Controller
+from service.core.frame import Event, Tick, order
+from service.core.intake.intake import rest_ticks
+from service.core.skill.pose import LearnedGripper, LearnedOrientation
+from service.core.skill.skill import Skill
+
+REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
+
+
+def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
+    """Lets a controller that is thrown away follow two hands for a moment, and stop.
+
+    The first hand that a loop sees would otherwise stop it for a fifth of a second, the first ever
+    for many seconds. A skill that is loaded later may know of orientation and gripper: so does the
+    one rehearsed with.
+    """
+    arm = msgspec.structs.replace(settings.arm, source="state")
+    plain = replace(skill, threshold=math.inf)
+    skill = replace(
+        plain,
+        turn=skill.turn or LearnedOrientation(_flat(skill, 3), skill.orientation),
+        gripper=skill.gripper or LearnedGripper(_flat(skill, 1)),
+    )
+    for one in (plain, skill):
+        one.predict(*np.zeros((3, 2, 3)))
+    for one in (skill, _as_sent(skill), _as_sent(plain)):
+        _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
+
+
+def _as_sent(skill: Skill) -> Skill:
+    """The skill as another process gives it back: its arrays are read-only, and loops are compiled
+    once more for those.
+    """
+    parts: list[bytes] = []
+    data = pickle.dumps(skill, protocol=5, buffer_callback=lambda part: parts.append(bytes(part.raw())))
+    sent: Skill = pickle.loads(data, buffers=parts)
+    return sent
+
+
+def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
+    controller = Controller(settings, skill, urdf=urdf)
+    names = settings.joints.names
+    count = rest_ticks(settings) + REHEARSED_TICKS
+    for index in range(count):
+        stamp_ns = round(1e9 * (1 + index * settings.period_s))
+        sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
+        measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
+        controller.step(Tick(index, (*hands, measured)))
+    controller.step(Tick(count, (order("hold"),)))
+
+
+def _flat(skill: Skill, outputs: int) -> KMP:
+    """A primitive of the skill's input that says 0 everywhere."""
+    inputs = skill.primitive.inputs[:1]
+    nothing = Gaussians(np.zeros((1, outputs)), np.eye(outputs)[None])
+    return KMP.fit(inputs, nothing, kernel=GaussianKernel(1.0), lambda_mean=1.0)

@@ -1,0 +1,351 @@
+"""The daemon: a thin shell that fills the controller's inbox from Zenoh and hands each frame to
+whoever cares.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from service.client import endpoints, open_session
+from service.config import Settings, robot_description
+from service.contract import cdr
+from service.contract.explain import ExplainedError
+from service.contract.incidents import in_brief, in_full
+from service.contract.messages import Attachment
+from service.contract.records import STAGES, Reason
+from service.contract.requests import Status, encode_json
+from service.contract.roles import access_control
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
+from service.core.outputs import outgoing
+from service.core.separation.separation import FARTHEST, IRRELEVANT
+from service.core.skill.skill import Skill
+from service.core.warm_up import warm_up
+from service.daemon import supervised_thread
+from service.daemon.clock import (
+    PREPARE_NS,
+    SPIN_NS,
+    Deadlines,
+    Granted,
+    Window,
+    ahead_of_others,
+    ask_for_real_time,
+    run_beside_real_time,
+)
+from service.daemon.input_monitor import InputMonitor
+from service.daemon.measured_tool import MeasuredTool
+from service.daemon.requests import Requests
+from service.daemon.saved_via_points import SavedViaPoints, state_folder
+from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
+from service.daemon.skill_worker import SkillWorker
+from service.daemon.status import CellStatus
+from service.daemon.streams import Streams
+from service.daemon.things import Things
+from service.learning.skill_file import SkillError
+from service.recording.client import Scribe
+
+log = logging.getLogger("thirdhand")
+STOP_TIMEOUT_S = 3.0
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SLOWEST_START_S = 120.0  # of the skill worker, on a machine that is busy
+LONG_START_S = 3.0
+MOST_NOTES = 100  # a second
+LONGEST_LATENCY_MS = 1000.0  # beyond it, stamps tell of clocks
+
+
+class LoopError(ExplainedError, RuntimeError):
+    """A control loop that cannot go on, not even to stop the arm."""
+
+
+class Daemon:
+    """One cell's loop and all around it.
+
+    `serve` runs until it is asked to stop, then stops the arm and closes everything.
+    """
+
+    def __init__(
+        self, settings: Settings, skill: Skill, *, skill_worker: SkillWorker, skills: Path, scribe: Scribe, lock: Lock
+    ) -> None:
+        self._settings = settings
+        self._scribe = scribe
+        self._stop = threading.Event()
+        self._ended = threading.Event()
+        urdf = robot_description(settings)
+        allow_descriptors()
+        network = settings.network
+        with ahead_of_others():
+            self._session = open_session(
+                connect=network.connect,
+                listen=network.listen,
+                certificate=network.certificate,
+                zenoh_config=network.zenoh_config,
+                more=BOUNDS
+                | (access_control(settings.cell, network.revoked, network.ros2_domain) if network.certificate else {}),
+            )
+        try:
+            self._token = occupy(self._session, settings.cell)
+        except OccupiedError:
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise
+        slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
+        slow.start()
+        try:
+            warm_up(settings, skill, urdf=urdf)
+        finally:
+            slow.cancel()
+        self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
+        self._measured_tool = MeasuredTool(settings, urdf)
+        self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
+        self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
+        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
+        self._sources = InputMonitor(settings)
+        self._failure = ""  # of the service, the last one
+        self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
+        self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
+        self._faults: deque[Event] = deque()
+        self._notes = (0, 0)  # second, and how many in it
+        self._failed_at: int | None = None
+        self._late_ns = self._began_ns = 0
+        self._newest = -1  # tick
+        self._laps: list[tuple[str, int]] = []
+        self.endpoints = endpoints(self._session) if settings.network.listen else ()
+        lock.tell(self.endpoints)
+        self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
+        self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
+        self._clock = Deadlines(settings.rate_hz)
+        self._status = encode_json(self._survey())
+        self._requests = Requests(
+            self._session,
+            settings,
+            skill,
+            skill_worker=skill_worker,
+            skills=skills,
+            status=lambda: self._status,
+            frame=lambda: self._frame,
+            note=self.note,
+            keep=scribe.keep,
+            failed=self._fail,
+        )
+
+    def stop(self, *_: Any) -> None:
+        """Asks the loop to stop the arm and end. Safe in a signal handler."""
+        self._stop.set()
+
+    def note(self, text: str) -> None:
+        """A line for the log and for the recording; of more than MOST_NOTES a second only the
+        number is told.
+        """
+        second = int(time.monotonic())
+        if second != self._notes[0]:
+            left_out = self._notes[1] - MOST_NOTES
+            self._notes = (second, 0)
+            if left_out > 0:
+                self._say(f"{left_out} more requests in a second, not noted one by one")
+        self._notes = (second, self._notes[1] + 1)
+        if self._notes[1] <= MOST_NOTES:
+            self._say(text)
+
+    def _say(self, text: str) -> None:
+        log.info(text)
+        self._scribe.note("requests", text, time.time_ns())
+
+    def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
+        """Runs the loop until `stop`, `announce`d once requests are answered; then everything is
+        flushed and closed. What the recordings lack, in words; empty: nothing.
+        """
+        reporter: threading.Thread | None = None
+        try:
+            self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
+            reporter = supervised_thread.start("status thread", self._report, self._fail)
+            self._granted = ask_for_real_time()
+            announce(self)
+            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
+            supervised_thread.supervised("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
+        finally:
+            self._ended.set()
+            gc.unfreeze()  # what was kept from the collector may go
+            if reporter is not None:
+                reporter.join(2)
+            self._requests.close()
+            self._streams.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+            if missing := self._scribe.close(timeout_s=20):
+                log.warning("%s", missing)
+        return missing
+
+    def _fail(self, what: str) -> None:
+        """Says what of the service failed; the next tick is at fault for it."""
+        self._failure = what
+        self._faults.append(order("fault", what))
+        self._say(what)
+
+    def _fail_in_the_loop(self, what: str) -> None:
+        """Lets the loop stop the arm. Raises LoopError where no tick came since it failed last."""
+        self._scribe.skip()
+        tick = int(self._frame["tick"])
+        if tick == self._failed_at:
+            raise LoopError(f"{what}, and again at once: the arm is commanded no more")
+        self._failed_at = tick
+        self._fail(what)
+
+    # --- the loop: every line below costs each tick ---
+
+    def _run(self) -> None:
+        run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
+
+    def _ticks(self) -> Iterator[Tick]:
+        inbox: list[Event] = []
+        stop_by: float | None = None
+        # a period of 1 ms has no room for it
+        prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
+        while True:
+            index, self._late_ns = self._clock.wait(prepare)
+            self._newest = index
+            self._began_ns = time.perf_counter_ns()
+            self._laps = []
+            inbox = self._streams.receive()
+            while self._requests.inbox:
+                if (event := self._requests.inbox.popleft().claimed(index)) is not None:
+                    inbox.append(event)
+            while self._faults:
+                inbox.append(self._faults.popleft())
+            if self._stop.is_set():
+                if stop_by is None:
+                    stop_by = time.monotonic() + STOP_TIMEOUT_S
+                elif not self._frame["joint_velocities"].any():
+                    return
+                elif time.monotonic() > stop_by:
+                    log.error("the arm has not come to rest in %g s; it is commanded no more", STOP_TIMEOUT_S)
+                    return
+                inbox.append(order("hold"))  # behind whatever else is asked meanwhile
+            yield Tick(index, tuple(inbox))
+
+    def _warm_up(self) -> None:
+        """Steps a twin through what the next tick may be: so it finds code and numbers near."""
+        self._twin.copy_from(self._controller)
+        self._twin.step(Tick(self._newest + 1, tuple(self._streams.newest.values())))
+
+    def _lap(self, stage: str) -> None:
+        self._laps.append((stage, time.perf_counter_ns()))
+
+    def _publish(self, tick: Tick, frame: Frame) -> None:
+        now_ns = time.time_ns()
+        attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
+        for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
+            self._streams.publish(channel.key, payload, attachment)
+
+    def _record(self, tick: Tick, frame: Frame) -> None:
+        self._frame = frame
+        stages, before, latency_ms = [0.0] * len(STAGES), self._began_ns, 0.0
+        for stage, at in self._laps:
+            stages[STAGES.index(stage)] = (at - before) / 1e3
+            before = at
+        if 0 in frame["hand_ages"].tolist():
+            latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
+            if 0 <= latency_ms < LONGEST_LATENCY_MS:
+                self._latency.add(latency_ms)
+            else:
+                latency_ms = 0.0
+        late_us, work_us = self._late_ns / 1e3, (time.perf_counter_ns() - self._began_ns) / 1e3
+        time_ns, missed = self._clock.stamp_ns, self._clock.missed
+        timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
+        self._lateness.add(late_us)
+        self._work.add(work_us)
+        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._controller.skill.file)
+
+    # --- beside the loop ---
+
+    def _report(self) -> None:
+        """Publishes the status, logs what changed, keeps the scribe alive: ten times a second."""
+        run_beside_real_time()
+        said: tuple[str, str] | None = None
+        told: deque[str] = deque(maxlen=50)
+        while not self._ended.wait(0.1):
+            status = self._survey()
+            errors = list(status.scribe["errors"])
+            payload = self._status = encode_json(status)
+            self._streams.publish("status", payload)
+            self._scribe.note("status", payload.decode(), time.time_ns())
+            self._things.look()
+            try:
+                self._scribe.supervise()
+            except OSError as error:  # a want of descriptors or memory passes
+                errors.append(f"the scribe cannot be seen to: {error}")
+            for error_text in errors:
+                if error_text not in told:
+                    told.append(error_text)
+                    log.warning("%s", error_text)
+            for line in self._sources.news(status.sources, time.monotonic()):
+                log.warning("%s", line)
+            if status.tick >= 0 and (status.mode, status.reason) != said:
+                said = (status.mode, status.reason)
+                log.info("%s at tick %d%s", in_brief(*said), status.tick, in_full(status.because, status.remedy))
+
+    def _survey(self) -> Status:
+        """The status at this moment."""
+        frame, state, clock = self._frame, self._controller.state, self._clock
+        sources = self._sources.survey(self._controller, state, time.monotonic())
+        return CellStatus(frame, self._controller, state, sources, self._settings, self._failure).status(
+            time_ns=time.time_ns(),
+            rate_hz=clock.rate_hz(),
+            missed=clock.missed,
+            realtime=self._granted.realtime,
+            memory_locked=self._granted.locked,
+            received={key: arrivals.count for key, arrivals in self._sources.arrivals.items()},
+            lateness_us=self._lateness.percentiles(),
+            work_us=self._work.percentiles(),
+            latency_ms=self._latency.percentiles(),
+            scribe=self._scribe.status(),
+            command_heard=self._streams.is_followed,
+            endpoints=self.endpoints,
+            version=self._version,
+            tool_measured_m=self._measured_tool.told(state),
+        )
+
+
+def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> Skill:
+    """The skill in a file, with the via-points that were taught to it before. Raises SkillError."""
+    skill, saved = skill_worker.load(path, timeout_s=SLOWEST_START_S), SavedViaPoints(settings)
+    try:
+        found = saved.read(skill)
+    except SkillError as error:
+        path = saved.path(skill)
+        aside = path.with_suffix(".damaged")
+        with contextlib.suppress(OSError):
+            path.replace(aside)
+        log.warning("%s; it is kept as %s, and no via-points are in force", error, aside)
+        return skill
+    if found is None or found[0] == skill.via_points:
+        return skill
+    return skill_worker.adapt(skill, found[0], tolerance=found[1], timeout_s=SLOWEST_START_S)
+
+
+def serve(
+    settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]
+) -> str:
+    """The daemon from start to end; what the recordings lack, in words.
+
+    From the moment that it is ready SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError,
+    OccupiedError and UnreachableError before it starts, LoopError where it ends by itself.
+    """
+    lock = Lock(state_folder(settings), settings.cell)
+    skill_worker = SkillWorker()
+    try:
+        skill = load_skill(skill_worker, skill_path, settings)
+        daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, lock=lock)
+        for number in STOPPING:
+            signal.signal(number, daemon.stop)
+        return daemon.serve(announce)
+    finally:
+        skill_worker.close()
+        lock.close()

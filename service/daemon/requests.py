@@ -1,0 +1,298 @@
+"""Requests of clients: validated and answered beside the loop, carried out through its inbox."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from service.client import ENCODINGS
+from service.config import Settings
+from service.contract import channels
+from service.contract.requests import (
+    Add,
+    Clear,
+    List,
+    Nothing,
+    Remove,
+    Reply,
+    RequestError,
+    SkillRequest,
+    ViaPoint,
+    encode_json,
+)
+from service.core.frame import Event, Frame, order
+from service.core.setpoint.workspace import is_reachable
+from service.core.skill.skill import Skill
+from service.daemon import supervised_thread
+from service.daemon.clock import run_beside_real_time
+from service.daemon.saved_via_points import SavedViaPoints
+from service.daemon.skill_worker import SkillWorker
+from service.daemon.status import outcome
+from service.learning.skill_file import SkillError
+from service.learning.via_points import in_force, points_made_of, warnings_of
+
+ADOPTION_TIMEOUT_S = 2.0
+DECIDED_S = 0.001  # between looks whether the tick that took a request has been decided
+MOST_POINTS = 400  # that all via-points come to, with their neighbours
+MOST_WAITING = 16  # requests in a line
+LONGEST_LIST = 100  # bytes
+TEXT = zenoh.Encoding.TEXT_PLAIN
+ORDERS = ("hold", "resume", "reset")
+COMPUTED = "teaching"  # the line of what the skill worker computes for
+
+
+class Pending:
+    """An event on its way into the loop, and the tick that took it.
+
+    Either the loop takes it or its asker gives it up, never both.
+    """
+
+    def __init__(self, event: Event) -> None:
+        self._event = event
+        self._tick = -1
+        self._claim = threading.Lock()
+        self._taken = threading.Event()
+
+    def claimed(self, tick: int) -> Event | None:
+        """The event, consumed by this tick, or None where it was given up. Called by the loop."""
+        if not self._claim.acquire(blocking=False):
+            return None
+        self._tick = tick
+        self._taken.set()
+        return self._event
+
+    def wait(self) -> int:
+        """The tick that consumed it.
+
+        Raises RequestError where the loop does not; then it never will.
+        """
+        if not self._taken.wait(ADOPTION_TIMEOUT_S):
+            if self._claim.acquire(blocking=False):
+                raise RequestError("the loop did not take the request: it is starting, ending or stalled")
+            self._taken.wait()
+        return self._tick
+
+
+class Line:
+    """Requests that wait for a thread of their own; beyond MOST_WAITING they are refused."""
+
+    def __init__(self, name: str, answer: Callable[[str, zenoh.Query], None], failed: Callable[[str], None]) -> None:
+        self._name, self._answer = name, answer
+        self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(MOST_WAITING)
+        self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
+
+    def enqueue(self, suffix: str, query: zenoh.Query) -> None:
+        """Never waits."""
+        try:
+            self._waiting.put_nowait((suffix, query))
+        except queue.Full:
+            with query:
+                said = f"busy: {MOST_WAITING} {self._name} requests wait already; try again later"
+                query.reply_err(said.encode(), encoding=TEXT)
+
+    def close(self) -> None:
+        """Ends the thread; what waits is answered first."""
+        self._waiting.put(None)
+        self._thread.join(ADOPTION_TIMEOUT_S + 1)
+
+    def _serve(self) -> None:
+        run_beside_real_time()
+        while (item := self._waiting.get()) is not None:
+            self._answer(*item)
+            item = None  # the asker is told of the end where its query is let go
+
+
+class Requests:
+    """The queryables of one cell.
+
+    What is known is answered where it comes in. Each of hold, resume and reset has a line of its
+    own, and so have all that the skill worker computes for: none waits behind another.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        settings: Settings,
+        skill: Skill,
+        *,
+        skill_worker: SkillWorker,
+        skills: Path,
+        status: Callable[[], bytes],
+        frame: Callable[[], Frame],
+        note: Callable[[str], None],
+        keep: Callable[[bytes], object],
+        failed: Callable[[str], None],
+    ) -> None:
+        self.inbox: deque[Pending] = deque()
+        self._settings = settings
+        self._skill, self._in_force = skill, in_force(skill)
+        self._workshop = skill_worker
+        self._skills = skills
+        self._status = status
+        self._frame = frame
+        self._note = note
+        self._keep = keep
+        self._failed = failed
+        self._saved = SavedViaPoints(settings)
+        self._lines = {name: Line(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
+        self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
+
+    def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
+        here = threading.local()  # Zenoh calls from a thread of its own for each queryable
+
+        def come_in(query: zenoh.Query) -> None:
+            try:
+                if not hasattr(here, "is_beside"):
+                    here.is_beside = True
+                    run_beside_real_time()
+                if suffix == "status" or self._is_list(suffix, query):
+                    self._reply(suffix, query, noted=False)
+                else:
+                    self._lines[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
+            except Exception as error:
+                self._failed(f"the way in of {suffix} requests failed: {error!r}")
+
+        return session.declare_queryable(channels.key(self._settings.cell, suffix), come_in)
+
+    def close(self) -> None:
+        """Ends all threads; requests still waiting are answered first."""
+        for queryable in self._queryables:
+            queryable.undeclare()  # type: ignore[no-untyped-call]
+        for line in self._lines.values():
+            line.close()
+
+    @staticmethod
+    def _is_list(suffix: str, query: zenoh.Query) -> bool:
+        if suffix != "via_points" or query.payload is None or len(query.payload) > LONGEST_LIST:
+            return False
+        try:
+            return isinstance(channels.BY_KEY[suffix].codec.decode(query.payload.to_bytes()), List)
+        except RequestError:
+            return False
+
+    def _reply(self, suffix: str, query: zenoh.Query, *, noted: bool = True) -> None:
+        key = channels.key(self._settings.cell, suffix)
+        with query:  # its end tells the asker that no more replies come
+            try:
+                if str(query.key_expr) != key and suffix != "status":
+                    raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
+                size = 0 if query.payload is None else len(query.payload)
+                if size > channels.LARGEST_REQUEST:
+                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
+            except (RequestError, SkillError) as error:
+                self._note(f"{suffix} refused: {error}")
+                query.reply_err(str(error).encode(), encoding=TEXT)
+            except Exception as error:  # one request that fails must not end all others
+                self._note(f"{suffix} failed: {error!r}")
+                query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
+            else:
+                if noted:
+                    self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
+                query.reply(key, answer, encoding=ENCODINGS["json"])
+
+    def _answer(self, suffix: str, payload: bytes) -> Reply:
+        request = channels.BY_KEY[suffix].codec.decode(payload)
+        match request:
+            case SkillRequest(name):
+                return self._load(name)
+            case List():
+                return Reply(int(self._frame()["tick"]), self._in_force)
+            case Add() | Remove() | Clear():
+                return self._teach(request)
+            case Nothing():
+                return self._order(suffix)
+        raise RequestError(f"nothing is done with a request on {suffix}")
+
+    def _order(self, suffix: str) -> Reply:
+        """Hold, resume or reset, with the mode that resulted."""
+        before, _ = outcome(self._frame())
+        tick, end = self._through_the_loop(order(suffix)), time.monotonic() + ADOPTION_TIMEOUT_S
+        while int(self._frame()["tick"]) < tick and time.monotonic() < end:
+            time.sleep(DECIDED_S)
+        mode, reason = outcome(self._frame())
+        note = ""
+        if suffix == "reset" and before != "fault":
+            note = "there was no fault: nothing was reset"
+        elif suffix == "resume" and before == "follow":
+            note = "there was no hold to end"
+        elif suffix == "resume" and mode == "fault":
+            note = "a fault is ended by reset, not by resume"
+        return Reply(tick, mode=mode, reason=reason, note=note)
+
+    def _through_the_loop(self, event: Event) -> int:
+        pending = Pending(event)
+        self.inbox.append(pending)
+        return pending.wait()
+
+    def _adopt(self, skill: Skill) -> Reply:
+        self._keep(skill.file)
+        draft = self._saved.draft(skill)  # what cannot be saved is not taught
+        try:
+            tick = self._through_the_loop(Event("skill", skill.file, skill))
+            draft.replace(self._saved.path(skill))
+        finally:
+            draft.unlink(missing_ok=True)
+        before, self._skill, self._in_force = self._skill, skill, in_force(skill)
+        return Reply(tick, self._in_force, warnings_of(before, skill))
+
+    def _load(self, name: str) -> Reply:
+        folder = self._skills.resolve()
+        files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
+        there = {path.stem: path for path in files}  # and not what lies elsewhere, and is linked to
+        path = there.get(name.removesuffix(".npz"))
+        if path is None:
+            names = ", ".join(there) or "none"
+            raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {names}")
+        skill = self._workshop.load(path)
+        if found := self._saved.read(skill):  # what was taught goes with what was learned
+            points, tolerance = found
+            skill = self._workshop.adapt(skill, points, tolerance=tolerance)
+        return self._adopt(skill)
+
+    def _teach(self, request: Add | Remove | Clear) -> Reply:
+        points = {point.name: point for point in self._skill.via_points}
+        tolerance = self._skill.tolerance
+        match request:
+            case Clear():
+                points = {}
+            case Remove(names):
+                for i, name in enumerate(names):
+                    if name in names[:i]:
+                        raise RequestError(f"$.names[{i}]: {name!r} given twice, names once each needed")
+                    if name not in points:
+                        there = ", ".join(points) or "none"
+                        raise RequestError(f"$.names[{i}]: no via-point {name!r}. There are: {there}")
+                points = {name: point for name, point in points.items() if name not in names}
+            case Add(added, tolerance):
+                self._check(added)
+                points |= {point.name: point for point in added}
+        return self._adopt(self._workshop.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
+
+    def _check(self, added: Sequence[ViaPoint]) -> None:
+        """Raises RequestError for too many via-points, and for those that no target may reach."""
+        total = points_made_of(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
+        if total > MOST_POINTS:
+            raise RequestError(
+                f"$.points: {total} via-points in all, 13 for each with a radius; at most {MOST_POINTS} accepted"
+            )
+        low, high = self._skill.workspace
+        reach = self._settings.reach
+        for i, point in enumerate(added):
+            at, given = np.array(point.tool), f"$.points[{i}].tool: {list(point.tool)}"
+            if not ((low <= at) & (at <= high)).all():
+                corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
+                raise RequestError(f"{given} outside the skill's box, {corners} m accepted")
+            if not is_reachable(at, reach):
+                raise RequestError(
+                    f"{given} out of the arm's reach, {reach.inner} to {reach.outer} m from the shoulder, "
+                    f"x ≥ {reach.min_x} m and z ≥ {reach.min_z} m accepted"
+                )

@@ -1,0 +1,90 @@
+"""Via-points that survive a restart: a small file in the configured folder for each skill to which
+some were taught.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from service.config import Settings
+from service.contract.requests import Add, ViaPoint, decode_request
+from service.core.skill.skill import Skill
+from service.learning.skill_file import SkillError
+
+
+def state_folder(settings: Settings) -> Path:
+    """Where a cell keeps what survives a restart."""
+    return Path(settings.files.state).expanduser() / settings.cell
+
+
+def _checksum(saved: dict[str, Any]) -> str:
+    """Of all that is saved, however it is laid out."""
+    return hashlib.blake2b(json.dumps(saved, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+class SavedViaPoints:
+    """What was taught to each skill, on disk, so that it survives a restart; written atomically."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._folder = state_folder(settings)
+
+    def path(self, skill: Skill) -> Path:
+        """The file for this skill, known by what it was learned from."""
+        which = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
+        return self._folder / f"places-{which}.json"
+
+    def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
+        """Via-points and tolerance taught to this skill, or None.
+
+        Raises SkillError where the file is damaged.
+        """
+        path = self.path(skill)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise SkillError(f"cannot read via-points {path}: {error.strerror}") from None
+        try:
+            saved = json.loads(content)
+            if saved.pop("checksum") != _checksum(saved):
+                raise ValueError("its checksum is another: it was changed since; remove it, and teach them again")
+            request = (
+                decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
+                if saved["request"]
+                else None
+            )
+            if saved["learned_from"] != skill.learned_from:
+                return None
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise SkillError(f"{path} does not hold via-points ({error})") from None
+        return (request.points, request.tolerance) if request else ((), skill.tolerance)
+
+    def draft(self, skill: Skill) -> Path:
+        """A synced temporary file of the via-points of this skill, to be renamed over the old one.
+
+        Raises SkillError.
+        """
+        request = (
+            {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
+            if skill.via_points
+            else None
+        )
+        saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
+        content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self._folder, suffix=".new", delete=False) as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
+        return Path(file.name)

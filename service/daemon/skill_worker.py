@@ -1,0 +1,149 @@
+"""The skill worker: whatever computes for a request, so that the control process never does.
+
+A skill comes back as a small pickle and its arrays in shared memory: taking it over costs the
+control process no copying and no solving.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from service import child
+from service.contract.requests import ViaPoint
+from service.core.skill.skill import Skill
+from service.learning.skill_file import SkillError, decoded
+from service.learning.via_points import adapted
+
+TIMEOUT_S = 8.0  # shorter than a client waits
+
+
+class SkillWorker:
+    """Another process that makes skills.
+
+    Methods may be called from any thread; one request is worked on at a time.
+    """
+
+    def __init__(self) -> None:
+        self._busy = threading.Lock()
+        self._child: child.Child | None = None
+
+    def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> Skill:
+        """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
+        return self._ask(timeout_s, "load", path, None, 0.0)
+
+    def adapt(
+        self, skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
+    ) -> Skill:
+        """The skill that goes through these via-points and no others.
+
+        Raises SkillError, also after `timeout_s` [s].
+        """
+        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance)
+
+    def close(self) -> None:
+        """Ends the process, also while it works."""
+        if (running := self._child) is not None:
+            running.process.kill()
+        with self._busy:
+            self._end()
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.socket.close()
+            self._child.process.kill()
+            self._child.process.wait()
+            self._child = None
+
+    def _ask(self, timeout_s: float, *request: Any) -> Skill:
+        with self._busy:
+            if self._child is None or self._child.process.poll() is not None:
+                self._end()
+                self._child = child.start("service.daemon.skill_worker", socket.SOCK_STREAM)
+            try:
+                self._child.socket.settimeout(timeout_s)
+                _send(self._child.socket, pickle.dumps(request))
+                answer = _receive(self._child.socket)
+            except TimeoutError:
+                self._end()
+                raise SkillError(
+                    f"the skill worker did not answer within {timeout_s:g} s; nothing was changed"
+                ) from None
+            except (OSError, EOFError):
+                self._end()
+                raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
+        if isinstance(answer, Skill):
+            return answer
+        raise SkillError(answer)
+
+
+def _send(channel: socket.socket, *parts: Any) -> None:
+    """One message: its parts go into shared memory, only the descriptor through the socket."""
+    fd = child.in_memory(*parts)
+    try:
+        socket.send_fds(channel, [b"\0"], [fd])
+    finally:
+        os.close(fd)
+
+
+def _receive(channel: socket.socket) -> Any:
+    """One message, its arrays left in the shared memory that it came in."""
+    _, descriptors, _, _ = socket.recv_fds(channel, 1, 1)
+    if not descriptors:
+        raise EOFError
+    value, *buffers = child.from_memory(descriptors[0])
+    return pickle.loads(value, buffers=buffers)
+
+
+def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, tolerance: float) -> Skill:
+    if kind == "load":
+        try:
+            data = Path(source).read_bytes()
+        except OSError as error:
+            raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
+        skill = decoded(data, origin=str(source))
+    else:
+        skill = decoded(source, origin="the skill in force")
+    if via_points is not None:
+        skill = adapted(skill, via_points, tolerance=tolerance)
+    place = skill.hands[0].reshape(2, 3)
+    skill.predict(place, 0 * place, 0 * place)  # what is computed once is computed here
+    skill.digest  # noqa: B018
+    return skill
+
+
+def _main(descriptor: int) -> None:
+    """The child: one request after the other until the other end closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    child.end_with_parent()
+    os.nice(10)
+    with socket.socket(fileno=descriptor) as channel:
+        while True:
+            try:
+                request = _receive(channel)
+            except (EOFError, OSError):
+                return
+            buffers: list[pickle.PickleBuffer] = []
+            try:
+                answer: Skill | str = _work(*request)
+            except Exception as error:  # the asker is told, whatever it was
+                answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
+            skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+            try:
+                _send(channel, skill, *(b.raw() for b in buffers))
+            except BrokenPipeError:
+                return
+
+
+if __name__ == "__main__":
+    _main(int(sys.argv[1]))

@@ -1,0 +1,87 @@
+"""The daemon's ends of its cell's streams: the newest samples in, each tick's outputs out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from service.client import publisher
+from service.config import Settings
+from service.contract import channels, ros2
+from service.contract.messages import WireError
+from service.core.frame import Event
+from service.daemon.input_monitor import Arrivals
+from service.daemon.ros2 import Ros2
+
+LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+
+
+class Streams:
+    """What a cell hears and says on a session, with a ROS 2 domain where its settings name one.
+
+    `receive` and `publish` are for the loop; what came is told to `arrivals`, by channel.
+    What fails beside it is told to `failed`.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        settings: Settings,
+        *,
+        arrivals: Mapping[str, Arrivals],
+        failed: Callable[[str], None],
+    ) -> None:
+        cell, domain = settings.cell, settings.network.ros2_domain
+        self._arrivals = arrivals
+        self.newest: dict[str, Event] = {}
+        heard = [c for c in ros2.HEARD if c.key != "joints/state" or settings.arm.source == "state"]
+        keys = [(channel, channels.key(cell, channel.key)) for channel in heard]
+        if domain is not None:
+            keys += [(channel, ros2.key(domain, cell, channel)) for channel in heard]
+        self._subscribers = [(channel, session.declare_subscriber(key, RingChannel(1))) for channel, key in keys]
+        self._publishers = {
+            channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
+            for channel in channels.CHANNELS
+            if channel.direction == "out"
+        }
+        self._ros2 = None if domain is None else Ros2(session, cell, domain, heard=heard, failed=failed)
+
+    def receive(self) -> list[Event]:
+        """The newest message of each source, if it is new and can be read."""
+        return [event for channel, source in self._subscribers if (event := self._receive(channel, source))]
+
+    def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
+        sample = subscriber.try_recv()
+        if sample is None:
+            return None
+        arrivals = self._arrivals[channel.key]
+        try:
+            if len(sample.payload) > LARGEST_MESSAGE:
+                raise WireError(f"{len(sample.payload)} bytes, at most {LARGEST_MESSAGE} accepted")
+            payload = sample.payload.to_bytes()
+            event = self.newest[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
+            arrivals.take(event.value, time.time_ns())
+            return event
+        except WireError as error:
+            arrivals.refuse(str(error))
+            return None
+
+    def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Sends on a channel; what cannot be sent at once is dropped."""
+        self._publishers[suffix].put(payload, attachment=attachment)
+        if self._ros2 is not None:
+            self._ros2.publish(suffix, payload)
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether anybody hears the commands."""
+        return bool(self._publishers["joints/command"].matching_status.matching)  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        """Ends what runs beside the loop."""
+        if self._ros2 is not None:
+            self._ros2.close()

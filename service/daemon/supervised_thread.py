@@ -1,0 +1,35 @@
+"""The one place that keeps the service's threads running: work that an exception ends is told of
+and begun again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+log = logging.getLogger("thirdhand")
+PAUSE_S = 0.1
+
+
+def supervised(name: str, work: Callable[[], None], failed: Callable[[str], None], *, pause_s: float = PAUSE_S) -> None:
+    """Runs `work` to its end.
+
+    Where an exception ends it, that is logged and told to `failed`, and after `pause_s` [s] it
+    begins anew; what `failed` raises ends it for good.
+    """
+    while True:
+        try:
+            return work()
+        except Exception as error:
+            log.exception("the %s failed", name)
+            failed(f"the {name} failed: {error!r}")
+        time.sleep(pause_s)
+
+
+def start(name: str, work: Callable[[], None], failed: Callable[[str], None]) -> threading.Thread:
+    """A thread of `supervised` work."""
+    thread = threading.Thread(target=supervised, args=(name, work, failed), name=name, daemon=True)
+    thread.start()
+    return thread

@@ -1,0 +1,1 @@
+"""Demonstrations on disk: captured, listed, trimmed, and read from recordings of others."""

@@ -1,0 +1,308 @@
+"""Taking a demonstration: hands, tool and gripper of a cell, heard over Zenoh until somebody ends
+it or all is at rest, and written as they came.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import zenoh
+
+from service.client import Overheard
+from service.config import Settings, robot_description
+from service.contract import cdr, channels
+from service.contract.explain import ExplainedError
+from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
+from service.contract.requests import ViaPoint, encode_json
+from service.core.frame import Vector
+from service.core.intake.intake import FARTHEST_M, UNIT_M
+from service.demonstrations.files import far_away, from_tracker, is_by_tracker
+from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
+from service.demonstrations.tool_poses import tool_poses
+from service.recording.mcap_file import McapFile, machine
+
+HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
+HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
+ELSEWHERE, MOST_OTHERS = ("**/hands/*", "**/tool/pose"), 8  # what is published in other cells, or misspelt
+REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, and hands tremble
+TOLD = 0.7  # of that time samples have to cover
+MOVED = 5.0  # times that, before rest is the end
+KEPT_S = 0.3  # of the rest before and after the motion
+SILENT_S = 2.0  # after which nothing more is waited for
+POLL_S, TELL_S = 0.02, 0.1
+Until = Literal["key", "rest"]
+
+
+class TakeError(ExplainedError, RuntimeError):
+    """A demonstration that could not be taken; the message says what was not heard."""
+
+
+class Sample(NamedTuple):
+    """A message as it came in: when [ns], its bytes, and what rest is told from (a hand's or the
+    tool's position [m], or joints [rad]).
+    """
+
+    arrived_ns: int
+    payload: bytes
+    at: Vector
+
+
+class Take:
+    """What is heard of one demonstration; subscribed until closed."""
+
+    def __init__(self, session: zenoh.Session, cell: str, settings: Settings) -> None:
+        self.cell, self.settings = cell, settings
+        self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD}
+        self.malformed: dict[str, int] = {}
+        self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in HEARD}
+        self._heard_s, self._moved = time.monotonic(), False
+        self._subscribers = [session.declare_subscriber(channels.key(cell, key), self._listener(key)) for key in HEARD]
+
+    def _listener(self, key: str) -> Callable[[zenoh.Sample], None]:
+        waiting = self._waiting[key]
+        return lambda sample: waiting.append((time.time_ns(), sample.payload.to_bytes()))
+
+    def close(self) -> None:
+        """Hears no more."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self.collect()
+
+    def collect(self) -> None:
+        """Takes in what came since the last time; what is not readable is counted."""
+        for key, waiting in self._waiting.items():
+            while waiting:
+                arrived_ns, payload = waiting.pop(0)
+                self._heard_s = time.monotonic()
+                try:
+                    self.samples[key].append(Sample(arrived_ns, payload, self._at(key, payload)))
+                except WireError:
+                    self.malformed[key] = self.malformed.get(key, 0) + 1
+
+    def _at(self, key: str, payload: bytes) -> Vector:
+        message = channels.BY_KEY[key].codec.decode(payload)
+        if isinstance(message, PoseStamped):
+            if not finite(message.position + message.orientation):
+                raise WireError("a pose that is not finite")
+            is_scaled = is_by_tracker(key, message.frame_id, self.settings.hands)
+            return UNIT_M[self.settings.hands.unit if is_scaled else "m"] * np.array(message.position)
+        if key == GRIPPER_STATE:
+            return np.array(message.position[:1])
+        return np.array(in_order(message, self.settings.joints.names)[0])
+
+    @property
+    def missing(self) -> list[str]:
+        """What has not been heard yet of what a demonstration needs."""
+        tool = [] if self.samples[TOOL] or self.samples[JOINT_STATES] else [f"{TOOL} or {JOINT_STATES}"]
+        return [key for key in HANDS if not self.samples[key]] + tool
+
+    def check(self) -> None:
+        """Raises TakeError where a hand or the tool is too far away to be meant."""
+        hands = self.settings.hands
+        for key in (*HANDS, TOOL):
+            for sample in self.samples[key][-1:]:
+                pose = channels.POSE.decode(sample.payload)
+                at = np.array(pose.position)
+                if is_by_tracker(key, pose.frame_id, hands):
+                    at = from_tracker(at, hands)
+                if np.linalg.norm(at) > FARTHEST_M:
+                    why = far_away(key, pose.frame_id, pose.position, hands)
+                    raise TakeError(f"{key} is {why}. Nothing is recorded")
+
+    @property
+    def streams(self) -> dict[str, list[Sample]]:
+        """The streams by which it is judged: both hands, and the tool as it is tracked, else the
+        arm's joints.
+        """
+        return {key: self.samples[key] for key in (*HANDS, TOOL if self.samples[TOOL] else JOINT_STATES)}
+
+    @property
+    def silent_s(self) -> float:
+        """Time since anything came [s]."""
+        return time.monotonic() - self._heard_s
+
+    def begin(self) -> None:
+        """Forgets what came before: from here on it is kept."""
+        for samples in self.samples.values():
+            del samples[:-1]
+
+    def is_over(self, rest_s: float) -> bool:
+        """Whether all has been at rest for so long [s] after it moved."""
+        now_ns = time.time_ns()
+        began_ns = min(samples[0].arrived_ns for samples in self.streams.values())
+        if now_ns - began_ns < 1e9 * rest_s:
+            return False
+        for key, samples in self.streams.items():
+            lately = _since(samples, now_ns - int(1e9 * rest_s))
+            still = [sample.at for sample in lately]
+            self._moved = self._moved or (bool(still) and _apart(key, np.array([samples[0].at, still[-1]])) > MOVED)
+            told_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
+            if told_s < TOLD * rest_s or _apart(key, np.array(still)) > 1:
+                return False
+        return self._moved
+
+    def keep_motion(self) -> tuple[float, float]:
+        """Keeps what came while anything moved, with KEPT_S of rest before and behind; how much was
+        left out before and behind [s].
+        """
+        times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
+        start_ns, end_ns = self.span_of_motion()
+        self.keep(start_ns, end_ns)
+        return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
+
+    def span_of_motion(self) -> tuple[int, int]:
+        """From when to when anything moves [ns], with KEPT_S of rest before and behind."""
+        begins, ends = [], []
+        for key, samples in self.streams.items():
+            at = np.array([sample.at for sample in samples])
+            margin = REST_RAD if key == JOINT_STATES else REST_M
+            away = [np.abs(at - at[end]).max(axis=1) > margin for end in (0, -1)]
+            if away[0].any():
+                begins.append(samples[int(np.argmax(away[0]))].arrived_ns)
+                ends.append(samples[len(at) - 1 - int(np.argmax(away[1][::-1]))].arrived_ns)
+        if not begins:
+            return 0, time.time_ns()
+        return min(begins) - int(1e9 * KEPT_S), max(ends) + int(1e9 * KEPT_S)
+
+    def keep(self, start_ns: int, end_ns: int) -> None:
+        """Keeps what arrived in this time, and forgets the rest."""
+        for key, samples in self.samples.items():
+            self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
+
+    def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
+        """Writes the take: the messages as they came, the tool found from the joints where nobody
+        tracks it, the places of the task as far as they are told, settings and URDF attached. All
+        or nothing.
+
+        Raises TakeError, OSError.
+        """
+        if lacking := self.missing:
+            raise TakeError(f"nothing of {', '.join(lacking)} came in this time: no demonstration is written")
+        urdf = robot_description(self.settings)
+        messages = [
+            (sample.arrived_ns, key, sample.payload) for key, samples in self.samples.items() for sample in samples
+        ]
+        if not self.samples[TOOL]:
+            messages += self._tool_by_joints(urdf)
+        if places:
+            told = cdr.encode_string(encode_json(tuple(places)).decode())
+            messages.append((min(messages)[0], PLACES, told))
+        part = path.with_name(f".{path.name}.part")
+        file = McapFile(part, joints=len(self.settings.joints.names))
+        try:
+            now_ns = time.time_ns()
+            file.writer.add_metadata("thirdhand", {"cell": self.cell, **machine()})
+            for name, kind, data in (
+                ("settings.json", "application/json", msgspec.json.encode(self.settings)),
+                ("arm.urdf", "application/xml", urdf.encode()),
+            ):
+                file.writer.add_attachment(now_ns, now_ns, name, kind, data)
+            for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
+                codec = channels.STRING if key == PLACES else channels.BY_KEY[key].codec
+                file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
+            file.close()
+            part.replace(path)
+        finally:
+            file.abandon()
+            part.unlink(missing_ok=True)
+
+    def _tool_by_joints(self, urdf: str) -> list[tuple[int, str, bytes]]:
+        states = self.samples[JOINT_STATES]
+        stamps = [channels.JOINTS.decode(state.payload).stamp_ns or state.arrived_ns for state in states]
+        poses, kept = tool_poses(self.settings, urdf, np.array(stamps), np.array([state.at for state in states]))
+        return [
+            (
+                states[i].arrived_ns,
+                TOOL,
+                channels.POSE.encode(PoseStamped(stamps[i], BASE, tuple(at[:3]), tuple(at[3:]))),
+            )
+            for i, at in zip(kept, poses.tolist(), strict=True)
+        ]
+
+
+def _since(samples: list[Sample], since_ns: int) -> list[Sample]:
+    """The last samples, that arrived since a time."""
+    at = len(samples)
+    while at and samples[at - 1].arrived_ns >= since_ns:
+        at -= 1
+    return samples[at:]
+
+
+def _apart(key: str, at: Vector) -> float:
+    """How far positions or joints (N, K) are apart, 1 for as far as they may be at rest."""
+    return float(np.ptp(at, axis=0).max()) / (REST_RAD if key == JOINT_STATES else REST_M)
+
+
+def take(
+    session: zenoh.Session,
+    cell: str,
+    settings: Settings,
+    *,
+    until: Until,
+    rest_s: float,
+    is_ended: Callable[[], bool],
+    wait_s: float,
+    longest_s: float,
+    progress: Callable[[str], None] = lambda line: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Take:
+    """A demonstration, taken from when hands and tool are heard until `is_ended`, until all rests
+    for `rest_s` after it moved, or until nothing came for a while.
+
+    Raises TakeError where they are not heard within `wait_s`.
+    """
+    taken, others = Take(session, cell, settings), Overheard(session, *ELSEWHERE)
+    at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
+    try:
+        begun_s = time.monotonic()
+        say(f"waiting for {', '.join(taken.missing)} of cell {cell}")
+        while taken.missing:
+            if time.monotonic() - begun_s > wait_s or is_ended():
+                unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in taken.malformed.items())
+                meant = {channels.key(cell, key) for key in HEARD}
+                elsewhere = [key for key in others.keys if key not in meant][:MOST_OTHERS]
+                instead = f"; heard instead: {', '.join(elsewhere)}" if elsewhere else ""
+                raise TakeError(
+                    f"not heard: {', '.join(taken.missing)}{unreadable}{instead}. Are tracker and arm running, "
+                    f"connected to the same place, and in cell {cell}?"
+                )
+            time.sleep(POLL_S)
+            taken.collect()
+        others.close()
+        taken.check()
+        taken.begin()
+        begun_s, told_s = time.monotonic(), 0.0
+        say(f"recording{f'; it ends once {at_rest} after they moved' if until == 'rest' else ''}")
+        while not is_ended():
+            time.sleep(POLL_S)
+            taken.collect()
+            lasts_s = time.monotonic() - begun_s
+            if lasts_s - told_s > TELL_S:
+                told_s = lasts_s
+                counts = ", ".join(f"{key} {len(samples)}" for key, samples in taken.streams.items())
+                progress(f"{lasts_s:5.1f} s   {counts}")
+            if until == "rest" and taken.is_over(rest_s):
+                say(f"ended by rest: {at_rest}")
+                break
+            if lasts_s > longest_s:
+                say(f"ended after {longest_s:g} s")
+                break
+            if taken.silent_s > SILENT_S:
+                say(f"ended: nothing came for {SILENT_S:g} s")
+                break
+    except KeyboardInterrupt:
+        if taken.missing:
+            raise
+    finally:
+        others.close()
+        taken.close()
+    if until == "rest":
+        before_s, behind_s = taken.keep_motion()
+        if before_s or behind_s:
+            say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s behind it")
+    return taken

@@ -1,0 +1,284 @@
+"""Demonstrations and hands in recordings, ours and others': brought to frame `base` and to common
+stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.config import HandSettings, Settings
+from service.contract import cdr
+from service.contract.channels import JOINTS, POSE, STRING, topic
+from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
+from service.contract.requests import encode_json
+from service.core.frame import Vector
+from service.core.intake.far_away import too_far
+from service.core.intake.intake import FARTHEST_M, UNIT_M
+from service.core.rotation import rotation
+from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, Recorded, Source, Track, chosen
+from service.learning.demonstration import Demonstration
+from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
+from service.recording.mcap_reader import Messages, next_whole
+
+_STREAMS = tuple(ENDINGS.values())
+LARGEST_DELAY_S = 0.2  # of one stream more than of another, from a stamp to its recording
+
+
+def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
+    """Writes a demonstration in frame `base`.
+
+    The same arrays give the same bytes. Raises ValueError.
+    """
+    stamps_ns, left, right, tool = demonstration[:4]
+    poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
+    for name, stream in zip(_STREAMS, poses, strict=True):
+        if stream.shape != (len(stamps_ns), 7) or not np.isfinite(stream).all():
+            raise ValueError(
+                f"{name}: shape {stream.shape} given, finite numbers of shape ({len(stamps_ns)}, 7) needed"
+            )
+    gripper = demonstration.gripper
+    if gripper is not None and (gripper.shape != (len(stamps_ns),) or not np.isfinite(gripper).all()):
+        given, wanted = gripper.shape, (len(stamps_ns),)
+        raise ValueError(f"{GRIPPER_STATE}: shape {given} given, finite numbers of shape {wanted} needed")
+    file = McapFile(Path(path), joints=0, attached=False)
+    try:
+        for i, (stamp, *rows) in enumerate(
+            zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
+        ):
+            for name, row in zip(_STREAMS, rows, strict=True):
+                data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
+                file.put(topic(cell, name), POSE.type, data, stamp, i)
+            if gripper is not None:
+                data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
+                file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
+        if demonstration.places:
+            text = encode_json(demonstration.places).decode()
+            file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+    finally:
+        file.close()
+
+
+def read_demonstration(
+    path: str | Path,
+    *,
+    sources: Mapping[str, Source] | None = None,
+    settings: Settings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Demonstration:
+    """The demonstration in a recording: the hands and the tool in frame `base` at the tool's
+    stamps, as far as all three reach.
+
+    MCAP files, ours and others', and bags. Topics are those in `sources` (by left, right, tool),
+    else they are found by their ends, whatever the cell, or by what can be meant alone. Hands are
+    brought to `base` as the daemon does it, by the `settings`, by default those in the file. Where
+    the streams have stamps of their own, the hands are interpolated linearly; where these are of
+    clocks that differ, the times count at which they were recorded.
+
+    Raises RecordingError, also where there is damage: what it took may lie amid a motion. A file
+    that was cut ends early; that, and what was found or assumed, is told to `say`.
+    """
+    recorded = Recorded.open(path)
+    settings = settings or recorded.settings or Settings()
+    if any(not fault.cut for fault in recorded.faults):
+        there = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        faults = "; ".join(map(str, recorded.faults))
+        raise RecordingError(f"{path}: {faults}; {there} can be read; nothing is learned from it")
+    tracks, said = chosen(recorded, sources or {}, settings)
+    for fault in recorded.faults:
+        say(f"{path}: {fault}; {', '.join(f'{len(track.poses)} poses on {track.name}' for track in tracks)} are there")
+    count = sum(len(track.poses) for track in tracks)
+    if recorded.is_ours:  # what the daemon rejects, too
+        tracks = [_kept(track, _is_pose(track.poses)) for track in tracks]
+    told = tracks
+    tracks, mapped = in_base(path, tracks, settings.hands)
+    if recorded.is_ours:
+        tracks = [_kept(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
+        for track, before in zip(tracks, told, strict=True):
+            if len(before.poses) and not len(track.poses):
+                why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings.hands)
+                raise RecordingError(
+                    f"{path}: all {len(before.poses)} poses on {before.name} are too far, the first {why}"
+                )
+        if left_out := count - sum(len(track.poses) for track in tracks):
+            said.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
+    if said or mapped:
+        say(f"{path}: {'; '.join([*said, *mapped])}")
+    tracks, clocks = _by_one_clock(tracks)
+    if clocks:
+        say(f"{path}: {clocks}")
+    rows = []
+    for track in tracks:
+        stamps, first = np.unique(track.stamps_ns, return_index=True)
+        if len(stamps) < 2:
+            raise RecordingError(
+                f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+            )
+        rows.append((stamps, track.poses[first]))
+    stamps = rows[2][0]
+    start, end = max(row[0][0] for row in rows), min(row[0][-1] for row in rows)
+    stamps = stamps[(stamps >= start) & (stamps <= end)]
+    if len(stamps) < 2:
+        raise RecordingError(
+            f"{path}: hands and tool have less than two stamps of the tool in common: "
+            "by which clocks were they stamped?"
+        )
+    left, right, tool = (_resampled(stamps, *row) for row in rows)
+    stamps.setflags(write=False)
+    return Demonstration(
+        stamps, left, right, tool, BASE, recorded.places, recorded.closures(stamps, logged=bool(clocks))
+    )
+
+
+def _is_pose(poses: Vector) -> NDArray[np.bool_]:
+    """Which of the poses (N, 7) are finite, with a quaternion of norm 1."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.isfinite(poses).all(axis=1) & (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) <= 0.01))
+
+
+def _kept(track: Track, mask: NDArray[np.bool_]) -> Track:
+    """The track with some of its poses."""
+    return track._replace(stamps_ns=track.stamps_ns[mask], logged_ns=track.logged_ns[mask], poses=track.poses[mask])
+
+
+def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
+    """Whether the poses of a stream, `hands/left`, say, are told by the tracker's axes and unit."""
+    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
+    return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in of_hands)
+
+
+def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) in frame `base` [m], of those in the tracker's frame and unit."""
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
+
+
+def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
+    """What is said of a position of a stream, as it was told, that is too far from the base plate;
+    and what to do.
+    """
+    if is_by_tracker(name, frame, hands):
+        return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
+    rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
+    also = ", or name the tracker's frame in it and in [hands] frame: what it names is in [hands] unit"
+    return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
+
+
+def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
+    """Tracks of left hand, right hand and tool in frame `base`, and in words which were brought
+    there.
+
+    The hands' as the daemon takes what comes in: all but what is in `base` where the tracker has a
+    frame of its own. The tool's only where it names that frame. Raises RecordingError for others.
+    """
+    for track in tracks:
+        if track.frame not in ("", BASE, hands.frame):
+            known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
+            raise RecordingError(
+                f"{path}: {track.name} is in frame {track.frame!r}: {BASE!r}{known} needed, or a configuration "
+                "(--config) whose [hands] frame names it and says by base_from_tracker where it is"
+            )
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
+        return list(tracks), []
+    by_tracker = [is_by_tracker(track.name, track.frame, hands) for track in tracks]
+    if not any(by_tracker):
+        return list(tracks), []
+    turn, out = Rotation.from_matrix(axes), []
+    for track, is_mapped in zip(tracks, by_tracker, strict=True):
+        if is_mapped:
+            at = from_tracker(track.poses[:, :3], hands)
+            turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
+            track = track._replace(poses=np.hstack([at, turns]), frame=BASE)  # noqa: PLW2901
+        out.append(track)
+    names = ", ".join(track.name for track, is_mapped in zip(tracks, by_tracker, strict=True) if is_mapped)
+    return out, [f"{names} brought to frame {BASE} by [hands] unit and base_from_tracker"]
+
+
+def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
+    """Tracks with stamps of one clock, and in words why they are not their own; empty: they are."""
+    if not all(len(track.poses) for track in tracks):
+        return list(tracks), ""
+    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
+    if max(ahead_s) - min(ahead_s) <= LARGEST_DELAY_S or any(not np.ptp(track.logged_ns) for track in tracks):
+        return list(tracks), ""
+    clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
+    return [track._replace(stamps_ns=track.logged_ns) for track in tracks], (
+        f"stamps are of different clocks (against the recorder's {clocks}): the times of recording count instead"
+    )
+
+
+def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (T, 7) at `stamps`, between those at `at` (N,) by linear interpolation, quaternions the
+    short way and of norm 1.
+    """
+    if np.isin(stamps, at).all():
+        out = poses[np.searchsorted(at, stamps)]
+    else:
+        signs = np.cumprod(np.where(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0, -1.0, 1.0), axis=0)
+        smooth = np.concatenate([poses[:, :3], poses[:, 3:] * np.concatenate([[1.0], signs])[:, None]], axis=1)
+        times, knots = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out = np.stack([np.interp(times, knots, column) for column in smooth.T], axis=1)
+        out[:, 3:] /= np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
+    out.setflags(write=False)
+    return out
+
+
+def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
+    """Log time [ns], side and CDR bytes of every hand sample in order of time, one after the other.
+
+    Raises RecordingError.
+
+    Reads demonstrations, recordings and other ROS 2 recordings; of a file that was cut, what is
+    there, in the order of writing.
+    """
+    path = existing(path)
+    streams = PoseStreams(path, _STREAMS[:2])
+    empty = True
+    with path.open("rb") as stream:
+        messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()
+        while found := next_whole(messages, path):
+            name = streams.name(found[0], found[1])
+            if name:
+                empty = False
+                yield found[2].log_time, name.removeprefix("hands/"), found[2].data
+    if empty:
+        raise streams.missing("hands/left or hands/right")
+
+
+class PoseStreams:
+    """Which topics of a file are the wanted streams of poses, or of another type; one topic each,
+    whatever the cell.
+    """
+
+    def __init__(self, path: Path, names: tuple[str, ...], kind: str = POSE.type) -> None:
+        self._path, self._names, self._kind = path, names, kind
+        self._found: dict[str, str] = {}
+        self._seen: set[str] = set()
+
+    def name(self, schema: Any, channel: Any) -> str:
+        """The stream that a message belongs to; empty: none of them."""
+        topic = channel.topic
+        self._seen.add(topic)
+        name = next((name for name in self._names if f"/{topic}".endswith(f"/{name}")), "")
+        if (
+            not name
+            or schema is None
+            or schema.name.replace("/msg/", "/") != self._kind.replace("/msg/", "/")
+            or channel.message_encoding != "cdr"
+        ):
+            return ""
+        if self._found.setdefault(name, topic) != topic:
+            raise RecordingError(f"{self._path} has two streams of {name}: {self._found[name]} and {topic}")
+        return name
+
+    def missing(self, name: str) -> RecordingError:
+        """The error that says that a stream is not there, and what is."""
+        topics = ", ".join(sorted(self._seen)) or "none"
+        return RecordingError(f"{self._path} has no topic ending in {name} with {self._kind}; its topics: {topics}")

@@ -1,0 +1,369 @@
+"""Streams of poses in ROS 2 recordings of any kind, ours and others': MCAP files, bag folders,
+`.db3` and `.bag`; and which of them are the hands and the tool.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import Settings, robot_description
+from service.contract import cdr
+from service.contract.channels import JOINTS, POSE, STRING
+from service.contract.messages import BASE, PoseStamped, WireError, in_order
+from service.contract.requests import Add, ViaPoint, decode_request
+from service.core.frame import Vector
+from service.demonstrations.tool_poses import tool_poses
+from service.recording.mcap_file import RecordingError, existing
+from service.recording.mcap_reader import Fault, Messages
+
+SIDES = ("left", "right", "tool")
+ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
+JOINT_STATES, GRIPPER_STATE, PLACES = "joints/state", "gripper/state", "places"
+OF_A_HAND = {"hand", "hands", "wrist", "palm", "glove"}
+WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
+MANY, TREE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
+KINDS = (
+    POSE.type,
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    MANY,
+    TREE,
+)
+
+
+class Source(NamedTuple):
+    """A topic, and the index in a PoseArray or the child frame in a TFMessage; empty: its only."""
+
+    topic: str
+    part: str = ""
+
+    @classmethod
+    def parsed(cls, text: str) -> Source:
+        """Of `TOPIC` or `TOPIC:PART`."""
+        topic, _, part = text.partition(":")
+        return cls(topic, part)
+
+    def __str__(self) -> str:
+        return f"{self.topic}:{self.part}" if self.part else self.topic
+
+
+class Track(NamedTuple):
+    """Poses (N, 7) of one stream, x y z and quaternion x y z w, in `frame`; as what they were
+    stamped (N,) [ns], and when they were recorded (N,) [ns].
+    """
+
+    name: str
+    source: str
+    stamps_ns: NDArray[np.int64]
+    logged_ns: NDArray[np.int64]
+    poses: Vector
+    frame: str
+
+
+Parts = tuple[list[int], list[int], list[tuple[float, ...]], str]
+
+
+class Recorded:
+    """The messages of a recording from which poses can be read, by topic."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: dict[str, str] = {}  # types by topic, of all there are
+        self.faults: list[Fault] = []
+        self.settings: Settings | None = None  # those that were in force, where it is ours
+        self.urdf = ""
+        self.places: tuple[ViaPoint, ...] = ()  # named, where they were told
+        self._raw: dict[str, list[tuple[int, bytes]]] = {}
+        self._read: dict[str, dict[str, Parts]] = {}
+        self._decode: Callable[[bytes, str], Any]
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether its settings are attached."""
+        return self.settings is not None
+
+    @classmethod
+    def open(cls, path: str | Path) -> Recorded:
+        """What is in an MCAP file, a bag's folder, a `.db3` or a `.bag`. Raises RecordingError."""
+        path = Path(path)
+        found = cls(path)
+        if path.is_dir() or path.suffix in (".db3", ".bag"):
+            found._read_bag()
+        else:
+            found._read_mcap()
+        return found
+
+    def _read_mcap(self) -> None:
+        messages = Messages(existing(self.path))
+        for schema, channel, message in messages:
+            kind = "" if schema is None else _full(schema.name)
+            self.topics.setdefault(channel.topic, kind)
+            if channel.message_encoding == "cdr" and kind in (*KINDS, JOINTS.type):
+                self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
+            elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES}"):
+                self.places = self._decoded_places(message.data)
+        self.faults = messages.faults
+        if "settings.json" in messages.attachments:
+            try:
+                self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)
+            except msgspec.DecodeError as error:
+                raise RecordingError(f"the settings in {self.path} are not understood: {error}") from None
+            self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
+        self._decode = _decoder("ROS2_HUMBLE", "deserialize_cdr")
+
+    def _decoded_places(self, data: bytes) -> tuple[ViaPoint, ...]:
+        try:
+            return Add(decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])).points
+        except (WireError, ValueError) as error:
+            raise RecordingError(f"{self.path}: {PLACES}: {error}") from None
+
+    def _read_bag(self) -> None:
+        from rosbags.rosbag1 import Reader as OfRos1  # heavy, and most recordings are MCAP files
+        from rosbags.rosbag2 import Reader as OfRos2
+
+        if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
+            raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
+        of_ros_1 = self.path.suffix == ".bag"
+        try:
+            with (OfRos1 if of_ros_1 else OfRos2)(self.path) as bag:
+                self.topics = {one.topic: one.msgtype for one in bag.connections}
+                wanted = [one for one in bag.connections if one.msgtype in (*KINDS, JOINTS.type)]
+                for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
+                    self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
+        except Exception as error:  # what its storages raise has no common base
+            there = "" if self.path.exists() else " It is not there."
+            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{there}") from None
+        self._decode = (
+            _decoder("ROS1_NOETIC", "deserialize_ros1") if of_ros_1 else _decoder("ROS2_HUMBLE", "deserialize_cdr")
+        )
+
+    def tracks(self, topic: str) -> dict[str, Parts]:
+        """The streams of poses in a topic by part: stamps, times of recording [ns], poses, frame.
+
+        Raises RecordingError.
+        """
+        if topic in self._read:
+            return self._read[topic]
+        kind = self.topics[topic]
+        out = self._read[topic] = dict[str, Parts]()
+        for logged_ns, data in self._raw.get(topic, ()):
+            try:
+                parts = _poses(kind, self._decode(data, kind))
+            except Exception as error:  # the deserialiser says what it came upon in many ways
+                raise RecordingError(f"{self.path}: {topic}: a {kind} that is not readable: {error}") from None
+            for part, stamp_ns, frame, pose in parts:
+                if not (self.is_ours or np.isfinite(pose).all()):
+                    raise RecordingError(
+                        f"{self.path}: {topic}: a pose that is not finite, at stamp {stamp_ns or logged_ns} ns"
+                    )
+                stamps, logged, poses, _ = out.setdefault(part, ([], [], [], frame))
+                if frame != out[part][3]:
+                    raise RecordingError(
+                        f"{self.path}: {Source(topic, part)}: poses in frames {out[part][3]!r} and {frame!r}"
+                    )
+                stamps.append(stamp_ns or logged_ns)
+                logged.append(logged_ns)
+                poses.append(pose)
+        return out
+
+    def track(self, name: str, source: Source) -> Track:
+        """One stream as arrays. Raises RecordingError."""
+        stamps, logged, poses, frame = self.tracks(source.topic)[source.part]
+        return Track(name, str(source), np.array(stamps), np.array(logged), np.array(poses), frame)
+
+    def tool_by_joints(self, topic: str, settings: Settings, urdf: str) -> Track:
+        """The tool in frame `base`, found from joint states by the URDF. Raises RecordingError."""
+        stamps, logged, joints = [], [], []
+        for logged_ns, data in self._raw[topic]:
+            try:
+                state = self._joint_state(data)
+                joints.append(in_order(state, settings.joints.names)[0])
+            except WireError as error:
+                raise RecordingError(f"{self.path}: {topic}: {error}") from None
+            stamps.append(state.stamp_ns or logged_ns)
+            logged.append(logged_ns)
+        poses, kept = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
+        source = f"{topic}, by the URDF"
+        return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
+
+    def closures(self, stamps: NDArray[np.int64], *, logged: bool = False) -> Vector | None:
+        """How far the gripper is closed (T,) at stamps (T,) [ns], as the first joint of the topic
+        ending in `gripper/state` tells, by the times of recording where `logged`; None where there
+        is none. Raises RecordingError.
+        """
+        topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
+        if len(topics) > 1:
+            raise RecordingError(f"{self.path}: topics {', '.join(sorted(topics))}: one gripper needed")
+        told: dict[int, float] = {}
+        for logged_ns, data in self._raw[topics[0]] if topics else ():
+            try:
+                state = self._joint_state(data)
+            except WireError as error:
+                raise RecordingError(f"{self.path}: {topics[0]}: {error}") from None
+            if not np.isfinite(state.position[:1]).all() or not state.position:
+                raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {state.stamp_ns} ns")
+            told[logged_ns if logged else state.stamp_ns or logged_ns] = state.position[0]
+        if not told:
+            return None
+        at = np.array(sorted(told), np.int64)
+        ways = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out: Vector = np.interp(*ways, [told[i] for i in at.tolist()])
+        out.setflags(write=False)
+        return out
+
+    def _joint_state(self, data: bytes) -> Any:
+        """Raises WireError."""
+        if self.path.suffix != ".bag":
+            return cdr.decode_joints(data)
+        raise WireError("joint states of ROS 1 are not read; a bag of ROS 2 needed, or --tool with poses")
+
+    def joint_topic(self, settings: Settings) -> str:
+        """The one topic with joint states of the arm's joints; empty: none, or several."""
+        found = []
+        for topic, raw in self._raw.items():
+            if self.topics[topic] == JOINTS.type:
+                try:
+                    in_order(self._joint_state(raw[0][1]), settings.joints.names)
+                except WireError:
+                    continue
+                found.append(topic)
+        exact = [topic for topic in found if f"/{topic}".endswith(f"/{JOINT_STATES}")]
+        return exact[0] if len(exact) == 1 else found[0] if len(found) == 1 else ""
+
+    def streams(self) -> Iterator[tuple[Source, int]]:
+        """Every stream of poses, and how many there are in it."""
+        for topic in sorted(self._raw):
+            if self.topics[topic] in KINDS:
+                for part, (stamps, *_) in self.tracks(topic).items():
+                    yield Source(topic, part), len(stamps)
+
+
+def chosen(recorded: Recorded, given: Mapping[str, Source], settings: Settings) -> tuple[list[Track], list[str]]:
+    """The tracks of left hand, right hand and tool; and in words what was not said, but found.
+
+    By what is `given`, else by the topics' endings, the tool else by joint states, all else by
+    words in the names. Raises RecordingError.
+    """
+    urdf = recorded.urdf or robot_description(settings)
+    tracks: list[Track] = []
+    said: list[str] = []
+    for name in SIDES:
+        source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
+        joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
+        if source is None and name == "tool":
+            joints = recorded.joint_topic(settings)
+        if joints:
+            tracks.append(recorded.tool_by_joints(joints, settings, urdf))
+            said.append(f"tool found from {joints} by the arm's URDF")
+            continue
+        if source is None:
+            source = _by_words(recorded, name)
+            said.append(f"{name} is {source}")
+        tracks.append(recorded.track(ENDINGS[name], source))
+    return tracks, said
+
+
+def _given(recorded: Recorded, name: str, wanted: Source) -> Source:
+    """The stream that was named, as the recording has it. Raises RecordingError."""
+    topic = next((topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), "")
+    if topic and recorded.topics[topic] == JOINTS.type and name == "tool":
+        return Source(topic)
+    if not topic or recorded.topics[topic] not in KINDS:
+        what = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
+        raise RecordingError(f"{recorded.path}: --{name} {wanted}: {what}; {_what_is_there(recorded)}")
+    parts = list(recorded.tracks(topic))
+    if wanted.part in parts:
+        return Source(topic, wanted.part)
+    if len(parts) == 1 and not wanted.part:
+        return Source(topic, parts[0])
+    which = "an index" if recorded.topics[topic] == MANY else "a child frame"
+    needed = f"{which} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
+    raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
+
+
+def _by_ending(recorded: Recorded, name: str) -> Source | None:
+    """The stream of PoseStamped under our own name, whatever the cell. Raises RecordingError."""
+    found = [
+        topic
+        for topic, kind in recorded.topics.items()
+        if kind == POSE.type and f"/{topic}".endswith(f"/{ENDINGS[name]}") and "" in recorded.tracks(topic)
+    ]
+    if len(found) > 1:
+        raise RecordingError(
+            f"{recorded.path} has two streams of {ENDINGS[name]}: {found[0]} and {found[1]}; --{name} says which"
+        )
+    return Source(found[0]) if found else None
+
+
+def _by_words(recorded: Recorded, name: str) -> Source:
+    """The one stream whose name says so. Raises RecordingError."""
+    others = {word for other in SIDES[:2] if other != name for word in WORDS[other]}
+    streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
+    words = {source: _words(str(source)) for source in streams}
+    fitting = [source for source in streams if words[source] & WORDS[name] and not words[source] & others]
+    if len(fitting) > 1 and name != "tool":
+        fitting = [source for source in fitting if words[source] & OF_A_HAND]
+    if len(fitting) == 1:
+        return fitting[0]
+    also = f" or {JOINT_STATES} of the arm's joints" if name == "tool" else ""
+    several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
+    raise RecordingError(
+        f"{recorded.path} has no topic ending in {ENDINGS[name]} with {POSE.type}{also}{several}; "
+        f"{_what_is_there(recorded)}; --{name} TOPIC[:PART] names another"
+    )
+
+
+def _words(text: str) -> set[str]:
+    """The words of a name: `/vrpn/LeftHand_1` has vrpn, left, hand, 1."""
+    return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)}
+
+
+def _what_is_there(recorded: Recorded) -> str:
+    poses = ", ".join(f"{source} ({count})" for source, count in recorded.streams())
+    return f"its topics: {', '.join(sorted(recorded.topics)) or 'none'}; of these hold poses: {poses or 'none'}"
+
+
+def _full(kind: str) -> str:
+    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`."""
+    return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
+
+
+def _decoder(store: str, function: str) -> Callable[[bytes, str], Any]:
+    """What decodes messages; made at the first that needs it."""
+    made: list[Callable[[bytes, str], Any]] = []
+
+    def decode(data: bytes, kind: str) -> Any:
+        if kind == POSE.type and function == "deserialize_cdr":
+            return cdr.decode_pose(data)
+        if not made:
+            from rosbags.typesys import Stores, get_typestore  # takes a moment
+
+            made.append(getattr(get_typestore(Stores[store]), function))
+        return made[0](data, kind)
+
+    return decode
+
+
+def _poses(kind: str, message: Any) -> Iterator[tuple[str, int, str, tuple[float, ...]]]:
+    """Part, stamp [ns], frame, and pose x y z, quaternion x y z w, of each pose in a message."""
+    if isinstance(message, PoseStamped):
+        yield "", message.stamp_ns, message.frame_id, message.position + message.orientation
+        return
+    for i, one in enumerate(message.transforms if kind == TREE else message.poses if kind == MANY else [message]):
+        header = message.header if kind == MANY else one.header
+        stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        if kind == MANY:
+            at, turn, part = one.position, one.orientation, str(i)
+        elif kind == TREE or kind.endswith("TransformStamped"):
+            at, turn, part = one.transform.translation, one.transform.rotation, one.child_frame_id.strip("/")
+        else:
+            pose = one.pose.pose if kind.endswith("PoseWithCovarianceStamped") else one.pose
+            at, turn, part = pose.position, pose.orientation, ""
+        yield part, stamp_ns, header.frame_id.strip("/"), (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)

@@ -1,0 +1,262 @@
+"""Demonstrations on disk, one file a take: what is in them, as text and as a picture; trimmed and
+deleted.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service import palette
+from service.config import Settings
+from service.contract.channels import JOINTS, POSE
+from service.core.frame import Vector
+from service.demonstrations.files import read_demonstration
+from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
+from service.learning.demonstration import LEAST_M, Demonstration
+from service.recording.mcap_file import McapFile, RecordingError
+from service.recording.mcap_reader import Messages
+
+NAME = r"\w[\w .-]{0,63}"
+GAP_S = 0.1  # after which the daemon calls a hand stale
+JUMP_M, FASTEST = 0.02, 5.0  # [m, m/s] of a hand, from one sample to the next
+BLOCKS = "▁▂▃▄▅▆▇█"
+WIDTH = 60  # letters of the plot
+COLOURS = {
+    side: palette.written(colour)
+    for side, colour in zip(SIDES, (palette.LEFT, palette.RIGHT, palette.TOOL), strict=True)
+}
+
+
+class TakeNameError(RecordingError):
+    """A take that is not there, is there already, or cannot be called so."""
+
+
+class Stream(NamedTuple):
+    """What there is of one stream: how many poses at which rate [Hz], the longest time without one
+    [s] and when that began [s], and their frame.
+    """
+
+    name: str
+    poses: int
+    rate_hz: float
+    gap_s: float
+    gap_at_s: float
+    frame: str
+
+
+class Summary(NamedTuple):
+    """What a take holds, and what learning would make of it."""
+
+    path: Path
+    demonstration: Demonstration
+    streams: tuple[Stream, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def lasts_s(self) -> float:
+        """From the first to the last sample that hands and tool have in common [s]."""
+        return float(np.ptp(self.demonstration.stamps_ns)) / 1e9
+
+
+def path_of(folder: Path, name: str) -> Path:
+    """Where a take of this name is, or is to be. Raises TakeNameError."""
+    name = name.removesuffix(".mcap")
+    if not re.fullmatch(NAME, name):
+        raise TakeNameError(f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name")
+    return folder / f"{name}.mcap"
+
+
+def there(folder: Path, name: str) -> Path:
+    """The path of a take that is there. Raises TakeNameError."""
+    path = path_of(folder, name)
+    if not path.is_file():
+        names = ", ".join(found.stem for found in takes(folder)) or "none"
+        raise TakeNameError(f"no take {path.stem!r} in {folder}. There are: {names}")
+    return path
+
+
+def takes(folder: Path) -> list[Path]:
+    """The files of the takes in a folder, `take-2` before `take-10`."""
+    return sorted(folder.glob("*.mcap"), key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
+
+
+def _split(name: str) -> list[str]:
+    return re.split(r"(\d+)", name)
+
+
+def summary(path: Path, *, settings: Settings | None = None) -> Summary:
+    """What a take holds, by `settings` or those it was taken with. Raises RecordingError."""
+    remarks: list[str] = []
+    demonstration = read_demonstration(path, settings=settings, say=lambda line: remarks.append(_without(path, line)))
+    recorded = Recorded.open(path)
+    tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
+    streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
+    remarks += _still(demonstration)
+    for side in SIDES:
+        if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
+            remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
+    return Summary(path, demonstration, streams, tuple(remarks))
+
+
+def _still(demonstration: Demonstration) -> list[str]:
+    """What is said where hands or tool do not move, and nothing can be learned."""
+    found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
+    moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
+    return [
+        f"{name}: no more than {1000 * m:.1f} mm of motion, of which nothing is learned ({1000 * LEAST_M:g} needed)"
+        for name, m in moved
+        if m < LEAST_M
+    ]
+
+
+def _without(path: Path, line: str) -> str:
+    return line.removeprefix(f"{path}: ")
+
+
+def _jumps(at: Vector, seconds: Vector) -> int:
+    """How often positions (N, 3) [m] change as no hand moves."""
+    return int((np.linalg.norm(np.diff(at, axis=0), axis=1) > JUMP_M + FASTEST * np.diff(seconds)).sum())
+
+
+def _stream(side: str, track: Track) -> Stream:
+    logged = np.sort(track.logged_ns) / 1e9
+    gaps = np.diff(logged, prepend=logged[:1])
+    lasts_s, worst = float(np.ptp(logged)), int(np.argmax(gaps))
+    rate = (len(logged) - 1) / lasts_s if lasts_s else 0.0
+    began = float(logged[max(0, worst - 1)] - logged[0])
+    return Stream(side, len(logged), rate, float(gaps[worst]), began, track.frame)
+
+
+def table(found: Summary) -> str:
+    """What a take holds, as lines of text with a plot of speeds."""
+    lines = [f"{found.path}: {found.lasts_s:.1f} s"]
+    lines += [
+        f"  {one.name:<6}{one.poses:>7} poses  {one.rate_hz:6.1f} Hz  longest gap {1e3 * one.gap_s:.0f} ms at "
+        f"{one.gap_at_s:.1f} s  frame {one.frame or 'not named'}"
+        for one in found.streams
+    ]
+    if found.demonstration.places:
+        lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
+    lines += [f"  {remark}" for remark in found.remarks]
+    speeds = {side: _speed(found.demonstration, side) for side in SIDES}
+    lines += [
+        f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s" for side, speed in speeds.items()
+    ]
+    end = f"{found.lasts_s:.1f} s"
+    lines.append(f"  speed {'0 s':<{WIDTH - len(end)}}{end}")
+    return "\n".join(lines)
+
+
+def _speed(demonstration: Demonstration, side: str) -> Vector:
+    """Greatest speed [m/s] in each of WIDTH parts of the time, over 0.1 s."""
+    at: Vector = getattr(demonstration, side)[:, :3]
+    seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
+    edges = np.linspace(0.0, seconds[-1], WIDTH + 1)
+    window = min(0.1, float(seconds[-1]))
+    grid = np.arange(0.0, max(seconds[-1] - window, window), window / 2)
+    begin, end = (
+        np.stack([np.interp(grid + late, seconds, column) for column in at.T], axis=1) for late in (0.0, window)
+    )
+    speeds = np.linalg.norm(end - begin, axis=1) / window
+    return np.asarray(np.interp((edges[:-1] + edges[1:]) / 2, grid + window / 2, speeds))
+
+
+def _blocks(speed: Vector) -> str:
+    greatest = max(float(np.max(speed)), 0.05)  # rest is no mountain
+    return "".join(BLOCKS[min(int(len(BLOCKS) * one / greatest), len(BLOCKS) - 1)] for one in speed)
+
+
+def draw(found: Summary, path: Path) -> None:
+    """Writes a picture of a take, a PNG: positions over time, gaps shaded; the ways from above."""
+    from matplotlib.figure import Figure  # heavy, and most do without
+
+    figure = Figure(figsize=(11, 6.5), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(3, 2, width_ratios=(3, 2))
+    demonstration = found.demonstration
+    seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
+    first = figure.add_subplot(grid[0, 0])
+    axes = [first, *(figure.add_subplot(grid[i, 0], sharex=first) for i in (1, 2))]
+    above = figure.add_subplot(grid[:, 1])
+    for side in SIDES:
+        at = getattr(demonstration, side)
+        for i, axis in enumerate(axes):
+            axis.plot(seconds, at[:, i], color=COLOURS[side], lw=1.2, label=side)
+        above.plot(at[:, 0], at[:, 1], color=COLOURS[side], lw=1.2, label=side)
+        above.plot(at[0, 0], at[0, 1], "o", color=COLOURS[side], ms=5)
+    for i, axis in enumerate(axes):
+        axis.set_ylabel(f"{'xyz'[i]} [m]")
+        axis.label_outer()
+        for one in found.streams:
+            if one.gap_s > GAP_S:
+                axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=COLOURS[one.name], alpha=0.15, lw=0)
+    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base")
+    axes[-1].set_xlabel("time [s]")
+    above.set(title="from above; dots: the start", xlabel="x [m]", ylabel="y [m]")
+    above.set_aspect("equal", adjustable="datalim")
+    above.legend(frameon=False)
+    figure.savefig(path)
+
+
+def uncut(path: Path) -> Path:
+    """Where a take is kept as it was before it was trimmed: out of reach of `learn *.mcap`."""
+    return path.with_name(f"{path.name}.uncut")
+
+
+def trim(path: Path, start_s: float, end_s: float) -> str:
+    """Cuts a take to what was recorded from `start_s` to `end_s` [s] after its first sample, all or
+    nothing; in words what was cut. What is no stream of poses or joints stays whole. The take as it
+    was stays beside it, under the name that `uncut` tells, unless there is one already.
+
+    Raises RecordingError where nothing that can be learned from would be left.
+    """
+    messages = Messages(path)
+    rows = list(messages)
+    if messages.faults:
+        raise RecordingError(f"{path}: {'; '.join(map(str, messages.faults))}; it is not trimmed")
+    streams = {POSE.type, JOINTS.type}
+    times_ns = [row[2].log_time for row in rows if row[0] and row[0].name in streams] or [0]
+    begin_ns, lasts_s = min(times_ns), (max(times_ns) - min(times_ns)) / 1e9
+    kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
+    if len(kept_s) == len(times_ns):
+        return f"nothing is cut: {path} lasts {lasts_s:.1f} s"
+    part = path.with_name(f".{path.name}.part")
+    joints = next((len(JOINTS.decode(row[2].data).names) for row in rows if row[0] and row[0].name == JOINTS.type), 0)
+    file = McapFile(part, joints=joints)
+    try:
+        for name, content in messages.metadata.items():
+            file.writer.add_metadata(name, content)
+        for name, data in messages.attachments.items():
+            kind = "application/json" if name.endswith(".json") else "application/xml"
+            file.writer.add_attachment(begin_ns, begin_ns, name, kind, data)
+        for schema, channel, message in rows:
+            if schema is None or channel.message_encoding != "cdr":
+                raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it is not trimmed")
+            at_s = (message.log_time - begin_ns) / 1e9
+            if schema.name not in streams or start_s <= at_s <= end_s:
+                file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+        file.close()
+        try:
+            summary(part)
+        except RecordingError:
+            raise RecordingError(
+                f"{path} lasts {lasts_s:.1f} s: from {start_s:g} to {end_s:g} s too little is left, and it stays as "
+                "it was"
+            ) from None
+        whole = uncut(path)
+        was_there = whole.exists()
+        if not was_there:
+            path.replace(whole)
+        part.replace(path)
+        return (
+            f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s; "
+            f"the uncut take is {'still' if was_there else 'kept as'} {whole}"
+        )
+    except KeyError as error:
+        raise RecordingError(f"{path}: messages of type {error} are of no take; it is not trimmed") from None
+    finally:
+        file.abandon()
+        part.unlink(missing_ok=True)

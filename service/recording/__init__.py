@@ -1,0 +1,1 @@
+"""The scribe process and its files: recordings (MCAP) written, read and replayed."""

@@ -1,0 +1,275 @@
+"""MCAP files as we read them: every checksum verified, up to where a file was cut, and on behind
+what is damaged.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from service.recording.mcap_file import RecordingError
+
+Found = tuple[Schema | None, Channel, Message]
+_HEAD = struct.Struct("<BQ")  # opcode, bytes that follow
+_FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
+_COMPRESSIONS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4"))
+_BEFORE_COMPRESSION = _HEAD.size + 28  # bytes of a chunk
+_BLOCK = 1 << 20
+_NAMING = {
+    int(kind): record
+    for kind, record in ((Opcode.SCHEMA, Schema), (Opcode.CHANNEL, Channel), (Opcode.METADATA, Metadata))
+}
+_BROKEN = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    UnicodeDecodeError,
+    ValueError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    MemoryError,
+)
+
+
+class Fault(NamedTuple):
+    """What of a file cannot be read: from which byte on, how many, why, and whether its end is
+    missing (a cut) or there is more behind (damage).
+    """
+
+    cut: bool
+    at: int
+    size: int
+    why: str
+
+    def __str__(self) -> str:
+        if self.cut:
+            return f"cut at byte {self.at}: the end is missing ({self.why})"
+        return f"damage at byte {self.at}: {self.size} bytes cannot be trusted ({self.why})"
+
+
+class Messages:
+    """The schema, channel and message of every message of an MCAP file in file order.
+
+    `faults` are those met so far: one that is new when a message comes lies before that message.
+    `attachments` and `metadata` are those met so far whose checksums are right.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.faults: list[Fault] = []
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+
+    def __iter__(self) -> Iterator[Found]:
+        with self.path.open("rb") as stream:
+            reading = _Reading(stream, self.faults)
+            schemas, channels = reading.named_in_summary()
+            unnamed = False
+            for record in reading.records():
+                if isinstance(record, Message):
+                    channel = channels.get(record.channel_id)
+                    if channel is not None:
+                        yield schemas.get(channel.schema_id), channel, record
+                    elif not unnamed:
+                        unnamed = True
+                        why = f"messages on channel {record.channel_id}, whose name is not there"
+                        self.faults.append(Fault(False, stream.tell(), 0, why))
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Attachment):
+                    self.attachments[record.name] = record.data
+                elif isinstance(record, Metadata):
+                    self.metadata[record.name] = record.metadata
+
+
+class _Reading:
+    """One pass over a file."""
+
+    def __init__(self, stream: IO[bytes], faults: list[Fault]) -> None:
+        self._stream, self._faults = stream, faults
+        self._size = stream.seek(0, 2)
+        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None once it cannot be known
+        self._chunked = False
+        closing = self._size - len(MCAP0_MAGIC)
+        self._closed = closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
+        self._footer_at = closing - _FOOTER.size
+        self._footer = self._bytes(self._footer_at, _FOOTER.size) if self._footer_at > 0 else b""
+        self._closed = self._closed and self._footer[:9] == _HEAD.pack(Opcode.FOOTER, _FOOTER.size - _HEAD.size)
+
+    def named_in_summary(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """The schemas and channels that the file's end repeats, if it has one that is whole: so the
+        chunk that held them first may be damaged.
+        """
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        if self._closed and (at := self._summary()):
+            while at < self._footer_at:
+                opcode, length = _HEAD.unpack(self._bytes(at, _HEAD.size))
+                content = ReadDataStream(BytesIO(self._bytes(at + _HEAD.size, length)))
+                if opcode == Opcode.SCHEMA:
+                    schema = Schema.read(content)
+                    schemas[schema.id] = schema
+                elif opcode == Opcode.CHANNEL:
+                    channel = Channel.read(content)
+                    channels[channel.id] = channel
+                at += _HEAD.size + length
+        return schemas, channels
+
+    def _summary(self) -> int:
+        """Where the summary begins if its checksum is right, else 0."""
+        _, _, start, _, checksum = _FOOTER.unpack(self._footer)
+        if not 0 < start <= self._footer_at or not checksum:
+            return 0
+        covered = self._bytes(start, self._footer_at + _FOOTER.size - 4 - start)
+        return int(start) if zlib.crc32(covered) == checksum else 0
+
+    def records(self) -> Iterator[McapRecord]:
+        """The records of the data section, those in chunks one by one."""
+        at = len(MCAP0_MAGIC)
+        while True:
+            end = None
+            try:
+                opcode, end = self._head(at)
+                content = self._bytes(at + _HEAD.size, end - at - _HEAD.size)
+                found = self._understood(opcode, content)
+            except _BROKEN as error:
+                self._checksum = None
+                follows = self._follows(at, end)
+                why = str(error) or type(error).__name__
+                if follows is None:
+                    self._faults.append(Fault(not self._closed, at, self._size - at, why))
+                    return
+                self._faults.append(Fault(False, at, follows - at, why))
+                at = follows
+                continue
+            if self._checksum is not None:
+                self._checksum = zlib.crc32(content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum))
+            yield from found
+            if opcode == Opcode.DATA_END:
+                self._end(end)
+                return
+            at = end
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Opcode and end of the record at a byte."""
+        if at + _HEAD.size > self._size:
+            raise ValueError("the file ends before the recording does")
+        opcode, length = _HEAD.unpack(self._bytes(at, _HEAD.size))
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END and opcode < 0x80:
+            raise ValueError(f"no record of MCAP has the type {opcode}")
+        if at + _HEAD.size + length > self._size:
+            raise ValueError(f"a record of {length} bytes reaches over the end of the file")
+        return opcode, at + _HEAD.size + length
+
+    def _understood(self, opcode: int, content: bytes) -> list[McapRecord]:
+        """What a record holds, with its checksum verified."""
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.CHUNK:
+            self._chunked = True
+            return breakup_chunk(Chunk.read(stream), validate_crc=True)
+        if content[28:].startswith(_COMPRESSIONS):
+            raise ValueError(f"a chunk by its content, of type {opcode} by its head")
+        if opcode == Opcode.MESSAGE:
+            if self._chunked:
+                raise ValueError("a message outside the chunks")
+            return [Message.read(stream, len(content))]
+        if opcode == Opcode.ATTACHMENT:
+            checksum = int.from_bytes(content[-4:], "little")
+            if checksum and zlib.crc32(content[:-4]) != checksum:
+                raise ValueError("an attachment's checksum is wrong")
+            return [Attachment.read(stream)]
+        if opcode == Opcode.DATA_END:
+            told = DataEnd.read(stream).data_section_crc
+            if told and self._checksum is not None and told != self._checksum:
+                why = "the checksum over all data is wrong, outside of what has one of its own"
+                self._faults.append(Fault(False, 0, self._stream.tell(), why))
+            return []
+        if opcode not in _NAMING:
+            return []
+        return [_NAMING[opcode].read(stream)]
+
+    def _follows(self, at: int, end: int | None) -> int | None:
+        """Where reading can go on behind a record that is broken: at its end if a record is there,
+        else at the next whole chunk, if there is one.
+        """
+        if end is not None:
+            try:
+                self._head(end)
+                return end
+            except ValueError:
+                pass
+        return self._next_chunk(at + 1)
+
+    def _next_chunk(self, start: int) -> int | None:
+        """Where the next chunk begins whose content is whole."""
+        block_at = start
+        while block_at < self._size:
+            block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)
+            places = sorted(place for mark in _COMPRESSIONS for place in _places(block, mark))
+            for place in places:
+                at = block_at + place - _BEFORE_COMPRESSION
+                if at >= start and self._is_chunk(at):
+                    return at
+            block_at += _BLOCK
+        return None
+
+    def _is_chunk(self, at: int) -> bool:
+        try:
+            opcode, end = self._head(at)
+            if opcode != Opcode.CHUNK:
+                return False
+            breakup_chunk(
+                Chunk.read(ReadDataStream(BytesIO(self._bytes(at + _HEAD.size, end - at - _HEAD.size)))),
+                validate_crc=True,
+            )
+        except _BROKEN:
+            return False
+        return True
+
+    def _end(self, at: int) -> None:
+        """Verifies what stands behind the data."""
+        if self._closed:
+            _, _, start, _, checksum = _FOOTER.unpack(self._footer)
+            if checksum and start and not self._summary():
+                self._faults.append(Fault(False, at, self._size - at, "the summary's checksum is wrong"))
+        else:
+            whole = self._footer[:1] == bytes([Opcode.FOOTER])
+            why = "the closing bytes are not those of MCAP" if whole else "nothing closes the file"
+            self._faults.append(Fault(not whole, at, self._size - at, why))
+
+    def _bytes(self, at: int, count: int) -> bytes:
+        self._stream.seek(at)
+        return self._stream.read(count)
+
+
+def _places(block: bytes, mark: bytes) -> Iterator[int]:
+    at = block.find(mark)
+    while at >= 0:
+        yield at
+        at = block.find(mark, at + 1)
+
+
+def next_whole(messages: Iterator[Found], path: Path) -> Found | None:
+    """The next message of an indexed file, None at its end.
+
+    Raises RecordingError where the file is damaged.
+    """
+    try:
+        return next(messages, None)
+    except _BROKEN as error:
+        raise RecordingError(f"{path} is damaged: {type(error).__name__} {error}".strip()) from None

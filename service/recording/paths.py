@@ -1,0 +1,105 @@
+"""Where a cell's recordings go: the names of the next ones, and which old ones are removed to keep
+within the limits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from service.config import Settings
+from service.recording.mcap_reader import Messages
+from service.shipped import recordings
+
+MB = 1e6
+
+
+class Places:
+    """The paths of one recording after another.
+
+    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, in the order of time by their names;
+    else they are `recording` and `rrd`, the later ones numbered.
+    """
+
+    def __init__(
+        self, settings: Settings, folder: str | None, recording: str | None, rrd: str | None, *, attempt: int = 1
+    ) -> None:
+        self._settings = settings
+        self._folder = None if folder is None else Path(folder)
+        self._explicit = [None if path is None else Path(path) for path in (recording, rrd)]
+        self._number = attempt
+        self._newest = datetime.min.replace(tzinfo=UTC)
+        self._ours: dict[str, bool] = {}  # by the names of recordings
+        self._cell = settings.cell.replace("/", "-")
+
+    def next(self) -> tuple[Path | None, Path | None]:
+        """Paths for the next recording and the drawing beside it; None: not wanted."""
+        if self._folder is None:
+            while True:
+                number, self._number = self._number, self._number + 1
+                recording, rrd = (
+                    path and (path if number == 1 else path.with_stem(f"{path.stem}-{number}"))
+                    for path in self._explicit
+                )
+                if number == 1 or not any(path is not None and path.exists() for path in (recording, rrd)):
+                    return recording, rrd
+        at = max(datetime.now(UTC).replace(microsecond=0), self._newest + timedelta(seconds=1))
+        while any(path.exists() for path in self._named(at)):
+            at += timedelta(seconds=1)
+        self._newest = at
+        recording, rrd = self._named(at)
+        return recording, rrd if self._settings.files.rerun else None
+
+    def _named(self, at: datetime) -> tuple[Path, Path]:
+        assert self._folder is not None
+        stem = f"{self._cell}-{at:%Y%m%dT%H%M%SZ}"
+        return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
+
+    def prune(self, writing: Path | None) -> list[Path]:
+        """Removes this cell's oldest recordings beyond the limits, never the one being written;
+        what was removed.
+        """
+        keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
+        if self._folder is None or not (keep_bytes or keep_s):
+            return []
+        ours = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
+        found: dict[str, list[tuple[Path, int, float]]] = {}
+        for path in self._folder.glob("*Z*.*"):
+            if path.suffix in (".mcap", ".rrd") and ours.fullmatch(path.stem) and self._is_ours(path):
+                with contextlib.suppress(OSError):
+                    about = path.stat()
+                    found.setdefault(path.stem, []).append((path, about.st_size, about.st_mtime))
+        total = sum(size for files in found.values() for _, size, _ in files)
+        removed: list[Path] = []
+        for stem in sorted(found):
+            files = found[stem]
+            too_old = keep_s and time.time() - max(changed for *_, changed in files) > keep_s
+            too_much = keep_bytes and total > keep_bytes
+            if (writing is not None and stem == writing.stem) or not (too_old or too_much):
+                continue
+            for path, size, _ in files:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    total -= size
+                    removed.append(path)
+        return removed
+
+    def _is_ours(self, path: Path) -> bool:
+        """Whether a recording, and the drawing beside it, is not another cell's, whose name with
+        its slashes replaced is the same.
+        """
+        if path.stem not in self._ours:
+            messages = Messages(path.with_suffix(".mcap"))
+            with contextlib.suppress(OSError):
+                next(iter(messages), None)
+            cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
+            self._ours[path.stem] = cell == self._settings.cell
+        return self._ours[path.stem]
+
+
+def skills_folder(settings: Settings) -> Path:
+    """Where the skills of a cell are, and the demonstrations that they were learned from."""
+    return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()

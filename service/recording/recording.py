@@ -1,0 +1,326 @@
+"""Recordings as MCAP files: a Recorder that writes what each tick consumed and decided, a Recording
+that gives it back.
+
+All channels are ROS 2 messages in CDR, so that ROS 2 tools, Rerun and Foxglove read a recording as
+it is. Within a file the order is: settings, skill and URDF as attachments, then tick by tick
+`tick`, its events, `frame`, `timing`, `state`; what is there only for other tools is ignored on
+reading.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from service.config import Settings, robot_description
+from service.contract import cdr, channels
+from service.contract.messages import BASE, Quaternion, Thing, Transform, Vector3
+from service.contract.records import SIDES
+from service.core.frame import Record, Tick, encode
+from service.core.outputs import outgoing
+from service.demonstrations.pose_streams import ENDINGS
+from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
+from service.recording.mcap_reader import Fault, Messages
+from service.recording.steps import REPLAYED, Gap, Step, steps
+from service.urdf import Urdf
+from service.viewer.markers import with_balls
+
+THINGS = "objects"
+FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
+_LATCHED = (
+    "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
+    "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
+)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+class Recorder:
+    """Writes a recording.
+
+    Errors of the file system are raised; `flush` bounds what a kill can lose.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        settings: Settings,
+        skill: bytes,
+        state: Record | None = None,
+        urdf: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        time_ns: int = 0,
+    ) -> None:
+        self._urdf = robot_description(settings) if urdf is None else urdf
+        self._settings, self._skill, self._state = settings, skill, state
+        self._begun, self._sequence = False, 0
+        self._links = Urdf(self._urdf)
+        self._topics = {
+            channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
+        }
+        self._file = McapFile(Path(path), joints=len(settings.joints.names))
+        self.path = self._file.path
+        about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
+        self.kept = self.pending = 0  # ticks in the file, ticks that wait for the end of their chunk
+        writer = self._file.writer
+        try:
+            writer.add_metadata("thirdhand", about)
+            writer.add_attachment(time_ns, time_ns, "settings.json", "application/json", msgspec.json.encode(settings))
+            writer.add_attachment(time_ns, time_ns, "skill.npz", "application/octet-stream", skill)
+            writer.add_attachment(time_ns, time_ns, "arm.urdf", "application/xml", self._urdf.encode())
+        except OSError:
+            self._file.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._file.size
+
+    @property
+    def skill(self) -> bytes:
+        """The file of the skill in force."""
+        return self._skill
+
+    def lost_name(self) -> str:
+        """Empty while the file is where it was made; else `removed` or `moved`."""
+        return self._file.lost_name()
+
+    def _begin(self, time_ns: int) -> None:
+        """The initial state and the robot's description carry the time of the first thing written.
+
+        A reader's time line starts there.
+        """
+        self._begun = True
+        self._put("/robot_description", cdr.encode_string(with_balls(self._urdf)), time_ns, qos=_LATCHED)
+        if self._state is not None:
+            self._put("state", encode(self._state), time_ns)
+
+    def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
+        """One message on a channel: as the channel has it, or as its events are kept."""
+        channel = channels.BY_KEY[key]
+        kind = channel.kept_as.type
+        self._file.put(self._topics[key], kind, data, time_ns, self._sequence, qos=qos)
+
+    def write(
+        self,
+        tick: Tick,
+        frame: Record,
+        *,
+        time_ns: int,
+        timing: Record | None = None,
+        state: Record | None = None,
+        skill: bytes | None = None,
+        lost: int = 0,
+    ) -> None:
+        """Writes a tick and what came of it.
+
+        After `lost` ticks that could not be recorded, `state` (the controller's, after this tick)
+        and `skill` (in force) let a replay go on. The skill is written only if it differs from the
+        last that was.
+        """
+        if not self._begun:
+            self._begin(time_ns)
+        put, self._sequence = self._put, tick.index
+        self.pending += 1
+        kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
+        put("tick", cdr.encode_tick(tick.index, kinds, lost), time_ns)
+        for event in tick.inbox:
+            if event.kind == "skill":
+                self._skill = event.payload
+                put("skill", cdr.encode_skill(event.payload), time_ns)
+            else:
+                put(event.kind, event.payload, time_ns)
+        put("frame", encode(frame), time_ns)
+        if timing is not None:
+            put("timing", encode(timing), time_ns)
+        if state is not None:
+            put("state", encode(state), time_ns)
+        if skill is not None and skill != self._skill:
+            self._skill = skill
+            put("skill_in_force", cdr.encode_skill(skill), time_ns)
+        for channel, payload in outgoing(frame, time_ns, self._settings.joints.names):
+            put(channel.key, payload, time_ns)
+        if tick.index % channels.BY_KEY["/tf"].every == 0:
+            put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
+        if self._file.part_ends():
+            self._keep()
+
+    def _keep(self) -> None:
+        self.kept, self.pending = self.kept + self.pending, 0
+
+    def _transforms(self, frame: Record) -> list[Transform]:
+        """Where everything is, for viewers: the arm's links, tool, setpoint, target and hands."""
+        settings = self._settings
+        joints = dict(zip(settings.joints.names, frame["joints"].tolist(), strict=True))
+        found = self._links.transforms(joints)
+        offset = settings.tool.plate_from_tool
+        found.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
+        found.append(Transform(BASE, "setpoint", _point(frame["setpoint"]), _quaternion(frame["setpoint_orientation"])))
+        for side, name in enumerate(SIDES):
+            if frame["hand_ages"][side] >= 0:
+                found.append(Transform(BASE, f"{name}_hand", _point(frame["hands"][side]), _UPRIGHT))
+        if frame["covariance"].any():  # without both hands nothing is predicted
+            found.append(Transform(BASE, "target", _point(frame["target"]), _quaternion(frame["orientation"])))
+        return found
+
+    def note(self, key: str, text: str, time_ns: int) -> None:
+        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or things given
+        as JSON under `objects`; replay ignores it.
+        """
+        if key in REPLAYED:
+            raise ValueError(f"a note under {key!r}: that topic holds what a replay needs")
+        if not self._begun:
+            self._begin(time_ns)
+        if key == THINGS:
+            things = msgspec.json.decode(text, type=tuple[Thing, ...])
+            return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, things), time_ns)
+        topic = channels.topic(self._settings.cell, key)
+        self._file.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
+        return None
+
+    def flush(self) -> None:
+        """Ends the chunk in progress: what was written so far survives a kill of the process."""
+        self._file.flush()
+        self._keep()
+
+    def close(self) -> None:
+        """Ends the file; it is closed even where that fails. A second call does nothing."""
+        if self._file.closed:
+            return
+        if not self._begun and self._state is not None:
+            self._begin(0)
+        try:
+            self.flush()
+            self._file.close()
+        finally:
+            self._file.abandon()
+
+    def abandon(self) -> None:
+        """Closes the file as it is, without what is pending."""
+        self._file.abandon()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _point(position: Any) -> Vector3:
+    x, y, z = position.tolist()
+    return x, y, z
+
+
+def _quaternion(orientation: Any) -> Quaternion:
+    x, y, z, w = orientation.tolist()
+    return x, y, z, w
+
+
+def _as_take(path: Path) -> str:
+    """What a file that is no recording is, where it is a take, and what shows it."""
+    topics: list[str] = []
+    with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
+        told = make_reader(stream).get_summary()
+        topics = [f"/{channel.topic}" for channel in told.channels.values()] if told else []
+    if path.suffix != ".mcap" or not all(any(t.endswith(f"/{end}") for t in topics) for end in ENDINGS.values()):
+        return ""
+    name, folder = shlex.quote(path.stem), shlex.quote(str(path.parent))
+    return f"; it is a take: thirdhand record {name} --folder {folder} --show --plot {name}.png"
+
+
+class Recording:
+    """A recording on disk: its settings, its skill, and its steps one after the other, however long
+    it is.
+    """
+
+    def __init__(
+        self, path: Path, settings: Settings, skill: bytes, urdf: str, metadata: dict[str, str], *, truncated: bool
+    ) -> None:
+        self.path, self.settings, self.skill, self.urdf, self.metadata = path, settings, skill, urdf, metadata
+        self.truncated = truncated  # its end is missing
+        self.faults: list[Fault] = []  # known once all steps are read
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """The recording in a file. Raises RecordingError."""
+        path = existing(path)
+        messages = Messages(path)
+        next(iter(messages), None)
+        about, parts = messages.metadata.get("thirdhand"), messages.attachments
+        needed = ["settings.json", "skill.npz", *(["arm.urdf"] if messages.faults else [])]
+        if about is None or any(name not in parts for name in needed):
+            if any(fault.cut for fault in messages.faults):
+                raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
+            if messages.faults:
+                raise RecordingError(
+                    f"{path} lacks settings, skill or arm, which a replay starts from: "
+                    + "; ".join(map(str, messages.faults))
+                )
+            raise RecordingError(
+                f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
+                + _as_take(path)
+            )
+        if about.get("format") != FORMAT:
+            raise RecordingError(
+                f"{path} has format {about.get('format')}, {FORMAT} is understood: was it made by another version?"
+            )
+        try:
+            settings = msgspec.json.decode(parts["settings.json"], type=Settings)
+        except msgspec.DecodeError as error:
+            raise RecordingError(f"the settings in {path} are not understood: {error}") from None
+        urdf = parts.get("arm.urdf", b"").decode(errors="replace")
+        return cls(path, settings, parts["skill.npz"], urdf, about, truncated=ends_early(path))
+
+    def ticks(self) -> int | None:
+        """How many ticks the file says that it holds; None where its end, which says so, is not
+        there.
+        """
+        topic = channels.key(self.settings.cell, "tick")
+        with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
+            told = make_reader(stream).get_summary()
+            if told is not None and told.statistics is not None:
+                numbers = [number for number, channel in told.channels.items() if channel.topic == topic]
+                return sum(told.statistics.channel_message_counts.get(number, 0) for number in numbers)
+        return None
+
+    def steps(self, *, outputs: bool = True) -> Iterator[Step]:
+        """Every recorded tick in order, after the initial state if there is one.
+
+        Raises RecordingError on what is not understood.
+
+        Without `outputs` only what went in: a recording of a version with other frames and states
+        can be read so.
+        """
+        messages = Messages(self.path)
+        yield from steps(messages, self.settings, outputs=outputs)
+        self.faults = messages.faults
+        self.truncated = any(fault.cut for fault in messages.faults)
+
+    def unsaid(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
+        """What is damaged or cut besides the gaps, once all steps are read up to tick `last`."""
+        said = "".join(gap.why for gap in gaps)
+        read = "no tick was read" if last is None else f"the last tick read is {last}"
+        return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in said]
+
+    def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
+        """Key, text and time [ns] of the notes under the keys, in order; things as JSON."""
+        topics = channels.keys_by_topic(self.settings.cell, keys)
+        for _, channel, message in Messages(self.path):
+            key = topics.get(channel.topic)
+            if key == THINGS:
+                things = channels.BY_KEY[key].codec.decode(message.data)
+                yield key, msgspec.json.encode(things).decode(), message.log_time
+            elif key is not None:
+                yield key, cdr.decode_string(message.data), message.log_time

@@ -1,0 +1,277 @@
+"""Replay: the core run on one recording or on several that follow each other, compared frame by
+frame with what it decided then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from service.contract import channels
+from service.contract.messages import WireError
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick, differences, encode
+from service.core.skill.skill import Skill
+from service.learning.skill_file import SkillError, decoded
+from service.recording.mcap_file import RecordingError, machine
+from service.recording.recording import Recording
+from service.recording.steps import Gap, Step
+
+TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
+POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
+
+
+@dataclass
+class Pause(Gap):
+    """A gap, and the tick from whose state the replay went on."""
+
+    resumed: int | None = None
+
+    def __str__(self) -> str:
+        went_on = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
+        return f"{super().__str__()}; {went_on}"
+
+
+@dataclass
+class Replay:
+    """What came of it: how many frames were compared and are identical, where and how far others
+    differ, and what is missing.
+    """
+
+    ticks: int = 0
+    identical: int = 0
+    missing: list[Pause] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    truncated: bool = False
+    joined: int = 0
+    first_difference: str = ""
+    largest: dict[str, float] = field(default_factory=dict)
+    recorded_on: str = ""
+    here: str = ""
+
+    @property
+    def gaps(self) -> int:
+        """How often ticks are missing."""
+        return len(self.missing)
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing is missing, and every frame up to the regular end identical, bit for
+        bit.
+        """
+        complete = not (self.missing or self.faults or self.truncated)
+        return self.ticks > 0 and self.identical == self.ticks and complete
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether no position that is there differs by more than 10 µm or 10 µrad."""
+        return self.ticks > 0 and all(self.largest.get(name, 0.0) <= TOLERANCE for name in POSITIONS)
+
+    def text(self) -> str:
+        """The result for people to read."""
+        lines = [f"{self.ticks} ticks, {self.identical} frames identical"]
+        if self.joined:
+            lines.append(f"{self.joined + 1} recordings join without a gap")
+        lines += [*map(str, self.missing), *self.faults]
+        if not self.ticks:
+            lines.append("nothing to compare: the recording holds no state to start from")
+        if self.first_difference:
+            lines.append(self.first_difference)
+            lines.append(
+                "largest differences: "
+                + ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
+            )
+            if self.recorded_on != self.here:
+                lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
+        return "\n".join(lines)
+
+
+def replay(
+    first: Path | str, *more: Path | str, after: int | None = None, progress: Callable[[int], None] | None = None
+) -> Replay:
+    """Runs the core on a recording, and on those that follow it, and compares every frame.
+
+    It starts from the first state or, with `after`, from the first one at or after that tick, and
+    anew from the state that follows each gap. Two recordings join without one where the second
+    begins with the state in which the first ends. Raises RecordingError.
+    """
+    recordings = [Recording.open(path) for path in (first, *more)]
+    result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
+    before: Step | None = None
+    with threadpool_limits(1):
+        for i, recording in enumerate(recordings):
+            pieces = _Pieces(recording, result, after=after, before=before, follows=i > 0, progress=progress)
+            before = pieces.compared()
+            result.faults += recording.unsaid(result.missing, last=None if before is None else before.tick)
+            result.truncated = result.truncated or recording.truncated
+    return result
+
+
+class _Skills:
+    """The skills of a recording, by their digests, as far as it has been read."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._found: dict[bytes, Skill] = {}
+        self.decoded(recording.skill)
+
+    def decoded(self, data: bytes) -> Skill:
+        """The skill in the bytes of its file, once for all times that it is met.
+
+        Raises SkillError.
+        """
+        skill = decoded(data, origin="the recording", recorded=True)
+        return self._found.setdefault(skill.digest, skill)
+
+    def events(self, step: Step) -> tuple[Event, ...]:
+        """The events of a step, as the core takes them. Raises RecordingError."""
+        if step.skill:
+            self.decoded(step.skill)
+        return tuple(self._event(kind, payload) for kind, payload in step.events)
+
+    def in_force(self, start: Step) -> Skill | None:
+        """The skill in force after a step with a state; None where it was not read."""
+        assert start.state is not None
+        return self._found.get(start.state["skill"].tobytes())
+
+    def _event(self, kind: str, payload: bytes) -> Event:
+        channel = channels.BY_KEY[kind]
+        try:
+            if kind == "skill":
+                return Event(kind, payload, self.decoded(payload))
+            return Event(kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None)
+        except (WireError, SkillError) as error:
+            raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
+
+
+class _Pieces:
+    """A recording from gap to gap, each piece run by a controller that goes on from a state."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        result: Replay,
+        *,
+        after: int | None,
+        before: Step | None,
+        follows: bool,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        self._recording, self._result, self._after, self._progress = recording, result, after, progress
+        self._skills = _Skills(recording)
+        self._steps = recording.steps()
+        self._follows = follows  # another recording
+        self._step = before  # the last that was read
+        self._gap_at: Step | None = None
+        self._controller: Controller
+
+    def compared(self) -> Step | None:
+        """Compares all there is; the last step."""
+        start = next(self._steps, None)
+        if start is not None and not self._begins(start):
+            start = self._next_start(start)
+        while start is not None:
+            skill = self._skills.in_force(start)
+            assert skill is not None
+            self._controller = Controller(self._recording.settings, skill, start.state, urdf=self._recording.urdf)
+            self._step, self._gap_at = start, None
+            run(self._controller, self._ticks(), [self.compare])
+            start = None if self._gap_at is None else self._next_start(self._gap_at)
+        return self._step
+
+    def _begins(self, start: Step) -> bool:
+        """Whether the first step is a state to start from; says what is missing before it."""
+        before, result = self._step, self._result
+        self._skills.events(start)
+        joins = (
+            before is not None
+            and None not in (before.state, start.state)
+            and start.frame is None
+            and encode(before.state) == encode(start.state)  # type: ignore[arg-type]
+        )
+        if joins:
+            result.joined += 1
+        elif self._follows or start.lost or start.damage:
+            why = "" if start.lost else start.damage or f"{self._recording.path.name} begins anew"
+            self._note(start, why)
+        return start.state is not None and self._after is None and self._resumes(start)
+
+    def _note(self, step: Step, why: str) -> None:
+        before = None if self._step is None else self._step.tick
+        self._result.missing.append(Pause(before, step.tick, step.lost, why))
+
+    def _resumes(self, step: Step) -> bool:
+        """Whether a controller can go on from the state of a step."""
+        skill = self._skills.in_force(step)
+        for gap in reversed(self._result.missing):
+            if gap.resumed is not None:
+                break
+            if skill is None and "skill" not in gap.why:
+                gap.why += "; the skill then in force is not there"
+            gap.resumed = None if skill is None else step.tick
+        return skill is not None
+
+    def _next_start(self, step: Step | None) -> Step | None:
+        """The next step, `step` or behind it, from whose state a controller can go on."""
+        while step is not None:
+            self._skills.events(step)
+            self._step = step
+            wanted = self._after is None or step.tick >= self._after
+            if step.state is not None and wanted and self._resumes(step):
+                return step
+            step = next(self._steps, None)
+            if step is not None and (step.lost or step.damage):
+                self._note(step, step.damage)
+        return None
+
+    def _ticks(self) -> Iterator[Tick]:
+        """The ticks up to the next gap. Raises RecordingError."""
+        for step in self._steps:
+            assert self._step is not None
+            if step.tick <= self._step.tick:
+                raise RecordingError(
+                    f"{self._recording.path}: tick {step.tick} comes after tick {self._step.tick}; growing ticks needed"
+                )
+            if step.lost or step.damage:
+                self._note(step, step.damage)
+                self._gap_at = step
+                return
+            events = self._skills.events(step)
+            self._step = step
+            yield Tick(step.tick, events)
+
+    def compare(self, tick: Tick, frame: Frame) -> None:
+        """Holds the frame of the newest tick, and the state after it, against what was recorded."""
+        step, result = self._step, self._result
+        assert step is not None
+        assert step.frame is not None
+        unlike = differences(step.frame, frame)
+        if step.state is not None:
+            after = differences(step.state, self._controller.state)
+            unlike |= {f"state.{name}": value for name, value in after.items()}
+        result.ticks += 1
+        result.identical += not unlike
+        if unlike and not result.first_difference:
+            what = ", ".join(f"{name} by {value:.3g}" for name, value in unlike.items())
+            result.first_difference = f"first difference at tick {tick.index}: {what}"
+        for name, value in unlike.items():
+            result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
+        if self._progress is not None and result.ticks % 1000 == 0:
+            self._progress(result.ticks)
+
+
+def ticks(recording: Recording) -> Iterator[Tick]:
+    """The ticks of a recording, as the core takes them."""
+    skills = _Skills(recording)
+    for step in recording.steps(outputs=False):
+        yield Tick(step.tick, skills.events(step))
+
+
+def _named(metadata: dict[str, str]) -> str:
+    return (
+        ", ".join(f"{name} {metadata[name]}" for name in ("cpu", "numpy", "blas") if name in metadata)
+        or "an unnamed machine"
+    )

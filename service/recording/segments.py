@@ -1,0 +1,255 @@
+"""The ticks that the scribe is told, written into one recording after another.
+
+A recording that is large or old enough ends at a tick whose state is known, and the next begins
+with that state: nothing is between them. A recording that fails is left as it is, and the next
+begins with the first state once that works; what was lost meanwhile is counted, and marked there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from service.config import Settings
+from service.core.frame import Record
+from service.recording.paths import MB, Places
+from service.recording.protocol import Told
+from service.recording.recording import Recorder
+
+RETRY_S = 1.0
+ROOM_BYTES = 1_000_000  # some seconds of ticks: with less, a disk that was full is not tried again
+PRUNE_S = 5.0
+
+
+class Segments:
+    """Writes ticks and notes; what fails is told to `say`, in words, once.
+
+    `draw` is told where the drawing that belongs to a new recording goes. Of the ticks told,
+    `kept` are on disk, `lost` are not and will not be, and of these no recording says yet that
+    `unmarked` are missing.
+    """
+
+    def __init__(
+        self, settings: Settings, places: Places, *, say: Callable[[str], None], draw: Callable[[Path], None]
+    ) -> None:
+        self._settings, self._places, self._say, self._draw = settings, places, say, draw
+        self._recorder: Recorder | None = None
+        self._wanted = True
+        self._skill: bytes | None = None
+        self._rrd: Path | None = None
+        self._complete: Path | None = None
+        self._kept = self.lost = self.unmarked = 0
+        self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
+        self._began = self._tried = self._pruned = -1e9
+        self._full = self._moved = self._drawn = False
+        self._said: object = None
+
+    @property
+    def kept(self) -> int:
+        """Ticks on disk."""
+        return self._kept + (self._recorder.kept if self._recorder is not None else 0)
+
+    @property
+    def path(self) -> Path | None:
+        """The recording being written, or that was written last and is complete."""
+        return self._complete if self._recorder is None else self._recorder.path
+
+    @property
+    def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
+        """`starting` before there is a skill, `recording`, `interrupted`, or `drawing` where no
+        recording is wanted.
+        """
+        if self._skill is None or not self._wanted:
+            return "starting" if self._skill is None else "drawing"
+        return "interrupted" if self._recorder is None else "recording"
+
+    def begin(self, skill: bytes | None, state: Record | None) -> None:
+        """Begins with a skill and a state; without them, with the first that are told."""
+        self._skill = skill
+        if skill is not None:
+            self._recorder = self._opened(state)
+
+    def _opened(self, state: Record | None) -> Recorder | None:
+        """A new recording, if it can be begun, and a new drawing beside it; a first one in any
+        case.
+        """
+        self._tried = time.monotonic()
+        path, rrd = self._places.next()
+        self._wanted = path is not None
+        recorder = None if path is None else self._recorder_at(path, state)
+        if recorder is not None or not self._wanted:
+            self._marked = self._marked_pending = 0
+            self._began, self._moved = self._tried, False
+        elif self._rrd is not None:
+            return None
+        self._rrd, self._drawn = rrd, False
+        if rrd is not None:
+            self._draw(rrd)
+        return recorder
+
+    def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
+        assert self._skill is not None
+        try:
+            if self._full and shutil.disk_usage(_there(path)).free < ROOM_BYTES:
+                return None
+            return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
+        except OSError as error:
+            self._failed(path, error)
+            _discard(path)
+            return None
+
+    def free_mb(self) -> float | None:
+        """Room left where the recording is written; None where none is."""
+        with contextlib.suppress(OSError):
+            return None if self.path is None else round(shutil.disk_usage(_there(self.path)).free / 1e6)
+        return None
+
+    def _failed(self, path: Path, error: OSError) -> None:
+        self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        cause = error.errno or str(error)
+        if cause != self._said:
+            self._said = cause
+            self._say(f"recording to {path} ended: {error}; it goes on once that is mended")
+
+    def write(self, told: Told) -> int:
+        """Writes a tick; how many before it are missing, where that is said now."""
+        self._skill = next((event.payload for event in reversed(told.tick.inbox) if event.kind == "skill"), self._skill)
+        self._skill = told.skill or self._skill
+        now = time.monotonic()
+        may_begin = told.state is not None and self._skill is not None
+        if may_begin and self._recorder is None and now - self._tried > RETRY_S and (self._wanted or self._due(now)):
+            self._recorder = self._opened(None)
+        if self._recorder is None:
+            if self._wanted:
+                self.lost += 1
+                self.unmarked += 1 + told.lost
+            else:
+                self._kept += 1  # all that was asked for
+            return 0 if self._wanted else told.lost
+        missing = told.lost + self.unmarked
+        self._marked += missing
+        self._marked_pending += missing
+        self.unmarked = 0
+        self._safely(lambda recorder: _written(recorder, told, missing))
+        if self._recorder is not None and not self._recorder.pending:
+            self._marked_pending = 0
+        if self._recorder is not None and told.state is not None and self._due(now):
+            self._next(told.state)
+        return missing
+
+    def _due(self, now: float) -> bool:
+        files = self._settings.files
+        sizes = [self._recorder.size] if self._recorder is not None else []
+        if self._rrd is not None:
+            with contextlib.suppress(OSError):
+                sizes.append(self._rrd.stat().st_size)
+        too_large = max(sizes, default=0) > files.segment_mb * MB
+        return too_large or self._moved or now - self._began > files.segment_minutes * 60
+
+    def _next(self, state: Record) -> None:
+        """Goes on in a new recording, which begins with the state that the old one ends with; stays
+        where none can be begun.
+        """
+        self._safely(Recorder.flush)
+        new = None if self._recorder is None else self._opened(state)
+        if new is not None:
+            self._end()
+            self._recorder = new
+
+    def _end(self) -> None:
+        """Ends the recording in progress."""
+        self._safely(Recorder.close)
+        if self._recorder is not None:
+            self._kept += self._recorder.kept
+            self._recorder = None
+
+    def _safely(self, act: Callable[[Recorder], None]) -> None:
+        """Does one thing with the recording, which ends where that fails; what of it is not on disk
+        is lost.
+        """
+        recorder = self._recorder
+        if recorder is None:
+            return
+        try:
+            act(recorder)
+        except OSError as error:
+            self._failed(recorder.path, error)
+            self._leave(recorder, recorder.pending, self._marked_pending if recorder.pending else 0)
+
+    def _leave(self, recorder: Recorder, lost: int, unmarked: int) -> None:
+        recorder.abandon()
+        self._recorder = None
+        self._kept += recorder.kept + recorder.pending - lost
+        self.lost += lost
+        self.unmarked += lost + unmarked
+        self._tried = time.monotonic() if self._full else -1e9
+        if not recorder.kept:
+            _discard(recorder.path)
+
+    def note(self, key: str, text: str, time_ns: int) -> None:
+        """Writes a text under `<cell>/<key>`."""
+        self._safely(lambda recorder: recorder.note(key, text, time_ns))
+
+    def flush(self) -> None:
+        """Hands what was written to the system, and sees whether the files are where they were
+        made.
+
+        Now and then the oldest recordings are removed.
+        """
+        self._safely(Recorder.flush)
+        self._look()
+        if time.monotonic() - self._pruned > PRUNE_S:
+            self._pruned = time.monotonic()
+            with contextlib.suppress(OSError):
+                self._places.prune(self.path)
+
+    def _look(self) -> None:
+        recorder = self._recorder
+        if recorder is None:
+            return
+        self._marked_pending = 0
+        if recorder.kept:
+            self._full, self._said = False, None
+        lost_name = recorder.lost_name()
+        if lost_name == "removed":
+            self._say(f"recording {recorder.path} was removed while it was written; the next one begins")
+            self._leave(recorder, recorder.kept + recorder.pending, self._marked)
+        elif lost_name and not self._moved:
+            self._moved = True
+            self._say(f"recording {recorder.path} was moved while it was written; the next one begins")
+        if self._rrd is not None:
+            self._moved = self._moved or (self._drawn and not self._rrd.exists())
+            self._drawn = self._rrd.exists()
+
+    def close(self) -> None:
+        """Ends the recording."""
+        self.flush()
+        path = self.path
+        self._end()
+        self._complete = path if self._said is None else None
+
+
+def _written(recorder: Recorder, told: Told, missing: int) -> None:
+    time_ns = int(told.timing["time_ns"])
+    recorder.write(
+        told.tick, told.frame, time_ns=time_ns, timing=told.timing, state=told.state, skill=told.skill, lost=missing
+    )
+    if missing:
+        recorder.note("log", f"{missing} ticks before tick {told.tick.index} are not recorded", time_ns)
+
+
+def _discard(path: Path) -> None:
+    """Removes a recording without a tick."""
+    if path.is_file():
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def _there(path: Path) -> Path:
+    """The nearest folder above a path that exists."""
+    return next((folder for folder in path.parents if folder.is_dir()), Path("/"))

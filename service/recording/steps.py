@@ -1,0 +1,136 @@
+"""The steps of a recording, put together from its messages: what each tick consumed, what it
+decided, and where ticks are missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from service.config import Settings
+from service.contract import cdr, channels
+from service.contract.messages import WireError
+from service.core.frame import TIMING, Record, decode, frame_layout, state_layout
+from service.recording.mcap_file import RecordingError
+from service.recording.mcap_reader import Messages
+
+_RECORDS = ("frame", "timing", "state")
+REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
+
+
+class Step(NamedTuple):
+    """One recorded tick: what it consumed, what it decided, and the state after it where that was
+    recorded.
+
+    A step may hold the state before the first tick, or the first behind damage, and nothing else:
+    its `frame` is None. Where ticks were `lost` before this one, replay continues from its `state`,
+    with the skill in force, which is told where it may have changed meanwhile. Where `damage` is
+    not empty, what was recorded before this step cannot be read, and why.
+    """
+
+    tick: int
+    events: tuple[tuple[str, bytes], ...]
+    frame: Record | None
+    timing: Record | None
+    state: Record | None
+    skill: bytes | None = None
+    lost: int = 0
+    time_ns: int = 0
+    damage: str = ""
+
+
+@dataclass
+class Gap:
+    """Ticks that are not there: between which they would be (None: the beginning, the end), how
+    many were counted as lost, and why.
+    """
+
+    after: int | None
+    before: int | None
+    lost: int
+    why: str
+
+    def __str__(self) -> str:
+        where = "before the first tick" if self.after is None else f"after tick {self.after}"
+        if self.before is not None:
+            where = f"before tick {self.before}" if self.after is None else f"{where}, before tick {self.before}"
+        lost = f"{self.lost} tick{'s' * (self.lost != 1)} not recorded" if self.lost else ""
+        return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
+
+
+def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[Step]:
+    """Every tick that is whole, in order, after the initial state if there is one; without
+    `outputs` only what went in. Raises RecordingError on what is not understood.
+    """
+    names = channels.keys_by_topic(settings.cell, REPLAYED)
+    joints = len(settings.joints.names)
+    layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
+    step: dict[str, Any] | None = None
+    seen, damage = 0, ""
+
+    def finished() -> Iterator[Step]:
+        """The step in progress, unless damage or a cut took its rest."""
+        if step is not None and (len(messages.faults) == seen or _is_whole(step, outputs=outputs)):
+            yield _finished(step, outputs=outputs)
+
+    try:
+        for _, channel, message in messages:
+            if len(messages.faults) > seen:
+                yield from finished()
+                damage = "; ".join(str(fault) for fault in messages.faults[seen:])
+                step, seen = None, len(messages.faults)
+            name = names.get(channel.topic)
+            if name is None or (name in _RECORDS and not outputs):
+                continue
+            data = message.data
+            if name == "tick":
+                yield from finished()
+                index, kinds, lost = cdr.decode_tick(data)
+                step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
+                step["damage"], damage = damage, ""
+            elif step is None:
+                if name == "state":
+                    alone = decode(data, layouts["state"])
+                    yield Step(int(alone["tick"]), (), None, None, alone, damage=damage)
+                    damage = ""
+            elif name in _RECORDS:
+                step[name] = decode(data, layouts[name])
+            elif name == "skill_in_force":
+                step["skill"] = cdr.decode_skill(data)
+            else:
+                step["events"].append((name, cdr.decode_skill(data) if name == "skill" else data))
+        yield from finished()
+    except WireError as error:
+        raise RecordingError(f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
+
+
+def _is_whole(step: dict[str, Any], *, outputs: bool) -> bool:
+    return len(step["events"]) == len(step["kinds"]) and ("frame" in step or not outputs)
+
+
+def _finished(step: dict[str, Any], *, outputs: bool) -> Step:
+    kinds, events = [_kind(number) for number in step["kinds"]], step["events"]
+    if [kind for kind, _ in events] != kinds or (outputs and "frame" not in step):
+        raise WireError(
+            f"tick {step['tick']} lists {kinds}; "
+            f"{[kind for kind, _ in events]} and {'a' if 'frame' in step else 'no'} frame follow"
+        )
+    timing, state, skill = (step.get(name) for name in ("timing", "state", "skill"))
+    return Step(
+        step["tick"],
+        tuple(events),
+        step.get("frame"),
+        timing,
+        state,
+        skill,
+        step["lost"],
+        step["time_ns"],
+        step["damage"],
+    )
+
+
+def _kind(number: int) -> str:
+    if number not in channels.EVENT_KINDS:
+        raise WireError(f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known")
+    return channels.EVENT_KINDS[number]

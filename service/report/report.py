@@ -1,0 +1,334 @@
+"""What a recording tells: how long, what it lacks, what the service did and why, how promptly, how
+near to people, how well places were met, and which limits were touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from service.contract.incidents import REASONS
+from service.contract.records import SIDES, Cause, Flag, Mode, Reason
+from service.core.frame import Vector
+from service.recording.recording import Recording
+from service.report.causes import what_led, why_held
+from service.report.columns import Columns, read, runs
+from service.report.visits import Place, places
+
+SHARES = (50, 99, 100)
+
+
+class Span(NamedTuple):
+    """What the service did for a while, since the first tick [s], and what is to be said of why."""
+
+    start_s: float
+    lasts_s: float
+    mode: Mode
+    reason: Reason
+    why: str = ""
+
+    @property
+    def doing(self) -> str:
+        """In one word or two."""
+        mode = str(self.mode.name).lower()
+        return mode if self.reason is Reason.NONE else f"{mode}: {str(self.reason.name).lower()}"
+
+
+class Fault(NamedTuple):
+    """A fault, what led to it, and how it ended."""
+
+    span: Span
+    led: tuple[str, ...]
+    ended: str
+
+
+class Percentiles(NamedTuple):
+    """Median, 99th percentile and largest of some values, which there are so many of."""
+
+    p50: float
+    p99: float
+    largest: float
+    samples: int
+
+    @classmethod
+    def of(cls, values: Vector) -> Percentiles | None:
+        """None where there are no values."""
+        if not len(values):
+            return None
+        p50, p99, largest = np.percentile(values, SHARES).tolist()
+        return cls(p50, p99, largest, len(values))
+
+
+class Approach(NamedTuple):
+    """The least distance between the arm and a hand [m], when [s], what the service did then, and
+    the speed toward the hand that was allowed [m/s].
+    """
+
+    distance_m: float
+    at_s: float
+    doing: str
+    allowed_m_s: float
+
+
+class Limit(NamedTuple):
+    """A limit that was touched: for how long and how often, and when first [s]."""
+
+    name: str
+    lasts_s: float
+    times: int
+    first_s: float
+
+
+class Joint(NamedTuple):
+    """How near a joint came to its limits: position [rad], and shares of speed and acceleration."""
+
+    name: str
+    margin_rad: float
+    speed: float
+    acceleration: float
+
+
+class Rejection(NamedTuple):
+    """Samples rejected for one cause, and when first [s]."""
+
+    cause: str
+    samples: int
+    first_s: float
+
+
+class Figure(NamedTuple):
+    """One number of a report, to be set beside another's."""
+
+    name: str
+    value: float | None
+    unit: str
+    digits: int
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What one recording tells. `columns` is what it is made of."""
+
+    path: Path
+    columns: Columns
+    begins: str  # the system clock's time of its first tick
+    skill: str
+    lasts_s: float
+    lacks: tuple[str, ...]  # gaps, damage, a cut, what is not understood
+    spans: tuple[Span, ...]
+    faults: tuple[Fault, ...]
+    rate_hz: float
+    missed: int
+    lateness_us: Percentiles | None
+    work_us: Percentiles | None
+    latency_ms: Percentiles | None
+    lag_mm: Percentiles | None  # from the tool to its target, while it follows
+    approach: Approach | None
+    places: tuple[Place, ...]
+    limits: tuple[Limit, ...]
+    joints: tuple[Joint, ...]
+    rejections: tuple[Rejection, ...]
+    hands_hz: dict[str, float]
+
+    def seconds(self, mode: Mode, reason: Reason | None = None) -> float:
+        """How long it was in a mode [s], for one reason or for any."""
+        return sum(s.lasts_s for s in self.spans if s.mode is mode and reason in (None, s.reason))
+
+    def best_m(self, name: str) -> float | None:
+        """The tool's least distance from a place, however often taught [m]; None: no visit."""
+        return min((p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None)
+
+    def figures(self) -> Iterator[Figure]:
+        """The numbers by which two recordings are compared."""
+        yield Figure("duration", self.lasts_s, "s", 1)
+        yield Figure("missing or damaged", len(self.lacks), "times", 0)
+        yield Figure("follow", self.seconds(Mode.FOLLOW), "s", 1)
+        for reason in Reason:
+            for mode in (Mode.HOLD, Mode.FAULT):
+                yield Figure(f"{mode.name}: {reason.name}".lower(), self.seconds(mode, reason), "s", 1)
+        yield Figure("faults", len(self.faults), "times", 0)
+        yield Figure("rate", self.rate_hz, "Hz", 2)
+        yield Figure("deadlines missed", self.missed, "", 0)
+        for name, found, unit, digits in (
+            ("latency", self.latency_ms, "ms", 2),
+            ("lateness", self.lateness_us, "µs", 0),
+            ("work of a tick", self.work_us, "µs", 0),
+            ("tool to target", self.lag_mm, "mm", 1),
+        ):
+            for share, value in zip(("median", "99 %", "largest"), found or (None,) * 3, strict=False):
+                yield Figure(f"{name}, {share}", value, unit, digits)
+        yield Figure("closest approach", self.approach and 1000 * self.approach.distance_m, "mm", 0)
+        touched = {limit.name: limit.lasts_s for limit in self.limits}
+        for flag in Flag:
+            yield Figure(name := str(flag.name).lower(), touched.get(name, 0.0), "s", 1)
+        rejected = {rejection.cause: rejection.samples for rejection in self.rejections}
+        for cause in Cause:
+            yield Figure(f"rejected: {cause.name}".lower(), rejected.get(str(cause.name).lower(), 0), "", 0)
+        for place in dict.fromkeys(place.name for place in self.places):
+            best = min(
+                (one.best_m for one in self.places if one.name == place and one.best_m is not None), default=None
+            )
+            yield Figure(f"place {place}: nearest", None if best is None else 1000 * best, "mm", 1)
+
+
+def reported(path: str | Path, *, progress: Callable[[int], None] = lambda ticks: None) -> Report:
+    """What the recording in a file tells. Raises RecordingError."""
+    recording = Recording.open(path)
+    return report(read(recording, progress=progress))
+
+
+def report(columns: Columns) -> Report:
+    """What these columns tell."""
+    recording, frames, timing = columns.recording, columns.frames, columns.timing
+    spans = tuple(_spans(columns))
+    begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    following = frames[frames["mode"] == Mode.FOLLOW]
+    sent = frames[frames["commanded"] > 0]
+    passed_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9 if len(timing) > 1 else 0.0
+    lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
+    return Report(
+        path=recording.path,
+        columns=columns,
+        begins=begins if len(frames) else "never: it holds no tick",
+        skill=columns.skills[-1].skill.name if columns.skills else "not understood",
+        lasts_s=lasts_s,
+        lacks=(*columns.gaps, *columns.remarks),
+        spans=spans,
+        faults=tuple(_faults(columns, spans)),
+        rate_hz=(len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0,
+        missed=int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0,
+        lateness_us=Percentiles.of(timing["lateness_us"]),
+        work_us=Percentiles.of(timing["work_us"]),
+        latency_ms=Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0),
+        lag_mm=Percentiles.of(1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)),
+        approach=_approach(columns, spans),
+        places=tuple(places(columns)),
+        limits=tuple(_limits(columns)),
+        joints=tuple(_joints(columns, sent)) if len(sent) else (),
+        rejections=tuple(_rejections(columns)),
+        hands_hz={side: columns.samples[f"hands/{side}"] / lasts_s if lasts_s else 0.0 for side in SIDES},
+    )
+
+
+def _spans(columns: Columns) -> Iterator[Span]:
+    """What it did, one after the other."""
+    frames, times, period_s = columns.frames, columns.times, columns.period_s
+    pieces = np.zeros(len(frames), np.int64)
+    pieces[columns.breaks] = 1
+    for begin, end in runs((np.cumsum(pieces) * 256 + frames["mode"]) * 256 + frames["reason"]):
+        mode, reason = Mode(int(frames["mode"][begin])), Reason(int(frames["reason"][begin]))
+        why = ""
+        if mode is Mode.HOLD:
+            why = why_held(columns, begin, end) or REASONS[str(reason.name).lower()].about
+        whole = end == len(frames) or end in columns.breaks
+        until = float(times[end - 1]) + period_s if whole else float(times[end])
+        yield Span(float(times[begin]), until - float(times[begin]), mode, reason, why)
+
+
+def _faults(columns: Columns, spans: tuple[Span, ...]) -> Iterator[Fault]:
+    for span in spans:
+        if span.mode is Mode.FAULT:
+            begin, end_s = int(np.searchsorted(columns.times, span.start_s)), span.start_s + span.lasts_s
+            resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
+            ended = end_s <= columns.times[-1]
+            by = "a `reset`" if any(abs(at - end_s) < 0.1 for at in resets) else "what is not recorded"
+            how = f"ended by {by} after {span.lasts_s:.1f} s" if ended else "not ended in this recording"
+            yield Fault(span, tuple(what_led(columns, begin)), how)
+
+
+def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
+    """Where a hand was seen, the nearest that it came to the arm."""
+    frames = columns.frames
+    newest = frames["hand_ages"].min(axis=1, where=frames["hand_ages"] >= 0, initial=2**31 - 1)
+    known = np.flatnonzero(newest * 1000 * columns.period_s <= columns.recording.settings.hands.stale_ms)
+    if not len(known):
+        return None
+    row = int(known[frames["hand_distance"][known].argmin()])
+    at_s = float(columns.times[row])
+    doing = next(span.doing for span in reversed(spans) if span.start_s <= at_s)
+    return Approach(float(frames["hand_distance"][row]), at_s, doing, float(frames["hand_limit"][row]))
+
+
+def _limits(columns: Columns) -> Iterator[Limit]:
+    for flag in Flag:
+        raised = (columns.frames["flags"] & int(flag)) > 0
+        begins = [begin for begin, _ in runs(raised) if raised[begin]]
+        if begins:
+            lasts_s = float(raised.sum()) * columns.period_s
+            yield Limit(str(flag.name).lower(), lasts_s, len(begins), float(columns.times[begins[0]]))
+
+
+def _joints(columns: Columns, sent: Any) -> Iterator[Joint]:
+    limits = columns.recording.settings.joints
+    low, high = sent["joints"] - np.array(limits.lower), np.array(limits.upper) - sent["joints"]
+    margin = np.minimum(low, high).min(axis=0)
+    speed = np.abs(sent["joint_velocities"]).max(axis=0) / np.array(limits.velocity)
+    acceleration = np.abs(sent["joint_accelerations"]).max(axis=0) / np.array(limits.acceleration)
+    for name, *values in zip(limits.names, margin.tolist(), speed.tolist(), acceleration.tolist(), strict=True):
+        yield Joint(name, *values)
+
+
+def _rejections(columns: Columns) -> Iterator[Rejection]:
+    counts = columns.frames["rejected"].astype(np.int64)
+    if not len(counts):
+        return
+    for cause in Cause:
+        more = counts[:, cause] - counts[0, cause]
+        if more[-1]:
+            yield Rejection(str(cause.name).lower(), int(more[-1]), float(columns.times[int(np.argmax(more > 0))]))
+
+
+def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]:
+    """Names and values of the settings, and of the versions and machine, that two recordings do
+    not share.
+    """
+    found = []
+    told = [
+        _flat(msgspec.to_builtins(r.columns.recording.settings), "")
+        | {f"made with {name}": value for name, value in r.columns.recording.metadata.items()}
+        | {"skill": r.skill}
+        for r in (one, other)
+    ]
+    for name in sorted({*told[0], *told[1]}):
+        values = [told[i].get(name, "not told") for i in (0, 1)]
+        if values[0] != values[1]:
+            found.append((name, *values))
+    return found
+
+
+def _flat(value: Any, path: str) -> dict[str, Any]:
+    if isinstance(value, dict):
+        inner = (_flat(inside, f"{path}.{name}" if path else name) for name, inside in value.items())
+        return {name: found for one in inner for name, found in one.items()}
+    return {path: value}
+
+
+def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end_s: float) -> str:
+    """In one sentence, what kept the tool from a place between two times [s] since `begun_s` of the
+    recording, since which times are told.
+    """
+    begin_s, until_s = begun_s + start_s, begun_s + end_s
+    stops = [
+        span
+        for span in found.spans
+        if span.mode is not Mode.FOLLOW and span.start_s < until_s and span.start_s + span.lasts_s > begin_s
+    ]
+    if stops:
+        worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
+        led = next((fault.led[0] for fault in found.faults if fault.span is worst), worst.why)
+        what = "was at fault" if worst.mode is Mode.FAULT else "held"
+        name, at_s = str(worst.reason.name).lower(), worst.start_s - begun_s
+        since = f"from {at_s:.1f} s on" if at_s > 0 else "from before the script began"
+        return f"the arm {what} ({name}) {since}, for {worst.lasts_s:.1f} s{f': {led}' if led else ''}"
+    hands_m = [one.hands_m for one in found.places if one.name == place]
+    if not hands_m:
+        return f"no place {place!r} was taught"
+    if best := found.best_m(place):
+        return f"the arm followed; with the hands where {place!r} was taught the tool came within {1000 * best:.0f} mm"
+    return f"the arm followed, but the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"

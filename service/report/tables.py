@@ -1,0 +1,195 @@
+"""A report as tables: what the terminal, the page and the CSV files all show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from service.contract.incidents import remedy
+from service.report.report import Fault, Figure, Percentiles, Report, differing_settings
+
+NONE = "-"
+NOTHING_MISSING = "Nothing is missing in it."
+
+
+class Table(NamedTuple):
+    """A table: its name in files, its title, the heads of its columns, units in brackets, and rows
+    of texts. From column `numbers` on these are numbers; 0: those with units are.
+    """
+
+    name: str
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numbers: int = 1
+
+    def is_number(self, column: int) -> bool:
+        """Whether a column holds numbers."""
+        return column >= self.numbers if self.numbers else self.heads[column].endswith("]")
+
+
+def tables(report: Report) -> Iterator[Table]:
+    """The tables of one report; those with nothing to tell are left out."""
+    return (table for table in _tables(report) if table.rows)
+
+
+def _tables(report: Report) -> Iterator[Table]:
+    yield Table("missing", "What is missing in the recording", ("what",), tuple((line,) for line in report.lacks))
+    spans = tuple((_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans)
+    yield Table("modes", "What it did", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0)
+    yield Table(
+        "faults",
+        "Faults, and what led to them",
+        ("at [s]", "reason", "what led to it, and what to do"),
+        tuple(_fault(fault) for fault in report.faults),
+        numbers=0,
+    )
+    yield Table(
+        "places",
+        "Taught places",
+        (
+            "place",
+            "taught at [s]",
+            "hands came within [cm]",
+            "visits",
+            "tool came within [mm]",
+            "at the end of each [mm]",
+        ),
+        tuple(
+            (
+                place.name,
+                _s(place.start_s),
+                NONE if math.isinf(place.hands_m) else f"{100 * place.hands_m:.1f}",
+                str(len(place.visits)),
+                _mm(place.best_m),
+                ", ".join(_mm(visit.settled_m) for visit in place.visits) or NONE,
+            )
+            for place in report.places
+        ),
+    )
+    yield Table(
+        "times",
+        "Promptness",
+        ("what", "median", "99 %", "largest", "unit", "of"),
+        tuple(
+            (name, *(f"{value:.{digits}f}" for value in found[:3]), unit, str(found.samples))
+            for name, found, unit, digits in _times(report)
+            if found is not None
+        ),
+    )
+    if report.approach is not None:
+        near = report.approach
+        yield Table(
+            "approach",
+            "Closest approach of the arm to a hand",
+            ("distance [cm]", "at [s]", "then", "allowed toward it [m/s]"),
+            ((f"{100 * near.distance_m:.1f}", _s(near.at_s), near.doing, f"{near.allowed_m_s:.2f}"),),
+            numbers=0,
+        )
+    yield Table(
+        "limits",
+        "Limits that were touched",
+        ("limit", "for [s]", "times", "first at [s]"),
+        tuple((limit.name, _s(limit.lasts_s), str(limit.times), _s(limit.first_s)) for limit in report.limits),
+    )
+    yield Table(
+        "joints",
+        "Joints, at most",
+        ("joint", "from a limit [rad]", "of its speed [%]", "of its acceleration [%]"),
+        tuple(
+            (one.name, f"{one.margin_rad:.2f}", f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}")
+            for one in report.joints
+        ),
+    )
+    yield Table(
+        "rejections",
+        "Rejected samples",
+        ("cause", "count [samples]", "first at [s]", "what to do"),
+        tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
+        numbers=0,
+    )
+
+
+def _fault(fault: Fault) -> tuple[str, str, str]:
+    reason = str(fault.span.reason.name).lower()
+    return _s(fault.span.start_s), reason, "\n".join((*fault.led, fault.ended, f"what to do: {remedy(reason)}"))
+
+
+def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]:
+    yield "hand stamped to command published", report.latency_ms, "ms", 2
+    yield "tick later than its deadline", report.lateness_us, "µs", 0
+    yield "work of a tick", report.work_us, "µs", 0
+    yield "tool from its target, following", report.lag_mm, "mm", 1
+
+
+def summary(report: Report) -> list[str]:
+    """What a report begins with, a line each."""
+    hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
+    return [
+        f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
+        f"Something is missing in it, {_times_in_words(len(report.lacks))}." if report.lacks else NOTHING_MISSING,
+        f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
+        _counted(len(report.faults), "fault"),
+    ]
+
+
+def comparison(reports: Sequence[Report]) -> Iterator[Table]:
+    """Figures of several reports side by side, of two with their differences; then the settings."""
+    told = [{figure.name: figure for figure in report.figures()} for report in reports]
+    two = len(reports) == 2
+    rows = []
+    for name in dict.fromkeys(name for one in told for name in one):
+        figures = [one.get(name) for one in told]  # None: a place that was not taught there
+        values = [figure and figure.value for figure in figures]
+        known = next(figure for figure in figures if figure is not None)
+        if any(values):
+            row = [f"{name} [{known.unit}]" if known.unit else name]
+            row += [NONE if value is None else f"{value:.{known.digits}f}" for value in values]
+            rows.append((*row, *([_difference(known, values[0], values[1])] if two else [])))
+    names = names_of(reports)
+    heads = ("figure", *names, *(("difference",) if two else ()))
+    yield Table("comparison", "Side by side", heads, tuple(rows))
+    if two:
+        settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(*reports))
+        if settings:
+            yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+
+
+def names_of(reports: Sequence[Report]) -> list[str]:
+    """A name for each report that no other has: its file's, numbered where it is not the first."""
+    seen: dict[str, int] = {}
+    names = []
+    for report in reports:
+        stem = report.path.stem
+        seen[stem] = seen.get(stem, 0) + 1
+        names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
+    return names
+
+
+def _difference(figure: Figure, one: float | None, other: float | None) -> str:
+    if one is None or other is None:
+        return NONE
+    text = f"{other - one:+.{figure.digits}f}"
+    return "same" if float(text) == 0.0 else text
+
+
+def _times_in_words(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count or 'No'} {what}{'' if count == 1 else 's'}."
+
+
+def _short(value: object) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _s(seconds: float) -> str:
+    return f"{seconds:.2f}"
+
+
+def _mm(metres: float | None) -> str:
+    return NONE if metres is None else f"{1000 * metres:.1f}"

@@ -1,0 +1,105 @@
+"""How well taught places were met: where the tool was while the hands were where a place was
+taught.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.contract.requests import ViaPoint
+from service.core.frame import Records, Vector
+from service.report.columns import Columns, runs
+
+NEAR_M = 0.03  # hands nearer than this, or than its radius, to where a place was taught are there
+PAUSE_S, LEAST_S = 0.3, 0.1  # hands that leave for less have not left; that come for less have not come
+SETTLED_S = 0.1  # at a visit's end, over which the tool is where it came to
+
+
+class Visit(NamedTuple):
+    """A time when the hands were at a place: since the recording's first tick, and how long [s];
+    the tool's least distance from where it was taught, and that at the end [m].
+    """
+
+    start_s: float
+    lasts_s: float
+    nearest_m: float
+    settled_m: float
+
+
+class Place(NamedTuple):
+    """A taught place while it was in force [s], the visits to it, and how near the hands came to
+    where it was taught: the farther one of the two [m]; infinite where none was seen.
+    """
+
+    name: str
+    start_s: float
+    end_s: float
+    hands_m: float
+    visits: tuple[Visit, ...]
+
+    @property
+    def best_m(self) -> float | None:
+        """The tool's least distance over all visits [m]; None without any."""
+        return min((visit.nearest_m for visit in self.visits), default=None)
+
+
+def places(columns: Columns) -> list[Place]:
+    """Every place that was in force at some time, by the time it was taught."""
+    ticks, times = columns.frames["tick"], columns.times
+    found: list[Place] = []
+    for point, begin, end in _taught(columns):
+        within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
+        frames = columns.frames[within]
+        if len(frames):
+            nearest, visits = _visits(point, frames, times[within], columns.period_s)
+            found.append(Place(point.name, float(times[within][0]), float(times[within][-1]), nearest, tuple(visits)))
+    return found
+
+
+def _taught(columns: Columns) -> list[tuple[ViaPoint, int, float]]:
+    """Each via-point with the ticks from and before which it was in force, as it was."""
+    begun: dict[ViaPoint, int] = {}
+    over: list[tuple[ViaPoint, int, float]] = []
+    for tick, skill in columns.skills:
+        there = set(skill.via_points)
+        over += [(point, begun.pop(point), tick) for point in list(begun) if point not in there]
+        for point in skill.via_points:
+            begun.setdefault(point, tick)
+    return sorted([*over, *((point, tick, np.inf) for point, tick in begun.items())], key=lambda one: one[1])
+
+
+def _visits(point: ViaPoint, frames: Records, times: Vector, period_s: float) -> tuple[float, list[Visit]]:
+    """How near the hands came, and when they were there."""
+    taught = np.array([point.left, point.right])
+    seen = (frames["hand_ages"] >= 0).all(axis=1)
+    away = np.where(seen, np.linalg.norm(frames["hands"] - taught, axis=2).max(axis=1), np.inf)
+    wanted = np.array(point.tool)
+    if point.follow != "none":
+        side = ("left", "right").index(point.follow)
+        wanted = wanted + frames["hands"][:, side] - taught[side]
+    off = np.linalg.norm(frames["tool"] - wanted, axis=1)
+    there = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
+    visits, least, settled = [], round(LEAST_S / period_s), max(1, round(SETTLED_S / period_s))
+    for begin, end in runs(there):
+        if there[begin] and end - begin >= least:
+            visits.append(
+                Visit(
+                    float(times[begin]),
+                    (end - begin) * period_s,
+                    float(off[begin:end].min()),
+                    float(off[max(begin, end - settled) : end].mean()),
+                )
+            )
+    return float(away.min(initial=np.inf)), visits
+
+
+def _closed(there: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """The same, with gaps of at most so many filled."""
+    filled = there.copy()
+    for begin, end in runs(there):
+        if not there[begin] and end - begin <= longest and begin > 0 and end < len(there):
+            filled[begin:end] = True
+    return filled

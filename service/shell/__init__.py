@@ -1,3 +1,0 @@
-"""The control process around the core: its clock, its channels, its requests, and the workshop
-process that computes for them.
-"""

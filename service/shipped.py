@@ -1,0 +1,26 @@
+"""What is shipped beside the code: recordings, demonstrations and the soldering skill."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from service.core.skill.skill import Skill
+
+SHIPPED_SKILL = "soldering.npz"
+
+
+def recordings() -> Path:
+    """The folder of the shipped recordings and their skill."""
+    service = Path(__file__).parent
+    folders = (service / "recordings", service.parent / "recordings")
+    return next((folder for folder in folders if folder.is_dir()), folders[1])
+
+
+def shipped_skill() -> Skill:
+    """The skill that the service runs unless told otherwise."""
+    from service.learning.skill_file import decoded  # heavy, and most commands do without
+
+    path = recordings() / SHIPPED_SKILL
+    return decoded(path.read_bytes(), origin=str(path))

@@ -1,0 +1,1 @@
+"""What measures the loop: beside an empty loop, under loads, for days."""

@@ -1,0 +1,337 @@
+"""What happens beside a loop in its days: each done to a running daemon, and to an empty loop in
+its place, for `thirdhand bench --loads`.
+
+`python -m service.timing.loads KIND ENDPOINT` is the part of it that asks and publishes, a
+process of its own.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import contextlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from kmp import KMP, GaussianKernel, Gaussians
+from service.client import Client, RefusedError, UnreachableError, open_session
+from service.contract.explain import ExplainedError
+from service.contract.requests import ViaPoint
+from service.launch import Launched, free_port, launched
+from service.learning.skill_file import with_file
+from service.recording.replay import replay
+from service.shipped import SHIPPED_SKILL, recordings, shipped_skill
+from service.timing.probe import TRACKER_HZ, hands_of
+from service.timing.probes import probe
+from service.viewer.stream import rerun_program
+
+QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
+LARGE_SKILL, LARGE = "large", 100_000  # points
+SETTLE_S = 2.0
+COLLECTING = f"""
+from service import one_blas_thread
+import gc, sys, threading, time
+from service.cli.main import main
+
+def collect():
+    while True:
+        time.sleep({1 / COLLECTIONS_HZ})
+        gc.collect()
+
+threading.Thread(target=collect, daemon=True).start()
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+class LoadError(ExplainedError):
+    """A load could not be put on; the message says what failed."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A running daemon, and what a load needs to reach it."""
+
+    service: Launched
+    client: Client
+    live_port: int
+
+    def scribe(self) -> int:
+        """The process number of its scribe. Raises LoadError."""
+        pid = self.client.status().scribe["pid"]
+        if pid is None:
+            raise LoadError("the daemon has no scribe")
+        return int(pid)
+
+
+@contextlib.contextmanager
+def _nothing(cell: Cell) -> Iterator[None]:
+    yield
+
+
+@contextlib.contextmanager
+def _frozen(cell: Cell) -> Iterator[None]:
+    pid = cell.scribe()
+    os.kill(pid, signal.SIGSTOP)
+    yield
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
+
+
+@contextlib.contextmanager
+def _killed(cell: Cell) -> Iterator[None]:
+    os.kill(cell.scribe(), signal.SIGKILL)
+    yield
+
+
+@contextlib.contextmanager
+def _full(cell: Cell) -> Iterator[None]:
+    """The scribe's files may not grow any more, which fails as a full disk does."""
+    pid, none = cell.scribe(), resource.RLIM_INFINITY
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, none))
+    yield
+    with contextlib.suppress(ProcessLookupError):
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (none, none))
+
+
+@contextlib.contextmanager
+def _stalled(cell: Cell) -> Iterator[None]:
+    """A viewer that has begun to listen, and reads no more."""
+    with tempfile.TemporaryDirectory() as folder:
+        url = f"rerun+http://127.0.0.1:{cell.live_port}/proxy"
+        with _process([str(rerun_program()), "--save", str(Path(folder) / "live.rrd"), url]) as viewer:
+            time.sleep(SETTLE_S)
+            if viewer.poll() is not None:
+                raise LoadError(f"Rerun's program ended with code {viewer.returncode}")
+            viewer.send_signal(signal.SIGSTOP)
+            yield
+
+
+def _asking(kind: str) -> Callable[[Cell], contextlib.AbstractContextManager[None]]:
+    @contextlib.contextmanager
+    def asked(cell: Cell) -> Iterator[None]:
+        with asking(kind, cell.service.endpoint) as process:
+            yield
+            if process.poll() is not None:
+                raise LoadError(f"what asks for {kind!r} ended with code {process.returncode}")
+
+    return asked
+
+
+@dataclass(frozen=True)
+class Load:
+    """One of them: its name for people, and what puts it on."""
+
+    what: str
+    put_on: Callable[[Cell], contextlib.AbstractContextManager[None]] = _nothing
+    program: tuple[str, ...] = ("-m", "service")
+
+
+def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
+    """Acts at a rate, or as fast as it can, until killed."""
+    began, k = time.monotonic(), 0
+    while True:
+        with contextlib.suppress(RefusedError):
+            act(k)
+        if k == 0:
+            print("begun", flush=True)
+        k += 1
+        time.sleep(max(0.0, began + k / rate_hz - time.monotonic()))
+
+
+def _status(client: Client, session: Any) -> None:
+    _asked(QUERIES_HZ, lambda k: client.status())
+
+
+def _teaching(client: Client, session: Any) -> None:
+    """A place, taught over and over, a millimetre beside where it was."""
+    skill = shipped_skill()
+    primitive = skill.primitive
+    x = primitive.inputs[0].tolist()
+    left, right, tool = tuple(x[:3]), tuple(x[3:]), primitive.reference.mean[0].tolist()
+    _asked(TEACHING_HZ, lambda k: client.add([ViaPoint("here", left, right, (*tool[:2], tool[2] + 0.001 * (k % 2)))]))
+
+
+def _loading(client: Client, session: Any) -> None:
+    names = (LARGE_SKILL, SHIPPED_SKILL.removesuffix(".npz"))
+    _asked(0.5, lambda k: client.load_skill(names[k % 2]))
+
+
+def _hands(rate_hz: float, client: Client, session: Any) -> None:
+    publish = hands_of(session, shipped_skill())
+
+    def put(k: int) -> None:
+        now_ns = time.time_ns()
+        publish(now_ns % 10**13 / 1e9, now_ns)
+
+    _asked(rate_hz, put)
+
+
+ASKING: dict[str, Callable[[Client, Any], None]] = {
+    "hands": partial(_hands, TRACKER_HZ),
+    "bursts": partial(_hands, BURST_HZ),
+    "status": _status,
+    "teaching": _teaching,
+    "loading": _loading,
+}
+LOADS = (
+    Load("nothing more"),
+    Load("scribe frozen", _frozen),
+    Load("scribe killed", _killed),
+    Load("viewer stalled", _stalled),
+    Load("disk full", _full),
+    Load(f"{QUERIES_HZ:.0f} status queries a second", _asking("status")),
+    Load(f"taught each {1e3 / TEACHING_HZ:.0f} ms", _asking("teaching")),
+    Load(f"skills of {LARGE} points loaded", _asking("loading")),
+    Load(f"hands at {BURST_HZ / 1e3:g} kHz", _asking("bursts")),
+    Load(f"{COLLECTIONS_HZ:.0f} collections a second", program=("-c", COLLECTING)),
+)
+
+
+def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    """For each load what the daemon's loop misses and how late it is, for so many seconds, and the
+    same of an empty loop while all the rest goes on; and how much of what was recorded replays bit
+    for bit. Raises LoadError and LaunchError.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        skills = Path(name)
+        shutil.copy(recordings() / SHIPPED_SKILL, skills)
+        say(f"making a skill of {LARGE} points")
+        (skills / f"{LARGE_SKILL}.npz").write_bytes(_large())
+        rows = []
+        for load in LOADS:
+            say(f"{load.what}: {2 * seconds:g} s")
+            rows.append({"load": load.what} | _row(load, rate_hz, seconds, skills, say))
+        return rows
+
+
+def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as name:
+        folder, port = Path(name), free_port()
+        arguments = ("--arm", "assumed", "--rate", str(rate_hz), "--live", str(port))
+        with (
+            launched(folder, *arguments, record=folder, skills=skills, program=load.program, say=say) as service,
+            open_session(connect=[service.endpoint]) as session,
+            asking("hands", service.endpoint),
+        ):
+            cell = Cell(service, Client(session), port)
+            until_following(cell.client)
+            with load.put_on(cell):
+                before = cell.client.status()
+                time.sleep(seconds)
+                after = cell.client.status()
+                realtime = _let_others_first(service.process.pid)
+                empty = probe("empty", rate_hz, seconds)
+            service.stop()
+        ticks = after.tick - before.tick
+        replayed = [replay(path) for path in sorted(folder.glob("*.mcap"))]
+        return {
+            "realtime": realtime,
+            "mode": after.mode,
+            "ticks": ticks,
+            "places": after.places,
+            "scribe": {name: after.scribe[name] for name in ("lost", "restarts", "errors")},
+            "missed": (after.missed - before.missed) / max(1, ticks),
+            "lateness_us": msgspec.to_builtins(after.lateness_us),
+            "work_us": msgspec.to_builtins(after.work_us),
+            "empty_missed": empty["missed"] / max(1, empty["ticks"]),
+            "empty_lateness_us": {name: empty["lateness_us"][name] for name in ("p50", "p99", "max")},
+            "recorded": sum(one.ticks for one in replayed),
+            "identical": sum(one.identical for one in replayed),
+        }
+
+
+def _let_others_first(pid: int) -> bool:
+    """Takes real-time scheduling from a daemon's loop; whether it had it."""
+    had = os.sched_getscheduler(pid) == os.SCHED_FIFO
+    if had:
+        os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
+    return had
+
+
+def until_following(client: Client) -> None:
+    """Waits until a daemon follows the hands, and a little more. Raises LoadError."""
+    until = time.monotonic() + 15.0
+    while (now := client.status()).mode != "follow":
+        if time.monotonic() > until:
+            raise LoadError(f"the daemon does not follow the hands: {now.mode} ({now.reason})")
+        time.sleep(0.1)
+    time.sleep(SETTLE_S)
+
+
+def _large() -> bytes:
+    """The file of a skill of many points: the shipped one's over and over, a little beside."""
+    skill = shipped_skill()
+    inputs, reference = skill.primitive.inputs, skill.primitive.reference
+    pick = np.arange(LARGE) % len(inputs)
+    beside = np.random.default_rng(0).normal(scale=0.01, size=(LARGE, inputs.shape[1]))
+    moved = inputs[pick] + beside
+    primitive = KMP.fit(
+        moved,
+        Gaussians(skill.primitive.mean(moved), reference.covariance[pick]),
+        kernel=GaussianKernel(5.0),
+        rank_tolerance=1e-6,
+        lambda_mean=skill.primitive.lambda_mean,
+        prior_mean=skill.primitive.prior_mean,
+    )
+    return with_file(replace(skill, name=LARGE_SKILL, primitive=primitive, via_points=())).file
+
+
+@contextlib.contextmanager
+def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    """One of ASKING as a process of its own, which has begun. Raises LoadError."""
+    with _process([sys.executable, "-m", "service.timing.loads", kind, endpoint]) as process:
+        assert process.stdout is not None
+        if not process.stdout.readline():
+            raise LoadError(f"what asks for {kind!r} did not begin")
+        yield process
+
+
+@contextlib.contextmanager
+def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def text(rows: list[dict[str, Any]]) -> str:
+    """The rows for people to read."""
+    lines = [
+        f"{'':<34}{'missed':>9}{'late p50':>10}{'p99 µs':>9}{'empty:':>10}{'p50':>8}{'p99':>9}  replayed identically"
+    ]
+    for row in rows:
+        late, empty = row["lateness_us"], row["empty_lateness_us"]
+        lines.append(
+            f"  {row['load']:<32}{100 * row['missed']:8.2f}%{late['p50']:10.1f}{late['p99']:9.1f}"
+            f"{100 * row['empty_missed']:9.2f}%{empty['p50']:8.1f}{empty['p99']:9.1f}"
+            f"  {row['identical']} of {row['recorded']}"
+        )
+    return "\n".join(lines)
+
+
+def main(kind: str, endpoint: str) -> int:
+    """One of ASKING, until it is killed."""
+    with contextlib.suppress(UnreachableError), open_session(connect=[endpoint]) as session:
+        ASKING[kind](Client(session), session)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,206 @@
+"""What a daemon is measured with and against, each a process of its own that prints one JSON line:
+a loop that only does a fixed piece of work, the core alone in such a loop, a tracker that waits for
+the commands which answer its hands, and an echo.
+"""
+
+from __future__ import annotations
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import zenoh
+
+from service.client import endpoints, open_session
+from service.config import Settings, robot_description
+from service.contract import cdr, channels
+from service.contract.messages import PoseStamped
+from service.contract.records import SIDES
+from service.core.controller import Controller
+from service.core.frame import Event, Tick, Vector
+from service.core.skill.skill import Skill
+from service.core.warm_up import warm_up
+from service.daemon.clock import SPIN_NS, Deadlines, ask_for_real_time
+from service.learning.skill_file import decoded
+
+SHARES = (50.0, 99.0, 99.9, 100.0)
+EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms
+TRACKER_HZ, SWAY_M, SWAY_HZ = 487.3, 0.03, 0.3  # a rate that no loop's divides
+HANDS_EVERY_S = 0.01
+PING_EVERY = 20  # samples
+FLOATS, CALLS = 200, 20  # of the fixed piece of work
+SETTLE_S = 1.0  # that is not counted
+
+
+def percentiles(values: Any) -> dict[str, float]:
+    """The SHARES of some values, by name; zeros where there are none."""
+    found = np.percentile(values, SHARES).round(2).tolist() if len(values) else [0.0] * len(SHARES)
+    return dict(zip(("p50", "p99", "p99.9", "max"), found, strict=True))
+
+
+def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
+    """What a report says of a loop's lateness and work [us]: SHARES, counts between EDGES_US."""
+    found: dict[str, Any] = {}
+    for name, values in (("lateness", lateness_us), ("work", work_us)):
+        found[f"{name}_us"] = percentiles(values)
+        found[f"{name}_counts"] = np.histogram(np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US)[0].tolist()
+    return found
+
+
+def fixed_work(array: Vector) -> float:
+    """A piece of Python and NumPy that is the same in every version: what a machine's hour is
+    measured by.
+    """
+    total = 0.0
+    for k in range(FLOATS):
+        total += 0.5 * k
+    for _ in range(CALLS):
+        array = np.minimum(array * 1.0, 2.0)
+    return total + float(array[0])
+
+
+def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[str, Any]:
+    """Missed deadlines, lateness and work [us] of a loop."""
+    realtime = ask_for_real_time().realtime
+    clock = Deadlines(rate_hz, spin_ns=SPIN_NS if realtime else 0)
+    late_us, work_us = [], []
+    first = missed = 0
+    for _ in range(round((SETTLE_S + seconds) * rate_hz)):
+        index, late_ns = clock.wait()
+        began = time.perf_counter_ns()
+        work(index)
+        took = time.perf_counter_ns() - began
+        if index < SETTLE_S * rate_hz:
+            first, missed = index, clock.missed
+        elif index > (SETTLE_S + seconds) * rate_hz:
+            break
+        else:
+            late_us.append(late_ns / 1e3)
+            work_us.append(took / 1e3)
+    return {
+        "realtime": realtime,
+        "ticks": index - first,
+        "missed": clock.missed - missed,
+        **figures(late_us, work_us),
+    }
+
+
+def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
+    """Both hands [m] at a time [s], about the middle of what the skill has learned."""
+    middle = skill.hands.mean(axis=0).tolist()
+    x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
+    return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
+
+
+def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], None]:
+    """What publishes both hands, swaying, of a time [s] under a stamp [ns]."""
+    cell = Settings().cell
+    publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
+
+    def publish(t: float, stamp_ns: int) -> None:
+        for publisher, place in zip(publishers, swaying(skill, t), strict=True):
+            publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, "base", place, (0.0, 0.0, 0.0, 1.0))))
+
+    return publish
+
+
+def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
+    """The core alone, in the loop."""
+    settings = Settings(rate_hz=rate_hz)
+    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
+    skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
+    warm_up(settings, skill, urdf=urdf)
+    controller, every = Controller(settings, skill, urdf=urdf), round(HANDS_EVERY_S * rate_hz)
+
+    def step(index: int) -> object:
+        hands = swaying(skill, index / rate_hz) if index % every == 0 else []
+        poses = (PoseStamped(1 + index, "", place, (0.0, 0.0, 0.0, 1.0)) for place in hands)
+        return controller.step(
+            Tick(index, tuple(Event(f"hands/{side}", b"", pose) for side, pose in zip(SIDES, poses, strict=False)))
+        )
+
+    return loop(rate_hz, seconds, step)
+
+
+def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[str, Any]:
+    """Time from a hand published to the command that answers it, and there and back to an echo
+    [ms].
+    """
+    cell = Settings().cell
+    answered: dict[int, int] = {}
+    trips_ms: list[float] = []
+
+    def command(sample: zenoh.Sample) -> None:
+        if sample.attachment is not None:
+            newest = cdr.decode_attachment(sample.attachment.to_bytes()).hand_stamp_ns
+            answered.setdefault(newest, time.time_ns())
+
+    def pong(sample: zenoh.Sample) -> None:
+        trips_ms.append((time.time_ns() - int(sample.payload.to_bytes())) / 1e6)
+
+    with open_session(connect=[endpoint, echo_at], more={"mode": "peer"}) as session:
+        listening = [
+            session.declare_subscriber(channels.key(cell, "joints/command"), command),
+            session.declare_subscriber("probe/pong", pong),
+        ]
+        publish = hands_of(session, skill)
+        ping = session.declare_publisher("probe/ping", express=True)
+        start_ns, sent = time.time_ns(), []
+        for k in range(round((SETTLE_S + seconds) * TRACKER_HZ)):
+            due_ns = start_ns + round(1e9 * k / TRACKER_HZ)
+            time.sleep(max(0.0, (due_ns - time.time_ns()) / 1e9))
+            now_ns = time.time_ns()
+            publish(k / TRACKER_HZ, now_ns)
+            if k > SETTLE_S * TRACKER_HZ:
+                sent.append(now_ns)
+                if k % PING_EVERY == 0:
+                    ping.put(str(time.time_ns()).encode())
+        time.sleep(0.1)
+        for subscriber in listening:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+    latencies_ms = [(answered[stamp] - stamp) / 1e6 for stamp in sent if stamp in answered]
+    return {"latency_ms": percentiles(latencies_ms), "round_trip_ms": percentiles(trips_ms), "sent": len(sent)}
+
+
+def echo() -> None:
+    """Sends back what comes, until its standard input ends."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        back = session.declare_publisher("probe/pong", express=True)
+        heard = session.declare_subscriber("probe/ping", lambda sample: back.put(sample.payload))
+        print(endpoints(session)[0], flush=True)
+        sys.stdin.read()
+        heard.undeclare()  # type: ignore[no-untyped-call]
+
+
+def main(kind: str, *arguments: str) -> int:
+    """`empty RATE SECONDS`, `core SKILL RATE SECONDS`, `tracker SKILL ENDPOINT ECHO SECONDS` or
+    `echo`.
+    """
+    if kind == "echo":
+        echo()
+        return 0
+    if kind == "empty":
+        array = np.ones(7)
+        result = loop(int(arguments[0]), float(arguments[1]), lambda index: fixed_work(array))
+    else:
+        with open(arguments[0], "rb") as file:
+            skill = decoded(file.read(), origin=arguments[0])
+        if kind == "core":
+            result = core(skill, int(arguments[1]), float(arguments[2]))
+        else:
+            result = tracker(skill, arguments[1], arguments[2], float(arguments[3]))
+    print(json.dumps(result), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,58 @@
+"""The probes of `service.timing.probe`, started and heard; and a daemon's processes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import psutil
+
+from service.contract.explain import ExplainedError
+
+PROBE = [sys.executable, "-m", "service.timing.probe"]
+TIMEOUT_S = 900.0
+
+
+class BenchError(ExplainedError):
+    """The measurement could not be made; the message says what failed."""
+
+
+def probe(kind: str, *arguments: object) -> dict[str, Any]:
+    """What one of the probes found. Raises BenchError."""
+    command = [*PROBE, kind, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    if done.returncode != 0:
+        raise BenchError(f"{kind} could not be measured: {done.stderr.strip()[-500:]}")
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+@contextlib.contextmanager
+def echo() -> Iterator[str]:
+    """Where an echo listens."""
+    process = subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdin is not None
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.stdin.close()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+
+def family(pid: int) -> dict[str, psutil.Process]:
+    """A daemon's process and its children's, by what they are."""
+    found = {"daemon": psutil.Process(pid)}
+    kinds = {"service.recording.process": "scribe", "service.daemon.skill_worker": "skill worker"}
+    for child in found["daemon"].children():
+        found |= {kinds[word]: child for word in child.cmdline() if word in kinds}
+    return found

@@ -1,0 +1,1 @@
+"""What Rerun draws of a cell: its frames, its surroundings, its skill."""

@@ -1,0 +1,196 @@
+"""The arrangement of the views: three tabs, for the task, the timing, and what was learned.
+
+All curves have one axis of time, seconds from the start, so that their cursors stand in line; it
+goes on behind the newest value, where the legends are. How far up each view reaches is told by the
+limits in force, or by what was drawn: a single value that stands out does not flatten the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint import components
+
+from service import palette
+from service.config import Settings
+from service.core.separation.separation import IRRELEVANT
+
+TIMELINE = "seconds"
+TABS = ("task", "timing", "learning")
+WINDOW_S, LEGEND_SHARE = 20.0, 0.28  # of live curves; of the axis, kept free for legends
+ROOM = 1.25  # of an axis, times how far most seconds' curves reach
+GATE_FAR = 4.0  # times as high as the curves, the gate would flatten them
+EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
+
+
+class Curves(NamedTuple):
+    """One view of curves: where they are, their title, and the least and greatest value shown
+    unless what was drawn says otherwise; None: from 0, and from minus to plus.
+    """
+
+    origin: str
+    title: str
+    low: float
+    high: float
+    fixed: bool = False
+
+
+def curves(settings: Settings) -> dict[str, Curves]:
+    """All views of curves by their origin, as high as the settings let the values be."""
+    joints, tool, period_us = settings.joints, settings.tool, 1e6 * settings.period_s
+    velocity, acceleration = max(joints.velocity), max(joints.acceleration)
+    return {
+        view.origin: view
+        for view in (
+            Curves("/error", "Tool to target [mm]", 0, 60),
+            Curves("/turn", "Tool turned from the target [°]", 0, 10),
+            Curves("/gripper", "Gripper: how far closed [%]", 0, 110, True),
+            Curves("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
+            Curves("/speed", "Speed [m/s]", 0, tool.max_speed),
+            Curves("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
+            Curves("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, IRRELEVANT),
+            Curves("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
+            Curves("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
+            Curves("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),
+            Curves("/joints/error", "Joint, measured less commanded [rad]", 0, settings.arm.fault_error_rad),
+            Curves("/latency", "Hand to command [ms]", 0, 20),
+            Curves("/timing/lateness", "How late a tick begins [µs]", 0, period_us / 2),
+            Curves("/timing/work", "Work of a tick [µs]", 0, period_us),
+            Curves("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
+            Curves("/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.stale_ms, True),
+        )
+    }
+
+
+def blueprint(
+    settings: Settings,
+    *,
+    live: bool,
+    gate_m: float = math.inf,
+    tops: Mapping[str, float] | None = None,
+    end_s: float | None = None,
+    tab: str = TABS[0],
+) -> rrb.Blueprint:
+    """The arrangement for a live view, or for a file that lasts `end_s` [s] and in which the curves
+    reach up to `tops`; both are known once it is drawn. `gate_m` is the deviation [m] above which
+    the skill in force holds.
+    """
+    views, reached = curves(settings), dict(tops or {})
+    tops = {origin: ROOM * top for origin, top in reached.items()}
+    gate_mm, most_mm = 1e3 * gate_m, GATE_FAR * reached.get("/deviation", views["/deviation"].high)
+    if gate_mm <= most_mm:
+        tops["/deviation"] = ROOM * max(gate_mm, reached.get("/deviation", 0.0))
+    left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
+    relative = rrb.TimeRangeBoundary.cursor_relative
+    if end_s is None:
+        room_s = LEGEND_SHARE * WINDOW_S / (1 - LEGEND_SHARE)
+        shown = rr.TimeRange(start=relative(seconds=-WINDOW_S), end=relative(seconds=room_s))
+    else:
+        whole_s = max(1.0, end_s / (1 - LEGEND_SHARE))
+        absolute = rrb.TimeRangeBoundary.absolute
+        shown = rr.TimeRange(start=absolute(seconds=0.0), end=absolute(seconds=whole_s))
+    loaded = (
+        rrb.VisibleTimeRanges(rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative()))
+        if live
+        else None
+    )
+
+    def plot(origin: str, *, legend: bool = True) -> rrb.TimeSeriesView:
+        view = views[origin]
+        high = view.high if view.fixed else tops.get(origin, view.high)
+        low = view.low if view.fixed or view.low >= 0 else -high
+        return rrb.TimeSeriesView(
+            origin=origin,
+            contents=["+ $origin/**", *(left_out if origin == "/deviation" else [])],
+            name=view.title,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+            axis_x=rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=shown),
+            axis_y=rrb.ScalarAxis(range=(low, high)),
+            time_ranges=loaded,
+        )
+
+    task = rrb.Vertical(
+        rrb.Horizontal(
+            _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
+            rrb.Vertical(
+                rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), active_tab=0),
+                plot("/deviation"),
+                rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
+                rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
+                row_shares=[3, 3, 3, 5],  # the joints have seven names
+            ),
+            column_shares=[3, 2],
+        ),
+        rrb.Horizontal(_modes(shown), _log(), column_shares=[3, 2]),
+        row_shares=[7, 2],
+        name="Task",
+    )
+    timing = rrb.Vertical(
+        rrb.Grid(
+            *(plot(origin) for origin in ("/latency", "/timing/lateness", "/timing/work", "/timing/stages", "/age")),
+            _log(),
+            grid_columns=2,
+        ),
+        _modes(shown),
+        row_shares=[6, 1],
+        name="Timing",
+    )
+    learning = rrb.Horizontal(
+        _scene(
+            "What was learned, and taught places",
+            "+ /skill/**",
+            "+ /scene/**",
+            "- /scene/banner/**",
+            "- /scene/reach/**",
+        ),
+        rrb.Vertical(
+            rrb.TextDocumentView(origin="/about/skill", name="Skill"),
+            plot("/deviation"),
+            plot("/error"),
+            row_shares=[3, 2, 2],
+        ),
+        column_shares=[3, 2],
+        name="Learning",
+    )
+    return rrb.Blueprint(
+        rrb.Tabs(task, timing, learning, active_tab=TABS.index(tab)),
+        rrb.TopPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else None),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _scene(name: str, *contents: str) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        origin="/",
+        name=name,
+        contents=list(contents),
+        background=rrb.Background(color=palette.BACKGROUND),
+        line_grid=rrb.LineGrid3D(
+            spacing=0.1,
+            plane=rr.components.Plane3D.XY.with_distance(-0.02),
+            stroke_width=0.5,
+            color=palette.faint(palette.GRID, 0.35),
+        ),
+        eye_controls=rrb.EyeControls3D(position=EYE, look_target=LOOK_AT, eye_up=UP),
+    )
+
+
+def _modes(shown: Any) -> rrb.StateTimelineView:
+    axis = rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=shown)
+    return rrb.StateTimelineView(origin="/mode", name="Mode", time_view=axis)
+
+
+def _log() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin="/log",
+        name="Log",
+        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"]),
+    )

@@ -1,0 +1,358 @@
+"""Where a Rerun scene goes: into a file, to live viewers, or both.
+
+Frames are sent by columns, a batch at a time. Where a destination fails (full disk, used port) it
+is given up and named in `problems`; the other goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import queue
+import socket
+import sys
+import threading
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from service.config import Settings
+from service.contract import cdr
+from service.contract.explain import ExplainedError
+from service.contract.messages import Thing, WireError, in_order
+from service.core.frame import Record
+from service.learning.demonstration import Demonstration
+from service.recording.paths import skills_folder
+from service.recording.recording import THINGS
+from service.viewer import learned as taught
+from service.viewer import things
+from service.viewer.blueprint import blueprint
+from service.viewer.dynamic import LOG_NS, Chunks, Shown
+from service.viewer.learned import Taught
+from service.viewer.sentences import sentence
+from service.viewer.static import Trees, log_fixed
+
+FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
+LIVE_MEMORY = "64MiB"
+FLUSH_TIMEOUT_S = 5.0
+REPEAT_S = 10.0  # what is in force is said again to live viewers as often
+
+
+class ViewerError(ExplainedError, RuntimeError):
+    """Something that cannot be shown: says what, and what would help."""
+
+
+class _Destination:
+    """Where the scene goes: collects frames, sends them by batches."""
+
+    def __init__(
+        self,
+        name: str,
+        sink: Any,
+        *,
+        live: bool,
+        batch_s: float,
+        urdf: Path,
+        settings: Settings,
+        recording_id: str,
+        skill: tuple[Taught, list[Demonstration]] | None,
+    ) -> None:
+        self._batch_ns = round(batch_s * 1e9)
+        self._pending: list[Shown] = []
+        self._live, self._settings = live, settings
+        self._trees = Trees(urdf)
+        self._chunks = Chunks(self._trees, settings, urdf.read_text(encoding="utf-8"), live=live)
+        self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
+        self._taught = skill
+        if skill is not None:
+            self._chunks.gate(skill[0].threshold)
+        self._things: tuple[Thing, ...] = ()
+        self._repeated_ns = 0
+        self._open = False
+        self.turn(name, sink)
+
+    def turn(self, name: str, sink: Any) -> None:
+        """From now on the scene goes elsewhere: what never changes is sent there first, and what is
+        in force with the first frame.
+        """
+        self._finish()
+        self.name = name
+        self._chunks.begin_anew()
+        self._repeated_ns, self._open = 0, True
+        self._stream.set_sinks(sink)
+        self._stream.send_recording_name(self._settings.cell)
+        # no more often than this: Rerun keeps 1.5 MB of each for good
+        self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
+        log_fixed(self._stream, self._trees, self._settings)
+        self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    def add(self, shown: Shown) -> None:
+        """Takes in one frame."""
+        if not self._repeated_ns:
+            self._repeat(shown.time_ns)
+        self._pending.append(shown)
+        if shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
+            self.send()
+        if self._live and shown.time_ns - self._repeated_ns > REPEAT_S * 1e9:
+            self._repeat(shown.time_ns)
+
+    def _repeat(self, time_ns: int) -> None:
+        """Says what is in force, also for those who come later."""
+        self._repeated_ns = time_ns
+        if self._taught is not None:
+            self.put(list(taught.drawn(*self._taught, self._at(time_ns))))
+        self.put(list(things.drawn(self._things, (), self._at(time_ns))))
+
+    def learn(self, skill: Taught, demonstrations: list[Demonstration]) -> None:
+        """Takes in the skill in force from now on."""
+        self._taught = skill, demonstrations
+        self._chunks.gate(skill.threshold)
+        if self._repeated_ns:
+            self.send()
+            self.put(list(taught.drawn(skill, demonstrations, self._at(self._repeated_ns))))
+
+    def place(self, found: tuple[Thing, ...], time_ns: int) -> None:
+        """Takes in what lies on the bench."""
+        before, self._things = self._things, found
+        if self._repeated_ns and found != before:
+            self.put(list(things.drawn(found, (thing.name for thing in before), self._at(time_ns))))
+
+    def log(self, text: str, level: str, time_ns: int) -> None:
+        """Takes in one line of the log."""
+        self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
+
+    def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
+        """What makes a chunk of one row at a time [ns]."""
+        index = self._chunks.index(np.array([time_ns], np.int64), to_ns=to_ns)
+        return lambda path, *columns: rr.chunk.Chunk.from_columns(path, index, list(columns))
+
+    def send(self) -> None:
+        """Sends what is pending."""
+        if self._pending:
+            batch, self._pending = self._pending, []
+            self.put(list(self._chunks.of(batch)))
+
+    def _finish(self) -> None:
+        """Sends what is pending, and to a file how far its curves reach, now that this is known."""
+        self.send()
+        if self._open and not self._live and self._chunks.end_s > 0:
+            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
+            self._stream.send_blueprint(
+                blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._chunks.end_s),
+                make_active=True,
+            )
+
+    @property
+    def _gate_m(self) -> float:
+        return np.inf if self._taught is None else self._taught[0].threshold
+
+    def put(self, chunks: list[rr.chunk.Chunk]) -> None:
+        """Hands chunks to the stream."""
+        self._stream.send_chunks(chunks)
+
+    def flush(self) -> None:
+        """Sends what is pending; raises if it does not arrive."""
+        self.send()
+        self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+    def close(self) -> None:
+        """Ends the file or the server."""
+        self._finish()
+        self._stream.disconnect()
+
+
+class _Live(_Destination):
+    """A server for live viewers, fed on a thread of its own: a viewer that stalls holds up nobody,
+    the oldest batches are dropped.
+    """
+
+    def __init__(self, port: int, **common: Any) -> None:
+        with socket.socket() as probe:
+            try:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise ViewerError(f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any") from None
+            port = probe.getsockname()[1]
+        self.url = f"rerun+http://127.0.0.1:{port}/proxy"
+        self._waiting: queue.Queue[list[rr.chunk.Chunk] | None] = queue.Queue(maxsize=100)
+        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=LIVE_MEMORY)
+        super().__init__(f"the live view at {self.url}", sink, live=True, batch_s=LIVE_BATCH_S, **common)
+        self._thread = threading.Thread(target=self._feed, name="live view", daemon=True)
+        self._thread.start()
+
+    def _feed(self) -> None:
+        while (chunks := self._waiting.get()) is not None:
+            self._stream.send_chunks(chunks)
+
+    def put(self, chunks: list[rr.chunk.Chunk] | None) -> None:
+        while True:
+            try:
+                return self._waiting.put_nowait(chunks)
+            except queue.Full:
+                with contextlib.suppress(queue.Empty):
+                    self._waiting.get_nowait()
+
+    def flush(self) -> None:
+        self.send()
+
+    def close(self) -> None:
+        self.send()
+        self.put(None)
+        self._thread.join(FLUSH_TIMEOUT_S)
+        if not self._thread.is_alive():
+            self._stream.disconnect()
+
+
+class Viewer:
+    """Draws frames as a Rerun scene into a file, for live viewers, or both.
+
+    Where it fails is told in `problems`, not raised.
+    """
+
+    def __init__(
+        self,
+        *,
+        urdf: Path,
+        settings: Settings,
+        skill: bytes | None = None,
+        rrd: Path | None = None,
+        live_port: int | None = None,
+    ) -> None:
+        self.problems: list[str] = []
+        self.url: str | None = None
+        self.rrd: str | None = None
+        self._settings = settings
+        self._measured: NDArray[np.float64] | None = None
+        self._skill, self._learned_from = b"", ""
+        self._unread: Taught | None = None  # whose demonstrations are to be read, which takes a while
+        self._remarks: list[str] = []  # for the log, with the next frame
+        self._demonstrations: list[Demonstration] = []
+        self._destinations: list[_Destination] = []
+        self._file: _Destination | None = None
+        self._common: dict[str, Any] = {
+            "urdf": urdf,
+            "settings": settings,
+            "recording_id": f"{settings.cell}-{uuid.uuid4().hex[:12]}",
+            "skill": None,
+        }
+        if skill is not None:
+            self.learn(skill)
+        if rrd is not None:
+            self.draw_into(rrd)
+        if live_port is not None:
+            with self._sparing("the live view", None):
+                live = _Live(live_port, **self._common)
+                self._destinations.append(live)
+                self.url = live.url
+
+    def draw_into(self, rrd: Path) -> None:
+        """Ends the file drawn into, if there is one, and goes on in another.
+
+        Each shows its part of the scene by itself; one endless file would fill the memory, which
+        holds a list of all that was sent.
+        """
+        name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
+        self.rrd = None
+        with self._sparing(name, drawn):
+            rrd.parent.mkdir(parents=True, exist_ok=True)
+            rrd.open("wb").close()
+            if drawn is None:
+                self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
+                self._destinations.append(self._file)
+            else:
+                drawn.turn(name, rr.FileSink(rrd))
+            self.rrd = str(rrd)
+
+    @contextlib.contextmanager
+    def _sparing(self, name: str, destination: _Destination | None) -> Iterator[None]:
+        """What goes wrong inside is noted, and ends the destination only."""
+        try:
+            yield
+        except Exception as error:
+            self.problems.append(f"{name} ended: {error}")
+            if destination in self._destinations:
+                self._destinations.remove(destination)
+            if destination is not None and destination is self._file:
+                self.rrd = None
+
+    def _each(self, act: Callable[[_Destination], None]) -> None:
+        for destination in list(self._destinations):
+            with self._sparing(destination.name, destination):
+                act(destination)
+
+    def add(
+        self, frame: Record, time_ns: int, timing: Record | None = None, events: Iterable[tuple[str, bytes]] = ()
+    ) -> None:
+        """Draws a frame at a time [ns], and what its `events` (kind and bytes) say of arm and
+        skill.
+        """
+        for kind, payload in events:
+            if kind == "joints/state":
+                with contextlib.suppress(WireError):
+                    self._measured = np.array(in_order(cdr.decode_joints(payload), self._settings.joints.names)[0])
+            elif kind == "skill":
+                self.learn(payload)
+        if self._unread is not None:
+            found, self._unread = self._unread, None
+            self._demonstrations = taught.demonstrations(found, skills_folder(self._settings))
+            self._show(found)
+        while self._remarks:
+            self.log(self._remarks.pop(0), "WARN", time_ns)
+        shown = Shown(frame, time_ns, timing, self._measured)
+        self._each(lambda destination: destination.add(shown))
+
+    def learn(self, skill: bytes) -> None:
+        """Draws what a skill was learned from and taught, from now on."""
+        if skill == self._skill:
+            return
+        self._skill = skill
+        try:
+            found = taught.taught(skill)
+        except ValueError as error:
+            self._remarks.append(str(error))
+            return
+        if found.learned_from != self._learned_from:
+            self._learned_from, self._demonstrations = found.learned_from, []
+            self._unread = found
+        self._show(found)
+
+    def _show(self, skill: Taught) -> None:
+        self._common["skill"] = skill, self._demonstrations
+        self._each(lambda destination: destination.learn(skill, self._demonstrations))
+
+    def note(self, key: str, text: str, time_ns: int) -> None:
+        """Shows a note: things on the bench, or a line in the log, a warning under `log`."""
+        if key == THINGS:
+            found = msgspec.json.decode(text, type=tuple[Thing, ...])
+            self._each(lambda destination: destination.place(found, time_ns))
+        else:
+            self.log(sentence(text), "WARN" if key == "log" else "INFO", time_ns)
+
+    def log(self, text: str, level: str, time_ns: int) -> None:
+        """Shows a line in the log; level is INFO, WARN or ERROR."""
+        self._each(lambda destination: destination.log(text, level, time_ns))
+
+    def flush(self) -> None:
+        """Sends what is pending and sees to it that the file has it."""
+        self._each(lambda destination: destination.flush())
+
+    def close(self) -> None:
+        """Ends the file and the live view."""
+        self._each(lambda destination: destination.flush())
+        self._each(lambda destination: destination.close())
+        self._destinations = []
+
+
+def rerun_program() -> Path:
+    """The Rerun program that came with the library: it need not be on the path."""
+    found = importlib.util.find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise ViewerError("the Rerun program is not installed: pip install rerun-sdk")
+    return Path(found.origin).with_name("rerun.exe" if sys.platform == "win32" else "rerun")

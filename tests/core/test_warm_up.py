@@ -1,0 +1,91 @@
+"""After `warm_up`, nothing is left for a loop to compile: in a process of its own, for a compiled
+function remembers what it has been compiled for.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from tests_paths import RECORDINGS
+
+COUNTED = """
+import importlib
+import pkgutil
+import sys
+from pathlib import Path
+
+from service import one_blas_thread
+from numba.core.dispatcher import Dispatcher
+
+import kmp
+import service.core
+from service.config import Settings, robot_description
+from service.core.warm_up import warm_up
+
+LOOPED = [
+    importlib.import_module(found.name)
+    for package in (kmp, service.core)
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
+    if not found.name.endswith("__main__")
+]
+
+def compiled():
+    return {
+        f"{name} of {module.__name__}": len(function.signatures)
+        for module in LOOPED
+        for name, function in vars(module).items()
+        if isinstance(function, Dispatcher)
+    }
+
+def since(before):
+    return {name: count - before[name] for name, count in compiled().items() if count != before[name]}
+
+def compiled_by(skill):
+    so_far = compiled()
+    warm_up(Settings(), skill, urdf=robot_description(Settings()))
+    assert since(so_far)
+    return compiled()
+"""
+REPLAYED = """
+from service.cli.main import main
+from service.shipped import shipped_skill
+
+before = compiled_by(shipped_skill())
+assert main(["replay", sys.argv[1]]) in (0, None)
+assert since(before) == {}, since(before)
+"""
+FROM_THE_SKILL_WORKER = """
+from service.daemon.skill_worker import SkillWorker
+from sim.experiments.rehearsal import rehearse as played
+from sim.scene import Scene
+from sim.script import HandScript
+
+worker = SkillWorker()
+loaded = worker.load(Path(sys.argv[1]), timeout_s=60.0)
+before = compiled_by(loaded)
+adapted = worker.adapt(loaded, Scene().via_points(), tolerance=0.05, timeout_s=60.0)
+worker.close()
+for skill in (loaded, adapted):
+    played(HandScript(Scene(), seed=1), lambda bench: skill)
+assert since(before) == {}, since(before)
+"""
+
+
+def done_in_a_process(script: str, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", COUNTED + script, *arguments], capture_output=True, text=True, timeout=240, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_rehearsal_leaves_nothing_to_compile() -> None:
+    assert "identical" in done_in_a_process(REPLAYED, str(RECORDINGS / "golden.mcap"))
+
+
+@pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
+def test_neither_does_a_skill_that_another_process_gave_back(file: str) -> None:
+    pytest.importorskip("pybullet", reason="its hands and arm are the bench's")
+    done_in_a_process(FROM_THE_SKILL_WORKER, str(RECORDINGS / file))

@@ -1,0 +1,202 @@
+"""The clock: deadlines kept in phase, skipped where they were missed, and the figures that tell how
+well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+
+from service.contract.requests import Percentiles
+from service.daemon.clock import CREEP_NS, PREPARE_NS, STEP_NS, Deadlines, Window
+
+PERIOD_NS = 2_000_000
+WALL_NS = 1_800_000_000_000_000_000
+
+
+class FakeClock:
+    """A clock that moves when it is told to, when someone sleeps (by more than was asked), and by a
+    little with each look.
+    """
+
+    def __init__(self, *, oversleep_ns: int = 0, look_ns: int = 0) -> None:
+        self.now = 1_000_000_007
+        self.oversleep_ns = oversleep_ns
+        self.look_ns = look_ns
+        self.slept_s: list[float] = []
+        self.set_by_ns = 0  # of the system clock
+
+    def wall_ns(self) -> int:
+        return WALL_NS + self.now + self.set_by_ns
+
+    def now_ns(self) -> int:
+        self.now += self.look_ns
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.slept_s.append(seconds)
+        self.now += round(seconds * 1e9) + self.oversleep_ns
+
+    def deadlines(self, *, rate_hz: int = 500, spin_ns: int = 0) -> Deadlines:
+        return Deadlines(rate_hz, spin_ns=spin_ns, now_ns=self.now_ns, wall_ns=self.wall_ns, sleep=self.sleep)
+
+
+def test_the_first_deadline_is_the_start() -> None:
+    clock = FakeClock()
+    assert clock.deadlines().wait() == (0, 0)
+    assert clock.slept_s == []
+
+
+def test_deadlines_stay_in_phase_however_late_each_wake_is() -> None:
+    clock = FakeClock(oversleep_ns=300_000)
+    start, deadlines = clock.now, clock.deadlines()
+    for tick in range(1000):
+        index, late_ns = deadlines.wait()
+        assert index == tick
+        assert clock.now - start == tick * PERIOD_NS + late_ns
+        assert late_ns == (300_000 if tick else 0)
+    assert deadlines.missed == 0
+
+
+def test_deadlines_that_passed_are_skipped_and_counted() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    deadlines.wait()
+    deadlines.wait()
+    clock.now += 5 * PERIOD_NS + 100
+    assert deadlines.wait() == (6, 100)
+    assert deadlines.missed == 4
+    assert deadlines.wait() == (7, 0)
+    assert deadlines.missed == 4
+
+
+def test_being_late_by_less_than_a_period_misses_nothing() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    deadlines.wait()
+    clock.now += 2 * PERIOD_NS - 1
+    assert deadlines.wait() == (1, PERIOD_NS - 1)
+    assert deadlines.missed == 0
+
+
+@example_settings(max_examples=50, deadline=None, derandomize=True)
+@given(st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=60))
+def test_there_is_never_a_burst(work_ns: list[int]) -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    last = -1
+    for work in work_ns:
+        before = clock.now
+        index, late_ns = deadlines.wait()
+        assert index > last
+        assert 0 <= late_ns < PERIOD_NS
+        assert clock.now - before <= PERIOD_NS
+        last = index
+        clock.now += work
+    assert last + 1 == len(work_ns) + deadlines.missed
+
+
+def test_sleep_ends_before_the_deadline_and_spinning_reaches_it() -> None:
+    clock = FakeClock(look_ns=1_000)
+    deadlines = clock.deadlines(spin_ns=100_000)
+    deadlines.wait()
+    _, late_ns = deadlines.wait()
+    assert clock.slept_s[-1] <= (PERIOD_NS - 100_000) / 1e9
+    assert 0 <= late_ns <= 1_000
+
+
+def test_the_rate_is_that_achieved() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    assert deadlines.rate_hz() == 0.0
+    for _ in range(501):
+        deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(500, rel=0.01)
+    clock.now += 500 * PERIOD_NS
+    deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(250, rel=0.01)
+
+
+def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
+    """What so many deadlines are stamped with."""
+    found = []
+    for _ in range(count):
+        deadlines.wait()
+        found.append(deadlines.stamp_ns)
+    return found
+
+
+def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None:
+    clock = FakeClock(oversleep_ns=300_000)
+    deadlines = clock.deadlines()
+    assert set(np.diff(stamps(clock, deadlines, 10))) == {PERIOD_NS}
+    clock.now += 98 * PERIOD_NS
+    before = deadlines.stamp_ns
+    deadlines.wait()
+    assert deadlines.stamp_ns - before == 98 * PERIOD_NS
+    assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000  # the deadline's time, not that of waking
+
+
+def test_stamps_follow_a_system_clock_that_is_set_ahead_at_once() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    stamps(clock, deadlines, 5)
+    clock.set_by_ns += 3_600_000_000_000
+    assert stamps(clock, deadlines, 1) == [clock.wall_ns()]
+
+
+def test_stamps_grow_while_a_system_clock_that_was_set_back_catches_up() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    before = stamps(clock, deadlines, 5)[-1]
+    clock.set_by_ns -= 1_000_000_000
+    after = stamps(clock, deadlines, 600)
+    steps = np.diff([before, *after])
+    assert (steps > 0).all()
+    assert (steps[:480] == CREEP_NS).all()
+    assert abs(after[-1] - clock.wall_ns()) < STEP_NS
+
+
+def test_stamps_are_drawn_to_a_system_clock_that_drifts_without_a_jump() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    stamps(clock, deadlines, 5)
+    for _ in range(3000):
+        clock.set_by_ns += 1_000  # 500 parts in a million, the most that it is ever slewed by
+        before = deadlines.stamp_ns
+        deadlines.wait()
+        assert abs(deadlines.stamp_ns - before - PERIOD_NS) <= 1_000
+    assert abs(deadlines.stamp_ns - clock.wall_ns()) < 1_000_000
+
+
+def test_an_empty_window_tells_zeros() -> None:
+    assert Window(10).percentiles() == Percentiles(0.0, 0.0, 0.0)
+
+
+def test_a_window_tells_percentiles_of_its_last_values_only() -> None:
+    window = Window(101)
+    for value in (7.0, 7.0, 7.0):
+        window.add(value)
+    assert window.percentiles() == Percentiles(7.0, 7.0, 7.0)
+    for value in range(1000, 1101):
+        window.add(float(value))
+    assert window.percentiles() == Percentiles(1050.0, 1099.0, 1100.0)
+
+
+def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -> None:
+    clock, prepared = FakeClock(), []
+    start, deadlines = clock.now, clock.deadlines()
+
+    def prepare() -> None:
+        prepared.append(clock.now - start)
+        clock.now += 200_000
+
+    deadlines.wait(prepare)  # the first deadline is now: no time
+    assert deadlines.wait(prepare) == (1, 0)
+    assert prepared == [PERIOD_NS - PREPARE_NS]
+    clock.now = start + 2 * PERIOD_NS - PREPARE_NS + 1
+    assert deadlines.wait(prepare) == (2, 0)
+    assert len(prepared) == 1

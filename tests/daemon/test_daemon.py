@@ -1,0 +1,344 @@
+"""The daemon as its users meet it: a process on Zenoh, hands in, joint commands out, requests
+answered, everything recorded.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from cell import LEFT, RIGHT, Tracker, serving, thirdhand
+from in_process import arm
+from tests_paths import RECORDINGS, ROOT
+from wam import JOINT_NAMES
+from zenoh.handlers import FifoChannel
+
+from service.cli.main import main
+from service.client import RefusedError
+from service.config import Settings, robot_description
+from service.contract import cdr, requests
+from service.core.arm.arm import Arm
+from service.core.controller import Controller
+from service.core.frame import Tick
+from service.core.skill.skill import Skill
+from service.daemon.measured_tool import MeasuredTool
+from service.recording.recording import Recording
+from service.recording.replay import replay
+
+HANDOVER = requests.ViaPoint(
+    "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
+)
+
+
+def following(status: dict[str, Any]) -> bool:
+    return bool(status["mode"] == "follow")
+
+
+def test_a_session_from_start_to_end(tmp_path: Path) -> None:
+    """Hands are followed, lost, and followed again; places are taught; SIGTERM ends it all, and
+    what was recorded replays identically.
+    """
+    records = tmp_path / "records"
+    with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
+        daemon.until(lambda s: (s["mode"], s["reason"]) == ("hold", "no_hands"))
+        commands = daemon.session.declare_subscriber("thirdhand/joints/command", FifoChannel(100))
+        with Tracker(daemon.session) as tracker:
+            daemon.until(following)
+            sample = commands.recv()
+            command = cdr.decode_joints(sample.payload.to_bytes())
+            assert command.names == JOINT_NAMES
+            assert len(command.position) == len(command.velocity) == 7
+            attachment = cdr.decode_attachment(sample.attachment.to_bytes())
+            assert attachment.published_ns >= attachment.hand_stamp_ns
+            commands.undeclare()
+
+            reply = daemon.client.add([HANDOVER])
+            (point,) = reply.points or ()
+            assert point.name == "handover"
+            assert point.missed_by_m < 0.005
+            assert daemon.until(lambda s: s["tick"] >= reply.tick)["places"] == ["handover"]
+
+            tracker.left = None
+            assert daemon.until(lambda s: s["mode"] == "hold")["reason"] == "stale_hand"
+            tracker.left = LEFT
+            daemon.until(following)
+
+            held = daemon.client.hold()
+            assert held.tick > 0
+            assert (held.mode, held.reason) == ("hold", "operator")
+            assert daemon.until(lambda s: s["mode"] == "hold")["reason"] == "operator"
+            daemon.client.ask("resume")
+            daemon.until(following)
+
+            def spoil(status: dict[str, Any]) -> bool:
+                daemon.session.put("thirdhand/hands/left", b"nonsense")
+                daemon.session.put("thirdhand/hands/right", bytes(100_000))
+                return {"malformed hands/left", "malformed hands/right"} <= status["rejected"].keys()
+
+            daemon.until(spoil)
+            assert daemon.end() == 0
+    (recording,) = records.glob("*.mcap")
+    (rrd,) = records.glob("*.rrd")
+    assert rrd.stat().st_size > 10_000
+    result = replay(recording)
+    assert result.exact, result.text()
+    frames = np.array([step.frame for step in Recording.open(recording).steps() if step.frame is not None])
+    assert not frames["joint_velocities"][-1].any()
+    notes = [text for _, text, _ in Recording.open(recording).notes("requests")]
+    assert any("handover" in note for note in notes)
+
+
+def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
+        daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
+        assert daemon.end() == 0
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        assert daemon.client.status().places == ("handover",)
+        listed = daemon.client.ask("via_points", {"op": "list"})["points"]
+        assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]
+        daemon.client.ask("via_points", {"op": "clear"})
+        daemon.process.kill()
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        assert daemon.client.status().places == ()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "request_", "words"),
+    [
+        (
+            "via_points",
+            {"op": "add", "points": [{"name": "h", "left": [1, 2], "right": [1, 2, 3], "tool": [1, 2, 3]}]},
+            "$.points[0].left: 2 numbers, 3 needed",
+        ),
+        ("via_points", {"op": "remove", "names": ["nothing"]}, "no via-point 'nothing'"),
+        ("via_points", {"op": "turn"}, "$.op"),
+        ("skill", {"name": "sodlering"}, "There are: soldering"),
+        ("skill", {"name": "../secret"}, "$.name"),
+        ("hold", {"why": "so"}, "why"),
+        ("via_points", {"op": "list", "a - at `$.x`": 1}, "unknown field"),
+        ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}, "unknown field"),
+        ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}, "unknown field"),
+    ],
+)
+def test_what_is_not_understood_is_refused_in_words(
+    shared_daemon: Any, suffix: str, request_: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(RefusedError) as refused:
+        shared_daemon.client.ask(suffix, request_)
+    assert words in str(refused.value)
+    assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == []  # and others are still answered
+
+
+@pytest.fixture(scope="module")
+def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with serving(tmp_path_factory.mktemp("shared"), "--arm", "assumed") as daemon:
+        yield daemon
+        assert daemon.end() == 0
+
+
+def test_a_place_out_of_reach_is_refused_and_nothing_changes(shared_daemon: Any) -> None:
+    before = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
+    far = msgspec.structs.replace(HANDOVER, name="far", tool=(1.3, 0.0, 0.3))
+    with pytest.raises(RefusedError, match="accepted"):
+        shared_daemon.client.add([HANDOVER, far])
+    assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == before
+
+
+def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_daemon: Any) -> None:
+    shared_daemon.client.ask("hold")
+    replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
+    assert sum(reply.ok is not None for reply in replies) == 1
+    assert shared_daemon.until(lambda s: s["reason"] in ("operator", "arm_not_ready"))["mode"] == "hold"
+    shared_daemon.client.ask("resume")
+
+
+def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> None:
+    along = [0.5 + 0.005 * i for i in range(30)]  # the tool goes along with the hand
+    many = [
+        msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(x, 0.0, 0.1), tool=(x, *HANDOVER.tool[1:]))
+        for i, x in enumerate(along)
+    ]
+    replies = shared_daemon.session.get(
+        "thirdhand/via_points", payload=requests.encode_json(requests.Add(tuple(many))), timeout=30
+    )
+    begin = time.monotonic()
+    shared_daemon.client.ask("hold")
+    held_s = time.monotonic() - begin
+    shared_daemon.client.ask("resume")
+    assert all(reply.ok is not None for reply in replies)
+    assert held_s < 1.0
+    shared_daemon.client.ask("via_points", {"op": "clear"})
+
+
+def test_the_commands_of_a_client(shared_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    at = ("--connect", shared_daemon.endpoint)
+    assert thirdhand("hold", *at).returncode == 0
+    status = thirdhand("status", *at)
+    assert status.returncode == 0
+    assert "hold (operator)" in status.stdout or "hold (no_hands)" in status.stdout
+    assert "resume in force since tick" in thirdhand("resume", *at).stdout
+    reset = thirdhand("reset", *at)
+    assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
+    place = ("--left", ".62", "-.28", ".3", "--right", ".98", ".32", ".06", "--tool", ".62", "-.28", ".3")
+    added = thirdhand("via-points", "add", "my place", *place, *at)
+    assert added.returncode == 0, added.stderr
+    assert "my place" in added.stdout
+    assert "replaced" not in added.stdout
+    capsys.readouterr()
+    assert main(["via-points", "add", "my place", *place, *at]) == 0
+    assert "replaced, as there was one of this name: my place\n" in capsys.readouterr().out
+    assert "1 via-point in force" in thirdhand("via-points", "list", *at).stdout
+    refused = thirdhand("via-points", "remove", "other", *at)
+    assert refused.returncode == 1
+    assert "There are: my place" in refused.stderr
+    assert thirdhand("via-points", "clear", *at).returncode == 0
+    carried = json.loads(thirdhand("status", "--json", *at).stdout)
+    assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
+
+
+def test_a_place_is_taught_from_where_hands_and_tool_are(
+    shared_daemon: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
+    shared_daemon.until(lambda s: not any(age < 300 for age in s["hand_age_ms"].values()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+        assert main(add) == 1
+    said = capsys.readouterr().err
+    assert re.search(r"nothing taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
+    shared_daemon.client.ask("hold")
+    with Tracker(shared_daemon.session):
+        status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
+        assert main(add) == 0
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+            assert main(add) == 1
+    assert "nothing taught: hands or tool did not hold still" in capsys.readouterr().err
+    (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
+    assert point["name"] == "glass"
+    np.testing.assert_allclose(point["left"], LEFT, atol=1e-3)
+    np.testing.assert_allclose(point["right"], RIGHT, atol=1e-3)
+    np.testing.assert_allclose(point["tool"], status["tool_m"], atol=1e-3)
+    shared_daemon.client.ask("via_points", {"op": "clear"})
+    shared_daemon.client.ask("resume")
+
+
+def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
+    settings, urdf = Settings(), robot_description(Settings())
+    controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
+    tool, wanted = MeasuredTool(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
+    controller.step(Tick(0))
+    assert tool.told(controller.state) is None
+    controller.step(Tick(1, (arm(joints, 1),)))
+    np.testing.assert_allclose(tool.told(controller.state), wanted, atol=1e-4)
+    controller.step(Tick(200))
+    assert tool.told(controller.state) is None
+
+
+def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
+    played = thirdhand(
+        "play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "10", "--connect", shared_daemon.endpoint
+    )
+    assert played.returncode == 0, played.stderr
+    status = shared_daemon.client.status()
+    assert set(status.hand_age_ms) == {"left", "right"}
+    assert status.rejected.get("not_finite", 0) == 0
+    assert "of the left hand" in played.stderr
+    assert "came to the daemon's loop" in played.stderr
+
+
+def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        at = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = thirdhand("serve", "--listen", at, "--arm", "assumed", env=os.environ | {"HOME": str(tmp_path)})
+    assert done.returncode == 1
+    assert "cannot listen on tcp/127.0.0.1" in done.stderr
+
+
+def test_the_version_is_told() -> None:
+    done = thirdhand("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("thirdhand 0.")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("serve", "--rate", "7"), 2, "50 to 1000 Hz"),
+        (("serve", "--config", "missing.toml"), 1, "missing.toml"),
+        (("serve", "--skill", "missing.npz"), 1, "missing.npz"),
+        (("serve", "--arm", "left"), 2, "invalid choice"),
+        (("serve", "--connect", "tcp/10.0.0.1:7447"), 2, "allow_insecure = true needed"),
+        (("serve", "--rate", "5OO"), 2, "50 to 1000 Hz"),
+        (("status", "--rate", "500"), 2, "unrecognized arguments: --rate 500"),
+        (("stauts",), 2, "; did you mean status?"),
+        (("status", "--connect", "tcp/127.0.0.1:9"), 1, "is a daemon running"),
+        (("learn", "missing.mcap", "--output", "x.npz"), 1, "missing.mcap"),
+        (("view", "missing.rrd"), 1, "missing.rrd"),
+        (("via-points", "add"), 2, "needed"),
+        (("play", "missing.mcap"), 1, "missing.mcap"),
+        (("play", "missing.mcap", "--cell", "**"), 2, "--cell: $.cell"),
+        (("hold", "--cell", ""), 2, "--cell: $.cell"),
+        (("status", "--certificate", "~nobody-of-this-name/x"), 1, "no such user's folder"),
+        ((), 2, "COMMAND"),
+    ],
+)
+def test_bad_usage_and_failures_are_told_on_standard_error(
+    tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "demo",
+        "serve",
+        "play",
+        "replay",
+        "learn",
+        "via-points",
+        "status",
+        "doctor",
+        "hold",
+        "resume",
+        "reset",
+        "cells",
+        "record",
+        "view",
+        "certificates",
+    ],
+)
+def test_every_command_has_help_with_an_example(name: str) -> None:
+    done = thirdhand(name, "--help")
+    assert done.returncode == 0
+    assert "example:" in done.stdout
+
+
+def test_the_client_in_the_readme_works(shared_daemon: Any) -> None:
+    code = (ROOT / "README.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
+    code = code.replace("tcp/127.0.0.1:7447", shared_daemon.endpoint)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] in ("hold", "follow")
+    assert len(lines) > 100
+    assert len(code.strip().splitlines()) <= 12

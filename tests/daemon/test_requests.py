@@ -1,0 +1,460 @@
+"""Requests: checked, answered and carried out through the inbox."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import stat
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from service.client import Client, RefusedError, endpoints, open_session
+from service.config import Files, Settings
+from service.contract import channels, requests
+from service.contract.records import Mode, Reason
+from service.core.frame import Event
+from service.core.skill.skill import Skill
+from service.daemon.requests import Pending, Requests, SavedViaPoints
+from service.daemon.saved_via_points import state_folder
+from service.daemon.skill_worker import SkillWorker
+from service.learning.skill_file import with_file
+from service.learning.via_points import adapted
+from sim.scene import Scene
+
+PLACES = Scene().via_points()
+HANDOVER = PLACES[0]
+CELLS = (f"tests/cell{n}" for n in itertools.count())
+
+
+class Cell:
+    """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
+
+    def __init__(
+        self, near: zenoh.Session, far: zenoh.Session, skill: Skill, skill_worker: SkillWorker, folder: Path
+    ) -> None:
+        (folder / "soldering.npz").write_bytes(skill.file)
+        self.folder = folder
+        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")))
+        self.taken: list[Event] = []
+        self.notes: list[str] = []
+        self.kept: list[bytes] = []
+        self.running = True
+        self._tick = 0
+        self._end = threading.Event()
+        self.failures: list[str] = []
+        tell = {"status": lambda: requests.encode_json(self.status()), "frame": self.frame}
+        tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
+        self.requests = Requests(near, self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
+        self._loop = threading.Thread(target=self._drain)
+        self._loop.start()
+        self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
+        self.session = far
+        self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
+        self.client.wait_until_ready()
+
+    def status(self) -> requests.Status:
+        none = requests.Percentiles()
+        numbers = {
+            "tick": self._tick,
+            "rate_hz": 500.0,
+            "missed": 0,
+            "realtime": False,
+            "memory_locked": False,
+            "rejected": {},
+            "hand_age_ms": {},
+            "hand_distance_m": 3.0,
+            "hand_limit_m_s": 1.5,
+            "scribe": {},
+        }
+        words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}
+        lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
+        return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
+
+    def frame(self) -> dict[str, int]:
+        return {"tick": self._tick, "mode": Mode.HOLD, "reason": Reason.NO_HANDS}
+
+    def _drain(self) -> None:
+        while not self._end.wait(0.0005):
+            self._tick += 1
+            while self.running and self.requests.inbox:
+                event = self.requests.inbox.popleft().claimed(self._tick)
+                self.taken += [event] if event else []
+
+    def refusal(self, suffix: str, request: Any) -> str:
+        """The words in which a request is refused; bytes are sent as they are."""
+        before = len(self.taken), self.names(), self.place_bytes()
+        payload = request if isinstance(request, bytes) else requests.encode_json(request)
+        replies = list(self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0))
+        assert len(replies) == 1
+        assert replies[0].err is not None
+        assert (len(self.taken), self.names(), self.place_bytes()) == before
+        return replies[0].err.payload.to_string()
+
+    def names(self) -> list[str]:
+        """The places in force."""
+        return [point["name"] for point in self.client.ask("via_points", {"op": "list"})["points"]]
+
+    def place_bytes(self) -> bytes:
+        folder = state_folder(self.settings)
+        return b"".join(file.read_bytes() for file in sorted(folder.glob("places-*.json")))
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.taken]
+
+    def close(self) -> None:
+        if not self._end.is_set():
+            self.requests.close()
+            self._end.set()
+            self._loop.join()
+
+
+@pytest.fixture(scope="module")
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """A listening session and one connected to it."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as near, open_session(connect=endpoints(near)) as far:
+        yield near, far
+
+
+@pytest.fixture(scope="module")
+def skill_worker() -> Iterator[SkillWorker]:
+    running = SkillWorker()
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def opened(
+    sessions: tuple[zenoh.Session, zenoh.Session], skill: Skill, tmp_path: Path
+) -> Iterator[Callable[[SkillWorker], Cell]]:
+    """Opens a cell; closes it."""
+    with contextlib.ExitStack() as closing:
+        yield lambda skill_worker: closing.enter_context(
+            contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path))
+        )
+
+
+@pytest.fixture
+def cell(opened: Callable[[SkillWorker], Cell], skill_worker: SkillWorker) -> Cell:
+    return opened(skill_worker)
+
+
+@pytest.fixture(scope="module")
+def taught_cell(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+    skill_worker: SkillWorker,
+    skill: Skill,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Cell]:
+    """A cell with three places taught, for requests that change nothing."""
+    with contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path_factory.mktemp("cell"))) as cell:
+        cell.client.add(PLACES)
+        yield cell
+
+
+def point(**change: Any) -> dict[str, Any]:
+    """A place as a client writes it; None leaves a field out."""
+    whole = {"name": "a", "left": HANDOVER.left, "right": HANDOVER.right, "tool": HANDOVER.tool} | change
+    return {name: value for name, value in whole.items() if value is not None}
+
+
+def add(*points: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"op": "add", "points": points, **more}
+
+
+@pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
+def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suffix: str) -> None:
+    first, second = cell.client.ask(suffix), cell.client.ask(suffix, {})
+    assert 0 < first["tick"] < second["tick"]
+    assert cell.kinds() == [suffix, suffix]
+
+
+def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
+    (reply,) = cell.session.get(channels.key(cell.settings.cell, "hold"), timeout=10.0)
+    assert reply.ok is not None
+    assert cell.kinds() == ["hold"]
+
+
+def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> None:
+    assert cell.client.places() == ()
+    points = cell.client.add(PLACES).points
+    assert points is not None
+    assert [taught.name for taught in points] == ["handover", "glass", "soldering"]
+    assert all(taught.missed_by_m < 0.003 for taught in points)
+    assert cell.client.places() == points
+
+    moved = cell.client.ask(
+        "via_points", add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3]))
+    )
+    assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
+    assert len(moved["points"]) == 3
+
+    assert [taught.name for taught in cell.client.remove("glass").points or ()] == ["handover", "soldering"]
+    assert cell.client.clear().points == ()
+    assert cell.kinds() == ["skill"] * 4
+    assert cell.taken[0].value.via_points == PLACES
+
+
+def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
+    assert cell.client.add(PLACES).warnings == ()
+    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
+    missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
+    assert missed > 0.1
+    assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
+
+
+def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Skill) -> None:
+    cell.client.add(PLACES, tolerance=0.04)
+    (event,) = cell.taken
+    assert event.payload == cell.kept[0] == adapted(skill, PLACES, tolerance=0.04).file
+
+
+@pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
+def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
+    cell: Cell, skill: Skill, name: str
+) -> None:
+    cell.client.add(PLACES)
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    other = with_file(replace(skill, learned_from="other demonstrations"))
+    (cell.folder / "other.npz").write_bytes(other.file)
+    assert cell.client.ask("skill", {"name": "other"})["points"] == []
+    assert cell.taken[-1].value.digest == other.digest
+    assert cell.names() == []
+    cell.client.add(PLACES[:1])
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    assert len(cell.client.load_skill("other").points or ()) == 1
+
+
+def test_what_is_taught_is_in_force_again_after_a_restart(cell: Cell, skill: Skill) -> None:
+    cell.client.add(PLACES[:2], tolerance=0.04)
+    assert SavedViaPoints(cell.settings).read(skill) == (PLACES[:2], 0.04)
+    cell.client.ask("via_points", {"op": "clear"})
+    restored = SavedViaPoints(cell.settings).read(skill)
+    assert restored is not None
+    assert restored[0] == ()
+
+
+class SlowWorkshop(SkillWorker):
+    """A skill worker in this process that adapts when it is let."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.let = threading.Event(), threading.Event()
+
+    def adapt(
+        self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float, timeout_s: float = 0.0
+    ) -> Skill:
+        self.begun.set()
+        assert self.let.wait(20)
+        return adapted(skill, places, tolerance=tolerance)
+
+
+def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell]) -> None:
+    slow = SlowWorkshop()
+    cell = opened(slow)
+    with ThreadPoolExecutor(1) as pool:
+        teaching = pool.submit(cell.client.add, PLACES)
+        assert slow.begun.wait(10)
+        held = cell.client.ask("hold")
+        assert cell.kinds() == ["hold"]
+        assert cell.client.ask("status")["cell"] == cell.settings.cell
+        slow.let.set()
+        taught = teaching.result(20)
+    assert cell.kinds() == ["hold", "skill"]
+    assert held["tick"] < taught.tick
+
+
+def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[SkillWorker], Cell]) -> None:
+    slow = SlowWorkshop()
+    cell = opened(slow)
+    with ThreadPoolExecutor(2) as pool:
+        teaching = pool.submit(cell.client.add, PLACES)
+        assert slow.begun.wait(10)
+        closing = pool.submit(cell.close)
+        slow.let.set()
+        assert teaching.result(20).points
+        closing.result(20)
+
+
+def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.requests.ADOPTION_TIMEOUT_S", 0.05)
+    cell.running = False
+    with pytest.raises(RefusedError, match="the loop did not take the request: it is starting, ending or stalled"):
+        cell.client.ask("hold")
+
+
+def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.requests.ADOPTION_TIMEOUT_S", 0.05)
+    cell.running = False
+    with pytest.raises(RefusedError):
+        cell.client.add(PLACES)
+    monkeypatch.undo()
+    cell.running = True
+    cell.client.ask("hold")  # taken after whatever else waits
+    assert cell.kinds() == ["hold"]
+    assert cell.names() == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../secret", "..", "/etc/passwd", "sub/inside", "a\0b", "link", "loop", "pipe", ".hidden", "x" * 200),
+        *("{folder}/../secret", "{folder}/soldering", "soldering.npz/../../secret", "~/secret", "secret\n", ""),
+    ],
+)
+def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_path: Path, name: str) -> None:
+    """What lies elsewhere is not loaded, however it is named; nor is told where it is."""
+    outside = tmp_path / "elsewhere"
+    outside.mkdir()
+    for path in (outside / "secret.npz", cell.folder.parent / "secret.npz", cell.folder / ".hidden.npz"):
+        path.write_bytes(skill.file)
+    (cell.folder / "sub").mkdir()
+    (cell.folder / "sub" / "inside.npz").write_bytes(skill.file)
+    (cell.folder / "link.npz").symlink_to(outside / "secret.npz")
+    (cell.folder / "loop.npz").symlink_to(cell.folder / "loop.npz")
+    os.mkfifo(cell.folder / "pipe.npz")
+    with pytest.raises(RefusedError) as refused:
+        cell.client.ask("skill", {"name": name.format(folder=cell.folder)})
+    assert str(refused.value).startswith("$.name")
+    assert str(outside) not in str(refused.value)
+    assert cell.kinds() == []
+    assert cell.failures == []
+
+
+def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
+    cell.client.add(PLACES)
+    saved = cell.folder / "state" / cell.settings.cell
+    assert stat.S_IMODE(next(saved.glob("places-*.json")).stat().st_mode) == 0o600
+    assert stat.S_IMODE(saved.stat().st_mode) == 0o700
+
+
+def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
+    (cell.folder / "state").write_text("a file where a folder is needed")
+    with pytest.raises(RefusedError, match="via-points"):
+        cell.client.add(PLACES)
+    assert cell.kinds() == []
+    assert cell.names() == []
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (add(point(left=[1.0, 2.0])), "$.points[0].left: 2 numbers, 3 needed"),
+        (add(point(), point(name="b", tool=[0.1] * 4)), "$.points[1].tool: 4 numbers, 3 needed"),
+        (add(point(left=[0.1, "x", 0.3])), "$.points[0].left[1]: 'x' given; -10 to 10 m accepted"),
+        (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
+        (add(point(left="here")), "$.points[0].left: 'here' given; 3 numbers needed"),
+        (add(point(right=None)), "$.points[0]: field `right` is missing"),
+        (
+            add(point(nam="b")),
+            "$.points[0]: unknown field 'nam'; known are name, left, right, tool, std, radius, follow",
+        ),
+        (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
+        (add(point(name="a/b")), "$.points[0].name: "),
+        (add(point(name="x" * 65)), "$.points[0].name: '"),
+        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
+        (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
+        (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
+        (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
+        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's box, ("),
+        (
+            add(point(tool=[0.2, 0.0, 0.3])),
+            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach, 0.35 to 0.88 m from the shoulder",
+        ),
+        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach"),
+        (add(), "$.points: none given, 1 to 100 needed"),
+        (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
+        (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
+        ({"op": "add"}, "$: field `points` is missing"),
+        (
+            {"op": "remove", "names": ["nothing"]},
+            "$.names[0]: no via-point 'nothing'. There are: handover, glass, soldering",
+        ),
+        (
+            {"op": "remove", "names": ["glass", "nothing"]},
+            "$.names[1]: no via-point 'nothing'. There are: handover, glass, soldering",
+        ),
+        ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
+        ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),
+        ({"op": "lst"}, "$.op: 'lst' given; add, remove, clear, list accepted"),
+        ({}, "$: field `op` is missing"),
+        ([], "$: [] given; an object with its fields needed"),
+        (b'{"op":', "not JSON: Input data was truncated"),
+        (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
+        (b"\xff\xfe", "not JSON: JSON is malformed"),
+        (b"[" * 100_000, "not JSON: maximum recursion depth"),
+        (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
+    ],
+    ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
+)
+def test_a_request_for_places_is_refused_whole_and_with_a_reason(
+    taught_cell: Cell, request_: Any, message: str
+) -> None:
+    assert taught_cell.refusal("via_points", request_).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder. There are: soldering"),
+        ({"name": "../soldering"}, "$.name: "),
+        ({"name": "/etc/passwd"}, "$.name: "),
+        ({"name": ".."}, "$.name: "),
+        ({"name": ".npz"}, "$.name: "),
+        ({"name": "a/b"}, "$.name: "),
+        ({"name": ""}, "$.name: "),
+        ({"name": "x" * 129}, "$.name: "),
+        ({"name": 3}, "$.name: 3 given; 1 to 64 letters"),
+        ({}, "$: field `name` is missing"),
+    ],
+)
+def test_a_request_for_a_skill_is_refused_whole_and_with_a_reason(
+    taught_cell: Cell, request_: Any, message: str
+) -> None:
+    assert taught_cell.refusal("skill", request_).startswith(message)
+
+
+@pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"now": True}, "$: unknown field 'now'; known are none"),
+        (None, "$: None given; an object with its fields needed"),
+        (b"hold!", "not JSON: JSON is malformed"),
+    ],
+)
+def test_a_plain_request_with_something_in_it_is_refused(
+    taught_cell: Cell, suffix: str, request_: Any, message: str
+) -> None:
+    assert taught_cell.refusal(suffix, request_).startswith(message)
+
+
+def test_a_link_does_not_lead_out_of_the_skill_folder(taught_cell: Cell, skill: Skill, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.npz").write_bytes(skill.file)
+    link = taught_cell.folder / "linked.npz"
+    link.symlink_to(tmp_path / "elsewhere.npz")
+    try:
+        assert "no skill 'linked' in the skill folder" in taught_cell.refusal("skill", {"name": "linked"})
+    finally:
+        link.unlink()
+
+
+def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
+    (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
+    assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
+    (taught_cell.folder / "broken.npz").unlink()
+
+
+def test_a_pending_event_tells_the_tick_that_took_it() -> None:
+    event = Event("hold", b"", None)
+    pending = Pending(event)
+    assert pending.claimed(42) is event
+    assert pending.wait() == 42

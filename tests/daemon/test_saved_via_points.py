@@ -1,0 +1,116 @@
+"""Saved via-points: what was taught survives a restart, whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from service.config import Files, Settings
+from service.core.skill.skill import Skill
+from service.daemon.saved_via_points import SavedViaPoints
+from service.learning.skill_file import SkillError
+from service.learning.via_points import adapted
+from sim.scene import Scene
+
+POINTS = Scene().via_points()
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> SavedViaPoints:
+    return SavedViaPoints(Settings(cell="lab/bench2", files=Files(state=str(tmp_path))))
+
+
+def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
+    assert saved.read(skill) is None
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    assert saved.read(skill) == (POINTS, 0.03)
+    saved.draft(skill).replace(saved.path(skill))
+    assert saved.read(skill) == ((), skill.tolerance)
+
+
+def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    other = replace(skill, learned_from="other demonstrations")
+    assert saved.read(other) is None
+    saved.path(skill).rename(saved.path(other))
+    assert saved.read(other) is None
+
+
+def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
+    other = replace(skill, learned_from="other demonstrations")
+    for one, count in ((skill, 2), (other, 1)):
+        saved.draft(adapted(one, POINTS[:count], tolerance=0.03)).replace(saved.path(one))
+    assert saved.read(skill) == (POINTS[:2], 0.03)
+    assert saved.read(other) == (POINTS[:1], 0.03)
+
+
+def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
+    for count in (1, 2, 3):
+        saved.draft(adapted(skill, POINTS[:count], tolerance=0.03)).replace(saved.path(skill))
+        assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
+        assert len(json.loads(saved.path(skill).read_text())["request"]["points"]) == count
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(saved.path(skill))
+    before = saved.path(skill).read_bytes()
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        saved.draft(replace(skill, name=3j)).replace(saved.path(skill))  # type: ignore[arg-type]
+    assert saved.path(skill).read_bytes() == before
+    assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"3",
+        b"\xff\xff",
+        b"{}",
+        b'{"learned_from": "x"}',
+        b'{"learned_from": "x", "request": 3}',
+        b'{"request": {"points": 1}}',
+    ],
+)
+def test_a_damaged_file_is_told_with_what_to_do(saved: SavedViaPoints, skill: Skill, content: bytes) -> None:
+    saved.path(skill).parent.mkdir(parents=True)
+    saved.path(skill).write_bytes(content)
+    with pytest.raises(SkillError, match=r"does not hold via-points") as caught:
+        saved.read(skill)
+    assert str(saved.path(skill)) in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.path(skill).mkdir(parents=True)
+    with pytest.raises(SkillError, match=r"cannot read via-points .*: Is a directory"):
+        saved.read(skill)
+
+
+def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    random = Random(1)
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    whole = saved.path(skill).read_bytes()
+    for _ in range(1000):
+        damaged = bytearray(whole)
+        damaged[random.randrange(len(whole))] ^= 1 << random.randrange(8)
+        saved.path(skill).write_bytes(damaged)
+        with contextlib.suppress(SkillError):
+            assert saved.read(skill) == (POINTS, 0.03)
+
+
+def test_a_file_that_somebody_edited_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    whole = saved.path(skill).read_text()
+    for text, why in ((whole.replace("0.03", "0.04"), "changed since"), (whole.replace("checksum", "sum"), "checksum")):
+        saved.path(skill).write_text(text)
+        with pytest.raises(SkillError, match=why):
+            saved.read(skill)
+    saved.path(skill).write_text(json.dumps(json.loads(whole)))  # laid out in another way
+    assert saved.read(skill) == (POINTS, 0.03)

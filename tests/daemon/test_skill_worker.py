@@ -1,0 +1,141 @@
+"""The skill worker: skills made by another process, the same to the bit as if made here, and errors
+that come back with their words.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests_paths import RECORDINGS
+
+from service.contract.requests import ViaPoint
+from service.core.skill.skill import Skill
+from service.daemon.skill_worker import SkillWorker
+from service.learning.skill_file import SkillError
+from service.learning.via_points import adapted, in_force
+from sim.scene import Scene
+
+PLACES = Scene().via_points()
+SOLDERING = RECORDINGS / "soldering.npz"
+
+
+@pytest.fixture(scope="module")
+def skill_worker() -> Iterator[SkillWorker]:
+    """A skill worker whose process is closed in the end."""
+    running = SkillWorker()
+    yield running
+    running.close()
+
+
+def child_of(skill_worker: SkillWorker) -> int:
+    """The process id of its child."""
+    assert skill_worker._child is not None
+    return skill_worker._child.process.pid
+
+
+def is_there(pid: int) -> bool:
+    """Whether a process exists, be it as a zombie."""
+    return Path(f"/proc/{pid}").exists()
+
+
+def assert_same_bits(one: Skill, other: Skill) -> None:
+    random = np.random.default_rng(0)
+    hands, velocities, accelerations = (random.normal((0.8, 0.0, 0.2), 0.1, (2, 3)) for _ in range(3))
+    assert one.digest == other.digest
+    assert one.file == other.file
+    found, wanted = (bits(skill.predict(hands, velocities, accelerations)) for skill in (one, other))
+    assert found == wanted
+
+
+def bits(value: object) -> bytes:
+    """The bytes of numbers, and of those in a tuple."""
+    if isinstance(value, tuple):
+        return b"".join(map(bits, value))
+    return b"" if value is None else np.asarray(value).tobytes()
+
+
+def test_a_skill_is_loaded_as_it_stands_in_its_file(skill_worker: SkillWorker, skill: Skill) -> None:
+    assert_same_bits(skill_worker.load(SOLDERING), skill)
+
+
+@pytest.mark.parametrize("count", [3, 1, 0])
+def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
+    skill_worker: SkillWorker, skill: Skill, count: int
+) -> None:
+    there = skill_worker.adapt(skill, PLACES[:count], tolerance=0.05)
+    assert_same_bits(there, adapted(skill, PLACES[:count], tolerance=0.05))
+    assert there.via_points == PLACES[:count]
+    assert in_force(there) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
+
+
+def test_a_skill_that_came_back_is_adapted_again(skill_worker: SkillWorker, skill: Skill) -> None:
+    once = skill_worker.adapt(skill, PLACES, tolerance=0.05)
+    assert_same_bits(skill_worker.adapt(once, PLACES[1:], tolerance=0.05), adapted(skill, PLACES[1:], tolerance=0.05))
+
+
+def test_arrays_that_came_back_cannot_be_changed(skill_worker: SkillWorker, skill: Skill) -> None:
+    there = skill_worker.adapt(skill, PLACES, tolerance=0.05)
+    with pytest.raises(ValueError, match="read-only"):
+        there.primitive.inputs[0, 0] = 1.0
+
+
+def test_errors_come_back_with_their_words(skill_worker: SkillWorker, skill: Skill, tmp_path: Path) -> None:
+    with pytest.raises(SkillError, match=r"tolerance is -1 m; 0 or more accepted"):
+        skill_worker.adapt(skill, PLACES[:1], tolerance=-1.0)
+    with pytest.raises(SkillError, match=r"cannot read skill .*nowhere\.npz: No such file"):
+        skill_worker.load(tmp_path / "nowhere.npz")
+    with pytest.raises(SkillError, match=r"cannot read skill .*: Is a directory"):
+        skill_worker.load(tmp_path)
+    (tmp_path / "broken.npz").write_bytes(SOLDERING.read_bytes()[:5000])
+    with pytest.raises(SkillError, match=r"broken\.npz: not a skill"):
+        skill_worker.load(tmp_path / "broken.npz")
+
+
+def test_an_error_does_not_end_the_process(skill_worker: SkillWorker, skill: Skill, tmp_path: Path) -> None:
+    skill_worker.load(SOLDERING)
+    child = child_of(skill_worker)
+    with pytest.raises(SkillError):
+        skill_worker.load(tmp_path / "nowhere.npz")
+    assert_same_bits(skill_worker.load(SOLDERING), skill)
+    assert child_of(skill_worker) == child
+
+
+def test_a_killed_process_is_replaced_at_the_next_request(skill_worker: SkillWorker, skill: Skill) -> None:
+    skill_worker.load(SOLDERING)
+    child = child_of(skill_worker)
+    os.kill(child, signal.SIGKILL)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)  # until it is dead; the skill worker finds that out itself
+    assert_same_bits(skill_worker.load(SOLDERING), skill)
+    assert child_of(skill_worker) != child
+    assert not is_there(child)
+
+
+def test_askers_in_several_threads_get_their_own_answers(skill_worker: SkillWorker, skill: Skill) -> None:
+    def taught(place: ViaPoint) -> tuple[ViaPoint, ...]:
+        return skill_worker.adapt(skill, [place], tolerance=0.05).via_points
+
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(taught, PLACES)) == [(place,) for place in PLACES]
+
+
+def test_closing_leaves_no_process_and_may_be_repeated(skill: Skill) -> None:
+    skill_worker = SkillWorker()
+    skill_worker.close()
+    assert_same_bits(skill_worker.load(SOLDERING), skill)
+    child = child_of(skill_worker)
+    skill_worker.close()
+    skill_worker.close()
+    assert not is_there(child)
+
+
+def test_a_skill_outlives_the_workshop_that_made_it(skill: Skill) -> None:
+    skill_worker = SkillWorker()
+    made = skill_worker.adapt(skill, PLACES, tolerance=0.05)
+    skill_worker.close()
+    assert_same_bits(made, adapted(skill, PLACES, tolerance=0.05))

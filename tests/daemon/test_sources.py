@@ -1,0 +1,214 @@
+"""What is told of hands and arm: rates, clocks, and what was rejected and why, in words."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from typing import Any
+
+import pytest
+from in_process import LEFT, RIGHT
+from wam import JOINT_NAMES, URDF
+
+from service.config import HandSettings, Settings
+from service.contract.messages import JointState, PoseStamped
+from service.contract.records import Cause
+from service.contract.requests import Percentiles, Status
+from service.core.controller import Controller
+from service.core.frame import Event, Frame, Tick, blank, frame_layout
+from service.core.skill.skill import Skill
+from service.daemon.input_monitor import KEYS, InputMonitor, in_words
+from service.daemon.status import CellStatus
+
+STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+S = 1_000_000_000
+POSTURE = Settings().arm.posture
+
+
+def pose(stamp_ns: int, position: tuple[float, ...] = LEFT, turn: Any = STRAIGHT, frame: str = "base") -> PoseStamped:
+    return PoseStamped(stamp_ns, frame, position, turn)  # type: ignore[arg-type]
+
+
+def joints(stamp_ns: int, position: tuple[float, ...] = POSTURE, names: tuple[str, ...] = JOINT_NAMES) -> JointState:
+    return JointState(stamp_ns, names, position, (0.0,) * len(position))
+
+
+class Cell:
+    """A controller and its sources, told message by message, a tick each."""
+
+    def __init__(self, skill: Skill, settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
+        self.controller = Controller(self.settings, skill, urdf=URDF)
+        self.sources = InputMonitor(self.settings)
+        self.ticks = itertools.count()
+        self.frame: Frame = blank(frame_layout(7))
+        self.log: list[str] = []
+
+    def tell(self, *messages: tuple[str, PoseStamped | JointState], late_ns: int = 0) -> None:
+        """One tick, in whose inbox messages are by source."""
+        index = next(self.ticks)
+        for source, message in messages:
+            self.sources.arrivals[KEYS[source]].take(message, message.stamp_ns + late_ns)
+        inbox = tuple(Event(KEYS[source], b"", message) for source, message in messages)
+        self.frame = self.controller.step(Tick(index, inbox))
+
+    def status(self, now_s: float, *, failure: str = "") -> Status:
+        state = self.controller.state
+        told = self.sources.survey(self.controller, state, now_s)
+        self.log += self.sources.news(told, now_s)
+        none = Percentiles()
+        more = {"rate_hz": 500.0, "missed": 0, "realtime": True, "memory_locked": True, "scribe": {}, "endpoints": ()}
+        survey = CellStatus(self.frame, self.controller, state, told, self.settings, failure)
+        return survey.status(**more, version="", lateness_us=none, work_us=none, latency_ms=none)
+
+
+@pytest.mark.parametrize(
+    ("source", "message", "cause", "words"),
+    [
+        ("left", pose(2, frame="camera"), Cause.WRONG_FRAME, "frame 'camera'; 'base' or none accepted"),
+        ("left", pose(2, (980.0, -320.0, 60.0)), Cause.OUT_OF_RANGE, "at (980, -320, 60), which looks like mm;"),
+        ("left", pose(2, turn=(0.0, 0.0, 0.0, 0.0)), Cause.NOT_A_ROTATION, "of norm 0; norm 1 needed"),
+        ("right", pose(2, (math.nan, 0.0, 0.0)), Cause.NOT_FINITE, "position (nan, 0, 0)"),
+        ("right", pose(S, RIGHT), Cause.REPEATED, "stamp 1.000 s again"),
+        ("right", pose(3 * S, RIGHT), Cause.AHEAD, "stamped 2 s after the newest accepted one"),
+        ("right", pose(S // 2, RIGHT), Cause.OLDER, "stamped 0.5 s before the newest accepted one"),
+        ("left", pose(S + 1, (0.5, 0.0, 0.3)), Cause.JUMPED, "at (0.5, 0, 0.3) in the tracker's frame"),
+        ("arm", joints(2, (90.0,) * 7), Cause.OUT_OF_RANGE, "base_yaw_joint at 90 rad, which looks like degrees; -2.6"),
+        ("arm", joints(2, (0.0, 0.0), ("a", "b")), Cause.INCOMPLETE, "missing among 2, a, b"),
+    ],
+)
+def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: Any, cause: Cause, words: str) -> None:
+    cell = Cell(skill)
+    cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)))
+    cell.tell((source, message))
+    refused = cell.controller.intake.refused[source, cause]
+    assert refused[:2] == (cause, message)
+    cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
+    assert words in in_words(refused, cell.settings)
+
+
+def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(30):
+        cell.tell(("left", pose(k + 1, frame="camera")))
+        cell.status(100 + k / 10)
+    assert [line.split(":")[0] for line in cell.log] == ["left hand"]
+    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: set [hands] f" in cell.log[0]
+    cell.sources.arrivals[KEYS["right"]].refuse("a header of another kind")
+    cell.status(103.0)
+    assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
+    cell.status(109.0)
+    assert len(cell.log) == 2
+    cell.status(111.0)
+    assert "left hand: rejected in the last 11 s: 29 wrong_frame (30 in all)" in cell.log[2]
+    cell.status(122.0)
+    assert len(cell.log) == 3
+
+
+def test_of_two_kinds_at_once_each_is_said_in_its_own_words(skill: Skill) -> None:
+    cell = Cell(skill)
+    cell.tell(("left", pose(S, LEFT)))
+    cell.status(1.0)
+    cell.tell(("left", pose(S // 2, LEFT)))
+    cell.tell(("left", pose(S + 1, (0.5, 0.0, 0.3))))
+    cell.status(1.1)
+    older, jumped = sorted(cell.log, key=lambda line: "jumped" in line)
+    assert "rejected as older: stamped 0.5 s before" in older
+    assert "rejected as jumped: at (0.5, 0, 0.3)" in jumped
+
+
+def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(300):
+        left, right = (LEFT, RIGHT) if k < 100 else (RIGHT, LEFT)
+        cell.tell(("left", pose(k + 1, left)), ("right", pose(k + 1, right)), ("arm", joints(k + 1)))
+        if k % 50 == 0:
+            cell.status(k / 500)
+    told = cell.status(0.6)
+    assert (told.mode, told.reason) == ("hold", "stale_hand")
+    assert "the left hand was last seen 400 ms ago, as what comes is rejected as swapped: at (" in told.because
+    assert "where the other hand was; left and right look exchanged" in told.because
+    assert told.remedy == "the tracker takes left for right: let it see both hands apart for a moment"
+    assert sum("rejected as swapped" in line for line in cell.log) == 2
+
+
+def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
+    cell = Cell(skill)
+    cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)), ("left", pose(1, (900.0, 0.0, 0.0))))
+    assert cell.status(1.0).sources["left"].cause == "out_of_range"
+    for k in range(1500):
+        seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1400 else ()
+        cell.tell(("right", pose(S + 1 + k, RIGHT)), ("arm", joints(k + 1)), *seen)
+        if k % 50 == 0:
+            told = cell.status(1.0 + k / 500)
+    assert told.reason == "stale_hand"
+    assert told.because == "the left hand was last seen 102 ms ago"
+    assert told.remedy.startswith("look at the tracker; growing counters")
+    assert told.rejected == {"out_of_range": 1}
+
+
+def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
+    settings = Settings(hands=HandSettings(frame="optitrack"))
+    cell = Cell(skill, settings)
+    for k in range(200):
+        cell.tell(("right", pose(k + 1, RIGHT)), ("left", pose(k + 1, frame="camera")), ("arm", joints(k + 1)))
+        if k % 50 == 0:
+            told = cell.status(k / 500)
+    told = cell.status(0.4)
+    assert (told.mode, told.reason) == ("hold", "no_hands")
+    assert told.because == (
+        "the left hand has not been seen yet, as what comes is rejected as wrong_frame: "
+        "frame 'camera'; 'base', 'optitrack' or none accepted"
+    )
+    assert told.remedy == "set [hands] frame and base_from_tracker, or publish in base"
+    assert told.frames == ("base", "optitrack", "")
+    assert told.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
+    assert (told.sources["right"].fresh, told.sources["left"].fresh) == (True, False)
+    assert told.rejected == {"wrong_frame": 200}
+    for _ in range(100):
+        cell.tell(("arm", joints(1000 + next(cell.ticks))))
+    told = cell.status(0.6)
+    assert "the right hand was last seen" in told.because
+    assert not told.sources["right"].fresh
+
+
+def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
+    cell = Cell(skill)
+    cell.tell()
+    assert cell.status(0.0).because == "no joint states came yet"
+    cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
+    assert "what comes of the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
+    cell.tell(("arm", joints(2)))
+    assert cell.status(0.2).because == "the arm has not told one posture for 0.1 s"
+    outside = (2.7, *POSTURE[1:])
+    for k in range(120):
+        cell.tell(("arm", joints(10 + k, outside)))
+    assert cell.status(0.5).because == "wam/base_yaw_joint at 2.700 rad is outside -2.6 to 2.6, and is moved back"
+    for _ in range(60):
+        cell.tell()
+    assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 100 ms")
+
+
+def test_a_tool_that_was_too_fast_says_how_fast(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(80):
+        cell.tell(("arm", joints(1 + k)))
+    for k in range(40):
+        fast = JointState(100 + k, JOINT_NAMES, POSTURE, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        cell.tell(("arm", fast))
+    told = cell.status(1.0)
+    assert told.reason == "tool_speed"
+    said = re.fullmatch(r"the tool was measured at (.*) m/s, 1 accepted", told.because)
+    assert said is not None
+    assert told.tool_m is not None
+    assert float(said[1]) == pytest.approx(3.0 * math.hypot(*told.tool_m[:2]), abs=0.01)  # about the base's yaw
+
+
+def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(10):
+        cell.tell(("left", pose(S + k)), late_ns=-5 * S)
+        told = cell.status(k / 10)
+    assert told.sources["left"].clock_ms == pytest.approx(-5000.0)
+    assert told.sources["right"].clock_ms is None

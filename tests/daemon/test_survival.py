@@ -1,0 +1,324 @@
+"""What a daemon survives, and how it ends: parts that fail, signals, a second daemon of its cell,
+and what its children do when it is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cell import Daemon, Tracker, serving, thirdhand
+
+from service.client import RefusedError, UnreachableError
+from service.daemon.single_instance import Lock
+from service.daemon.skill_worker import SkillWorker
+from service.daemon.supervised_thread import supervised
+from service.learning.skill_file import SkillError
+from service.recording.replay import replay
+
+SABOTAGE = """
+import pathlib
+from service.core import controller
+from service.daemon import daemon
+from service.daemon import requests
+
+def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
+    honest = getattr(owner, name)
+    def method(*arguments, **more):
+        if (mark := folder / name).exists():
+            if mark.read_text() == "once":
+                mark.unlink()
+            raise RuntimeError(f"{{name}} is sabotaged")
+        return honest(*arguments, **more)
+    setattr(owner, name, method)
+
+sabotaged(daemon.Daemon, "_survey")
+sabotaged(controller.Controller, "step")
+sabotaged(daemon.Daemon, "_publish")
+sabotaged(requests.Line, "enqueue")
+sabotaged(requests.Requests, "_reply")
+"""
+
+
+def children(pid: int) -> list[int]:
+    """The processes that a process has started and that are still there."""
+    done = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
+    return [int(line) for line in done.stdout.split()]
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def gone(pids: list[int], within_s: float) -> bool:
+    end = time.monotonic() + within_s
+    while any(map(is_running, pids)):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+
+    def is_at_fault(status: dict[str, Any]) -> bool:
+        return (status["mode"], status["reason"]) == ("fault", "service")
+
+    with (
+        serving(
+            tmp_path, "--arm", "assumed", "--record", str(records), before=SABOTAGE.format(folder=str(tmp_path))
+        ) as daemon,
+        Tracker(daemon.session),
+    ):
+        for name, provoke in {
+            "_survey": lambda: None,
+            "enqueue": lambda: daemon.client.ask("resume"),
+            "_reply": lambda: daemon.client.ask("resume"),
+            "step": lambda: None,
+            "_publish": lambda: None,
+        }.items():
+            daemon.until(lambda status: status["mode"] == "follow")
+            (tmp_path / "mark").write_text("once")
+            (tmp_path / "mark").rename(tmp_path / name)
+            with contextlib.suppress(UnreachableError):  # it is not answered, and that is all
+                provoke()
+            daemon.until(is_at_fault)
+            assert f"{name} is sabotaged" in daemon.log.read_text()
+            daemon.client.ask("hold")
+            daemon.client.ask("reset")
+            daemon.client.ask("resume")
+        daemon.until(lambda status: status["mode"] == "follow")
+        assert daemon.end() == 1  # the recording is not complete, and says so
+        assert daemon.log.read_text().endswith("ticks are not recorded\n")
+    (recording,) = records.glob("*.mcap")
+    result = replay(recording)
+    assert result.identical == result.ticks > 0, result.text()
+    assert [gap.lost for gap in result.missing] == [1, 1]  # the ticks at which the loop failed
+
+
+def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
+        started = children(daemon.process.pid)
+        (tmp_path / "step").write_text("always")
+        assert daemon.process.wait(20) == 1
+        assert "step is sabotaged" in daemon.log.read_text()
+        assert "the arm is commanded no more" in daemon.log.read_text()
+        assert gone(started, 10)
+
+
+def test_watched_work_begins_again_until_it_ends_by_itself() -> None:
+    runs, told = [], []
+
+    def work() -> None:
+        runs.append(len(runs))
+        if len(runs) < 3:
+            raise ValueError(f"run {len(runs)}")
+
+    supervised("work", work, told.append, pause_s=0.0)
+    assert len(runs) == 3
+    assert told == ["the work failed: ValueError('run 1')", "the work failed: ValueError('run 2')"]
+
+
+def test_nobody_cancels_the_stop_of_a_daemon_that_ends(tmp_path: Path) -> None:
+    """`resume` is asked again and again while it stops: the last command has come to rest."""
+    with serving(tmp_path, "--arm", "assumed") as daemon, Tracker(daemon.session) as tracker:
+        daemon.until(lambda status: status["mode"] == "follow")
+        tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
+        ended = threading.Event()
+
+        def resume() -> None:
+            while not ended.is_set():
+                with contextlib.suppress(UnreachableError, RefusedError):
+                    daemon.client.ask("resume")
+
+        asking = threading.Thread(target=resume)
+        asking.start()
+        time.sleep(0.2)
+        begun = time.monotonic()
+        daemon.process.send_signal(signal.SIGTERM)
+        assert daemon.process.wait(20) == 0
+        assert time.monotonic() - begun < 2.5  # not the time-out of the stop
+        ended.set()
+        asking.join(20)
+        assert "has not come to rest" not in daemon.log.read_text()
+
+
+def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("untouched")
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "daemon.lock").symlink_to(victim)
+    (tmp_path / "pipe").mkdir()
+    os.mkfifo(tmp_path / "pipe" / "daemon.lock")
+    for name in ("link", "pipe"):
+        lock = Lock(tmp_path / name, "thirdhand")
+        lock.tell(["tcp/127.0.0.1:1"])
+        lock.close()
+    assert victim.read_text() == "untouched"
+
+
+@pytest.mark.parametrize("signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]])
+def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: list[int]) -> None:
+    records = tmp_path / "records"
+    with (
+        serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon,
+        Tracker(daemon.session) as tracker,
+    ):
+        daemon.until(lambda status: status["mode"] == "follow")
+        tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
+        time.sleep(0.2)
+        for number in signals:
+            daemon.process.send_signal(number)
+            time.sleep(0.02)
+        assert daemon.process.wait(30) == 0
+        assert "Traceback" not in daemon.log.read_text()
+    (recording,) = records.glob("*.mcap")
+    result = replay(recording)
+    assert result.exact, result.text()
+
+
+def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        at = ("serve", "--arm", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
+        refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
+        assert refused.returncode == 1
+        assert "cell thirdhand is served already" in refused.stderr
+        assert f"listening on {daemon.endpoint}" in refused.stderr
+        assert "Traceback" not in refused.stderr
+        other = tmp_path / "other"
+        other.mkdir()
+        with serving(other, "--arm", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
+            assert daemon.client.status().cell == "thirdhand"
+        assert daemon.end() == 0
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
+def test_a_second_daemon_does_not_start_where_zenoh_does_not_show_the_first(tmp_path: Path, ending: int) -> None:
+    """Each listens on a port of its own, and neither connects to the other."""
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        again = ("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
+        refused = thirdhand(*again)
+        assert refused.returncode == 1
+        assert "cell thirdhand is served already on this machine" in refused.stderr
+        assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in refused.stderr
+        assert "Traceback" not in refused.stderr
+        lock = tmp_path / "state" / "thirdhand" / "daemon.lock"
+        assert stat.S_IMODE(lock.stat().st_mode) == 0o600
+        assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
+        daemon.process.send_signal(ending)
+        daemon.process.wait(30)
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        assert daemon.end() == 0
+
+
+def test_a_cell_without_a_folder_for_its_lock_is_served_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("a file where a folder is needed")
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        daemon.until(lambda status: status["tick"] > 0)
+        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
+
+
+def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
+    before = (
+        "import time\nfrom service.daemon.daemon import Daemon\nhonest = Daemon._run\n"
+        "def late(self):\n    time.sleep(10)\n    honest(self)\nDaemon._run = late"
+    )
+    with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
+        told = daemon.client.status()
+        said = thirdhand("status", "--connect", daemon.endpoint)
+        assert (told.tick, told.mode, told.reason, told.remedy) == (-1, "hold", "", "")
+        assert (told.hand_age_ms, told.hand_distance_m) == ({}, 3.0)
+        rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
+        assert rows["mode"] == "starting: nothing has been decided yet"
+        assert rows.keys() == {"mode", "skill", "listening"}
+        daemon.until(lambda status: status["tick"] >= 0)
+        assert "starting" not in thirdhand("status", "--connect", daemon.endpoint).stdout
+
+
+def test_no_child_outlives_a_daemon_that_is_killed(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+    with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
+        started = children(daemon.process.pid)
+        assert len(started) == 2
+        skill_worker = next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+        daemon.until(lambda status: status["tick"] > 600)
+        os.kill(skill_worker, signal.SIGSTOP)  # it is busy, and hears of nothing
+        daemon.process.kill()
+        daemon.process.wait()
+        assert gone([pid for pid in started if pid != skill_worker], 20)
+        os.kill(skill_worker, signal.SIGCONT)
+        assert gone([skill_worker], 10)
+    (recording,) = records.glob("*.mcap")
+    assert replay(recording).exact
+
+
+def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
+    """A child that never looks at its socket, and a parent's thread that ends before it does."""
+    (tmp_path / "busy.py").write_text(
+        "import time\nfrom service import child\nchild.end_with_parent()\nwhile True: time.sleep(0.01)\n"
+    )
+    parent = (
+        "import socket, sys, threading, time\nfrom service import child\nstarted = []\n"
+        "thread = threading.Thread(target=lambda: started.append(child.start('busy', socket.SOCK_STREAM)))\n"
+        "thread.start()\nthread.join()\nprint(started[0].process.pid, flush=True)\ntime.sleep(60)\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    running = subprocess.Popen(
+        [sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
+    )
+    assert running.stdout is not None
+    busy = int(running.stdout.readline())
+    time.sleep(0.5)
+    assert is_running(busy)
+    running.kill()
+    running.wait()
+    running.stdout.close()
+    assert gone([busy], 5)
+
+
+def test_a_workshop_killed_at_work_leaves_all_as_it_was(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        taught = teach(daemon, 3)
+        (skill_worker,) = children(daemon.process.pid)
+        os.kill(skill_worker, signal.SIGSTOP)
+        killing = threading.Timer(0.3, os.kill, [skill_worker, signal.SIGKILL])
+        killing.start()
+        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
+            teach(daemon, 5)
+        killing.join()
+        assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
+        assert len(teach(daemon, 5)) == 5
+        assert daemon.end() == 0
+
+
+def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
+    """The via-points in force once these are taught."""
+    place = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
+    points = [{"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)]
+    points_in_force: list[dict[str, Any]] = daemon.client.ask("via_points", {"op": "add", "points": points})["points"]
+    return points_in_force
+
+
+def test_a_slow_workshop_may_be_given_more_time(tmp_path: Path) -> None:
+    """As at the start on a machine that is busy: its process alone takes seconds to begin there."""
+    skill_worker = SkillWorker()
+    try:
+        with pytest.raises(SkillError, match=r"did not answer within 0\.01 s; nothing was changed"):
+            skill_worker.load(tmp_path / "nothing.npz", timeout_s=0.01)
+        with pytest.raises(SkillError, match="cannot read skill"):
+            skill_worker.load(tmp_path / "nothing.npz", timeout_s=60.0)
+    finally:
+        skill_worker.close()

@@ -1,0 +1,213 @@
+"""What a recording tells: modes and reasons over the time, what led to holds and faults, places,
+limits, promptness; against sessions of which that is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import LEFT, RIGHT, arm, hand
+from tests_paths import RECORDINGS
+from wam import URDF
+
+from service.config import Settings
+from service.contract.records import Flag, Mode, Reason
+from service.contract.requests import ViaPoint
+from service.core.controller import Controller
+from service.core.frame import Event, Tick, order, timed
+from service.core.skill.skill import Skill
+from service.learning.via_points import adapted
+from service.recording.recording import Recorder, Recording
+from service.report.columns import runs
+from service.report.report import Report, differing_settings, reported, why_missed
+from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
+
+SETTINGS = Settings()
+PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
+START_NS = 1_700_000_000_000_000_000
+FAULT_AT = 600  # ticks
+HERE = ViaPoint("here", LEFT, RIGHT, (0.5, 0.0, 0.35), std=0.001, radius=0.03)
+
+
+def stamp(tick: int) -> int:
+    return START_NS + tick * PERIOD_NS
+
+
+class Told:
+    """A session with resting hands and an arm that goes where it is told, until something happens
+    to it from tick `FAULT_AT` on; recorded as it goes.
+    """
+
+    def __init__(self, skill: Skill, path: Path, what: str = "", *, lost_at: int | None = None) -> None:
+        self.what, self.joints = what, SETTINGS.arm.posture
+        controller = Controller(SETTINGS, skill, urdf=URDF)
+        with Recorder(path, settings=SETTINGS, skill=skill.file, state=controller.state) as recorder:
+            for k in range(1200):
+                tick = Tick(k, tuple(self.inbox(k)))
+                frame = controller.step(tick)
+                if frame["commanded"]:
+                    self.joints = tuple(frame["joints"].tolist())
+                if lost_at is not None and lost_at <= k < lost_at + 100:
+                    continue
+                lost = 100 if lost_at is not None and k == lost_at + 100 else 0
+                timing = timed(k, stamp(k), k // 300, 50.0 + k % 7, 200.0, 1500.0 if k % 5 == 0 else 0.0, (0.0,) * 5)
+                state = controller.state if lost else None
+                recorder.write(tick, frame, time_ns=stamp(k), timing=timing, state=state, lost=lost)
+
+    def inbox(self, k: int) -> Iterable[Event]:
+        late = k >= FAULT_AT
+        if k % 5 == 0 and not (late and self.what == "left alone"):
+            yield hand("left", LEFT, k + 1)
+            yield hand("right", RIGHT, k + 1)
+        if k % 2 == 0 and not (
+            (self.what == "silent" and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+        ):
+            q, dq = list(self.joints), [0.0] * 7
+            if late and self.what == "pushed":
+                q[3] += min(0.15, 0.003 * (k - FAULT_AT))
+            if late and self.what == "fast":
+                dq[0] = 5.0
+            yield arm(tuple(q), stamp(k), tuple(dq))
+        if late and self.what == "failed" and k == FAULT_AT:
+            yield order("fault", "the request thread failed: out of paper")
+        if k == 1000:
+            yield order("reset")
+
+
+@pytest.fixture(scope="module")
+def golden() -> Report:
+    return reported(RECORDINGS / "golden.mcap")
+
+
+def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden: Report) -> None:
+    ends = [span.start_s + span.lasts_s for span in golden.spans]
+    assert [span.start_s for span in golden.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
+    assert ends[-1] == pytest.approx(golden.lasts_s) == pytest.approx(SECONDS, abs=0.05)
+    held = {span.reason: span for span in golden.spans if span.mode is Mode.HOLD}
+    for reason, (begin_s, end_s) in {
+        Reason.STALE_HAND: DROPOUT_S,
+        Reason.OPERATOR: HOLD_S,
+        Reason.FAR_FROM_DEMONSTRATIONS: AWAY_S,
+    }.items():
+        assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
+        assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
+    assert held[Reason.STALE_HAND].why.startswith("the left hand was not seen for 0.5")
+    assert held[Reason.OPERATOR].why == "`hold` was asked for"
+    far = held[Reason.FAR_FROM_DEMONSTRATIONS].why
+    assert far.startswith("a hand was off its places by up to ")
+    assert far.endswith(" mm; 104 mm are allowed")
+    assert golden.seconds(Mode.FOLLOW) + golden.seconds(Mode.HOLD) == pytest.approx(golden.lasts_s)
+    assert (golden.faults, golden.lacks) == ((), ())
+
+
+def test_rejections_and_limits_are_those_of_the_frames(golden: Report) -> None:
+    frames = np.array([step.frame for step in Recording.open(golden.path).steps() if step.frame is not None])
+    assert sum(one.samples for one in golden.rejections) == int(frames[-1]["rejected"].sum())
+    assert all(BAD_S[0] <= one.first_s <= AWAY_S[1] + 0.1 for one in golden.rejections)
+    for limit in golden.limits:
+        raised = (frames["flags"] & Flag[limit.name.upper()]) > 0
+        assert limit.lasts_s == pytest.approx(raised.sum() * PERIOD_S)
+        assert limit.times == sum(1 for begin, _ in runs(raised) if raised[begin])
+    assert {limit.name for limit in golden.limits} == {
+        str(flag.name).lower() for flag in Flag if (frames["flags"] & flag).any()
+    }
+    assert golden.approach is not None
+    known = (frames["hand_ages"] >= 0).any(axis=1)
+    assert golden.approach.distance_m == frames["hand_distance"][known].min()
+
+
+def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(golden: Report) -> None:
+    by_name = [(place.name, place.start_s) for place in golden.places]
+    assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
+    first, again = [place for place in golden.places if place.name == "handover"]
+    assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
+    assert first.end_s == pytest.approx(again.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
+    assert first.best_m is not None
+    assert first.best_m < 0.02
+    assert (again.visits, again.best_m) == ((), None)
+    assert again.hands_m > 0.03
+
+
+def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:
+    """Hands that rest where it was taught, and a tool that goes there."""
+    Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
+    [place] = reported(tmp_path / "a.mcap").places
+    frames = np.array([step.frame for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None])
+    [visit] = place.visits
+    assert visit.nearest_m == pytest.approx(np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min())
+    assert visit.settled_m == pytest.approx(np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4)
+    assert place.hands_m < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("what", "reason", "led"),
+    [
+        ("silent", Reason.ARM_SILENT, "the arm's last joint state came 10"),
+        ("pushed", Reason.ARM_ERROR, "wam/elbow_pitch_joint was measured 0.10"),
+        ("fast", Reason.TOOL_SPEED, "m/s; 1 m/s are allowed"),
+        ("failed", Reason.SERVICE, "the service failed: the request thread failed: out of paper"),
+    ],
+)
+def test_a_fault_tells_what_led_to_it_and_how_it_ended(
+    skill: Skill, tmp_path: Path, what: str, reason: Reason, led: str
+) -> None:
+    Told(skill, tmp_path / "a.mcap", what)
+    found = reported(tmp_path / "a.mcap")
+    fault = found.faults[0]
+    assert fault.span.reason is reason
+    assert FAULT_AT * PERIOD_S <= fault.span.start_s <= FAULT_AT * PERIOD_S + 0.2
+    assert led in fault.led[0]
+    assert any(line.startswith("before it: it followed for 1.") for line in fault.led)
+    assert fault.ended.startswith("ended by a `reset` after 0.")
+    why = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
+    assert str(reason.name).lower() in why
+    assert led in why
+
+
+def test_an_arm_that_fell_silent_while_it_rested_is_not_said_never_to_have_told_where_it_is(
+    skill: Skill, tmp_path: Path
+) -> None:
+    Told(skill, tmp_path / "a.mcap", "left alone")
+    first, *_, alone, last = reported(tmp_path / "a.mcap").spans
+    assert (first.reason, alone.reason, last.reason) == (
+        Reason.ARM_NOT_READY,
+        Reason.STALE_HAND,
+        Reason.ARM_NOT_READY,
+    )
+    assert first.why == "joint states came, but not yet of an arm that rests within its limits"
+    assert last.why == "the arm fell silent: no joint states from 1.7 s on"
+
+
+def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_no_mode(
+    skill: Skill, tmp_path: Path
+) -> None:
+    Told(skill, tmp_path / "a.mcap", lost_at=700)
+    found = reported(tmp_path / "a.mcap")
+    assert found.missed == 3
+    assert found.latency_ms is not None
+    assert found.latency_ms[:3] == pytest.approx((1.5, 1.5, 1.5))
+    assert found.latency_ms.samples == 220
+    assert found.lateness_us is not None
+    assert found.lateness_us.largest == 56.0
+    assert len(found.lacks) == 1
+    assert "100 ticks not recorded" in found.lacks[0]
+    assert sum(span.lasts_s for span in found.spans) == pytest.approx(1100 * PERIOD_S)
+    assert found.lasts_s == pytest.approx(1200 * PERIOD_S)
+
+
+def test_two_recordings_differ_in_the_settings_that_do(golden: Report, skill: Skill, tmp_path: Path) -> None:
+    Told(skill, tmp_path / "a.mcap")
+    names = {name for name, *_ in differing_settings(golden, reported(tmp_path / "a.mcap"))}
+    assert not {name for name in names if not name.startswith("made with ")}
+
+
+def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(golden: Report) -> None:
+    told = why_missed(golden, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
+    best_m = golden.best_m("glass")
+    assert best_m is not None
+    assert told.startswith("the arm followed; with the hands where 'glass' was taught the tool came within")
+    assert told.endswith(f" {1000 * best_m:.0f} mm")
+    assert why_missed(golden, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
