@@ -8,7 +8,7 @@ from wam import URDF
 from service.config import Settings
 from service.contract.records import Mode, Reason
 from service.core.arm.arm import Arm
-from service.core.frame import Vector
+from service.core.record import Vector
 
 SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s

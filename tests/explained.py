@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.config import Settings, ToolSettings
-from service.core.frame import Record, Vector
+from service.core.record import Record, Vector
 from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_SPANS,
@@ -17,7 +17,7 @@ from service.core.setpoint.bounds import (
     speed_to_come,
 )
 from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.setpoint.workspace import Target
+from service.core.skill.workspace import Target
 
 
 def margin(tool: ToolSettings) -> float:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.contract.requests import Percentiles
-from service.core.frame import Vector
+from service.core.record import Vector
 
 SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
 PREPARE_NS = 450_000  # before a deadline the next tick is prepared

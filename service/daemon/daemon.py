@@ -22,13 +22,14 @@ from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
-from service.contract.records import STAGES, Reason
+from service.contract.records import Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
 from service.core.controller import Controller, run
-from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
+from service.core.frame import STAGES, Event, Frame, Tick, frame_layout, order, timed
 from service.core.outputs import outgoing
-from service.core.separation.separation import FARTHEST, IRRELEVANT
+from service.core.record import blank
+from service.core.separation.separation import FARTHEST
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
@@ -107,7 +108,7 @@ class Daemon:
         self._measured_tool = MeasuredTool(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
-        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
+        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
         self._sources = InputMonitor(settings)
         self._failure = ""  # of the service, the last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))

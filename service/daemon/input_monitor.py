@@ -17,9 +17,9 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
-from service.core.frame import Record
 from service.core.intake.far_away import figures, too_far
-from service.core.intake.intake import FASTEST_JOINT, Refused
+from service.core.intake.intake import MAX_JOINT_SPEED, Refused
+from service.core.record import Record
 
 WINDOW_S = 1.0  # over which rates and clocks are told
 TELL_EVERY_S = 10.0  # counts of what goes on being rejected
@@ -174,6 +174,6 @@ def _of_joints(cause: Cause, sample: JointState, settings: Settings) -> str:
             if not low <= at <= high:
                 like = ", which looks like degrees" if abs(at) > TURN_RAD else ""
                 return f"{name} at {at:.4g} rad{like}; {low:g} to {high:g} accepted, or 0.2 rad outside"
-            if abs(fast) > FASTEST_JOINT:
-                return f"{name} at {fast:.4g} rad/s; up to {FASTEST_JOINT:g} accepted"
+            if abs(fast) > MAX_JOINT_SPEED:
+                return f"{name} at {fast:.4g} rad/s; up to {MAX_JOINT_SPEED:g} accepted"
     return f"positions {figures(position)}"

@@ -28,8 +28,8 @@ from service.contract.requests import (
     encode_json,
 )
 from service.core.frame import Event, Frame, order
-from service.core.setpoint.workspace import is_reachable
 from service.core.skill.skill import Skill
+from service.core.skill.workspace import is_reachable
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.saved_via_points import SavedViaPoints

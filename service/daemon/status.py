@@ -9,10 +9,12 @@ from service.contract.incidents import MALFORMED, SOURCE_NAMES, remedy
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
-from service.core.controller import RETURNING, Controller
-from service.core.frame import Frame, Record
-from service.core.intake.intake import REST_S
+from service.core.controller import Controller
+from service.core.decision.decision import RETURNING
+from service.core.frame import Frame
+from service.core.intake.intake import STILL_S
 from service.core.intake.plausibility import SCATTERED_M, SETTLED
+from service.core.record import Record
 from service.core.rotation import off_target
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import standard_deviations
@@ -83,7 +85,7 @@ class CellStatus(NamedTuple):
     def because(self) -> str:
         """The reason for mode hold or fault in words, with its figures."""
         frame, sources, settings = self.frame, self.sources, self.settings
-        error_rad, speed = self.controller.measured
+        error_rad, speed = self.controller.decision.measured
         match Reason(int(frame["reason"])):
             case Reason.NO_HANDS | Reason.STALE_HAND:
                 return "; ".join(_silence(side, sources[side]) for side in SIDES if not sources[side].fresh)
@@ -120,7 +122,7 @@ class CellStatus(NamedTuple):
         for name, at, low, high in zip(joints.names, measured, joints.lower, joints.upper, strict=True):
             if int(self.state["arm_ready"]) == RETURNING and not low <= at <= high:
                 return f"{name} at {at:.3f} rad is outside {low:g} to {high:g}, and is moved back"
-        return f"the arm has not told one posture for {REST_S:g} s"
+        return f"the arm has not told one posture for {STILL_S:g} s"
 
 
 def outcome(frame: Frame) -> tuple[str, str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.core.arm.arm import Arm
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.report.columns import Columns, Measured
 
 BEFORE_S = 1.0  # that is looked at

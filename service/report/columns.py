@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from service.contract import cdr
 from service.contract.messages import WireError, in_order
 from service.contract.records import Mode, Reason
-from service.core.frame import TIMING, Record, Records, Vector, frame_layout
+from service.core.frame import TIMING, frame_layout
+from service.core.record import Record, Records, Vector
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
 from service.recording.recording import Recording

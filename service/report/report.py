@@ -15,7 +15,7 @@ import numpy as np
 
 from service.contract.incidents import REASONS
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.recording.recording import Recording
 from service.report.causes import what_led, why_held
 from service.report.columns import Columns, read, runs

@@ -17,7 +17,6 @@ from rerun.blueprint import components
 
 from service import palette
 from service.config import Settings
-from service.core.separation.separation import IRRELEVANT
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
@@ -52,7 +51,7 @@ def curves(settings: Settings) -> dict[str, Curves]:
             Curves("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
             Curves("/speed", "Speed [m/s]", 0, tool.max_speed),
             Curves("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
-            Curves("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, IRRELEVANT),
+            Curves("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
             Curves("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
             Curves("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
             Curves("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.config import Settings
-from service.contract.records import SIDES, STAGES, Mode, Reason
-from service.core.frame import TIMING, Record
+from service.contract.records import SIDES, Mode, Reason
+from service.core.frame import STAGES, TIMING
+from service.core.record import Record
 from service.core.rotation import off_target
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, place
@@ -261,12 +262,12 @@ class Chunks:
         word where no hand is near.
         """
         body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
-        placed, near = np.empty((len(body.links), 2, 3)), np.empty(9)
-        place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.links, body.ends, placed)
+        placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
+        place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
         if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST):
             for side in np.flatnonzero(seen):
                 hand = np.stack([frame["hands"][side], frame["hands"][side] + self._forearm])
-                for ends, radius in zip(placed, body.radii.tolist(), strict=True):
+                for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
                     distance = between_segments(ends, hand, near) - radius - self._hand_radius
                     if distance < found[0]:
                         ways = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
-from service.core.intake.stillness import RESTING
+from service.core.intake.stillness import STILL
 from service.core.skill.pose import NO_GRIPPER, Turn
 from service.core.skill.skill import Known, Prediction, Skill
 from service.core.skill.via_points import neighbourhoods
@@ -58,7 +58,7 @@ class Rival(Skill):
         hands: Array,
         velocities: Array,
         accelerations: Array,
-        rest: Array = RESTING,
+        rest: Array = STILL,
         *,
         before: Known | None = None,
     ) -> Prediction:
@@ -82,7 +82,7 @@ class TimeDriven(Skill):
         hands: Array,
         velocities: Array,
         accelerations: Array,
-        rest: Array = RESTING,
+        rest: Array = STILL,
         *,
         before: Known | None = None,
     ) -> Prediction:

@@ -18,10 +18,11 @@ from scipy.stats import chi2
 
 from service.config import Settings
 from service.contract.messages import BASE, PoseStamped
-from service.core.frame import blank, state_layout
+from service.core.frame import state_layout
 from service.core.intake.intake import Intake
+from service.core.record import blank
 from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.setpoint.workspace import Target
+from service.core.skill.workspace import Target
 from service.core.stops import fastest_stop
 from sim.closed_loop import START_NS
 from sim.experiments.results import Array

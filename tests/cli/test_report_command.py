@@ -17,7 +17,7 @@ from wam import STATE
 from service import palette
 from service.cli.main import main
 from service.config import Settings
-from service.core.frame import blank
+from service.core.record import blank
 from service.recording.recording import Recorder, Recording
 from service.report.page import thinned
 

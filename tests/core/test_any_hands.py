@@ -22,7 +22,8 @@ from wam import URDF
 from service.contract.records import SIDES, Cause, Mode
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, order
+from service.core.frame import Tick, order
+from service.core.record import Vector
 from service.learning.skill_file import decoded
 
 PERIOD_S, TICKS = 0.002, 1000

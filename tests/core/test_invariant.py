@@ -27,7 +27,8 @@ from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, Vector, order
+from service.core.frame import Event, Frame, Tick, order
+from service.core.record import Vector
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import Scene

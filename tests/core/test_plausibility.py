@@ -22,8 +22,9 @@ from wam import URDF
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, as_array, copied
+from service.core.frame import Tick
 from service.core.intake import plausibility
+from service.core.record import Vector, as_array, copied
 from service.core.skill.skill import Skill
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)

@@ -22,7 +22,8 @@ from service.contract.records import Flag, Mode
 from service.core.arm.arm import Arm
 from service.core.arm.least_squares import keep_under, least_squares
 from service.core.controller import Controller, start_state
-from service.core.frame import Tick, Vector
+from service.core.frame import Tick
+from service.core.record import Vector
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
 from service.core.separation.separation import SLIP, Separation, allowed_speed

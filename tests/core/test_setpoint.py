@@ -16,11 +16,11 @@ from wam import STATE
 
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
-from service.core.frame import Vector, blank
 from service.core.intake.intake import Intake
+from service.core.record import Vector, blank
 from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
 from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
-from service.core.setpoint.workspace import Target
+from service.core.skill.workspace import Target
 from service.core.stops import fastest_stop
 
 PERIOD_S = 0.002

@@ -16,7 +16,8 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
 from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, blank, frame_layout
+from service.core.frame import Event, Frame, Tick, frame_layout
+from service.core.record import blank
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEYS, InputMonitor, in_words
 from service.daemon.status import CellStatus

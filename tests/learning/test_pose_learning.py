@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from taught_scene import PLACES, SCENE
 
 from service.contract.requests import RequestError, ViaPoint, decode_request
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn

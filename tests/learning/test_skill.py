@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from taught_scene import HANDOVER, SCENE, with_hands
 
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.script import HandMotions, HandScript

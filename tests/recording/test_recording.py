@@ -24,7 +24,8 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels, messages
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
-from service.core.frame import TIMING, Event, Record, Tick, blank, encode
+from service.core.frame import TIMING, Event, Tick, encode
+from service.core.record import Record, blank
 from service.demonstrations.files import write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError

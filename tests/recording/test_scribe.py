@@ -21,7 +21,8 @@ import pytest
 from test_recording import SKILL, at_ns, state_after, ticks
 
 from service.config import Files, Settings
-from service.core.frame import Event, Record, Tick, encode
+from service.core.frame import Event, Tick, encode
+from service.core.record import Record
 from service.recording.client import Scribe
 from service.recording.protocol import pack, unpack
 from service.recording.recording import Recording

@@ -17,8 +17,8 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.core.frame import Vector
-from service.core.intake.stillness import RESTING
+from service.core.intake.stillness import STILL
+from service.core.record import Vector
 from service.core.skill.places import Indices, Layout, Task
 from service.core.skill.via_points import NEAR as NEAR_TAUGHT
 
@@ -165,7 +165,7 @@ class Placed:
 
 
 def _resting(hands: Vector, rest: Vector | None) -> Vector:
-    return np.tile(RESTING, (len(hands), 1)) if rest is None else rest
+    return np.tile(STILL, (len(hands), 1)) if rest is None else rest
 
 
 def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vector:
