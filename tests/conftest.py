@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests_paths import RECORDINGS
 
 from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
@@ -19,6 +18,7 @@ from service.core import warm_up
 from service.core.skill.skill import Skill
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import decoded
+from support.paths import RECORDINGS
 
 
 class _NoBench:

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests_paths import ROOT
 
 import kmp
+from support.paths import ROOT
 
 PACKAGES = ("kmp", "service", "sim")
 OUTSIDE = {
@@ -130,6 +130,12 @@ def test_a_module_is_short_enough_to_be_read(path: Path) -> None:
 
 def test_no_module_has_a_name_that_says_nothing() -> None:
     assert [named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE] == []
+
+
+def test_tests_share_what_stands_in_support_and_never_import_each_other() -> None:
+    tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
+    theirs = {path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")} | {"tests"}
+    assert [named(path) for path in tests if imported(path) & theirs] == []
 
 
 def test_everything_that_the_mathematics_offers_is_there_and_sorted() -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from hatchling.builders.wheel import WheelBuilder
-from tests_paths import ROOT
+
+from support.paths import ROOT
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cell import thirdhand
 
 from service.recording.replay import replay
 from service.timing import loads, soak
+from support.cell import thirdhand
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.timed]
 QUIET = {"say": lambda line: None}

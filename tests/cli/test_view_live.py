@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import chromium
 import numpy as np
 import pytest
-from cell import Daemon, Tracker, serving
 from PIL import Image
-from tests_paths import ROOT
 
 from service.cli.live_page import STREAM
 from service.cli.view import FRESH_S, screenshot
+from support import chromium
+from support.cell import Daemon, Tracker, serving
+from support.paths import ROOT
 
 TIMEOUT_S = 90
 EMPTY_GRPC = b"\0\0\0\0\0"  # a message without fields

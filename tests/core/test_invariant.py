@@ -13,15 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bounds import bounds_hold
-from explained import Explained
 from hypothesis import HealthCheck
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
-from in_process import LEFT, RIGHT
-from tests_paths import RECORDINGS
-from wam import JOINT_NAMES, URDF
 
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
@@ -31,6 +26,11 @@ from service.core.frame import Event, Frame, Tick, Vector, order
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import Scene
+from support.bounds import bounds_hold
+from support.explained import Explained
+from support.in_process import LEFT, RIGHT
+from support.paths import RECORDINGS
+from support.wam import JOINT_NAMES, URDF
 
 SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s

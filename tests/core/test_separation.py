@@ -13,9 +13,7 @@ import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from scipy.optimize import minimize
-from wam import URDF
 
 from service.config import Box, Obstacles, Settings, Table
 from service.contract.records import Flag, Mode
@@ -31,6 +29,8 @@ from service.learning.via_points import adapted
 from sim.experiments.separation import _measure
 from sim.scene import Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.wam import URDF
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
 LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)

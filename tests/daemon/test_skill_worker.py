@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests_paths import RECORDINGS
 
 from service.contract.requests import ViaPoint
 from service.core.skill.skill import Skill
@@ -20,6 +19,7 @@ from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted, in_force
 from sim.scene import Scene
+from support.paths import RECORDINGS
 
 PLACES = Scene().via_points()
 SOLDERING = RECORDINGS / "soldering.npz"

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cell import Daemon, Tracker, serving, thirdhand
 
 from service.client import RefusedError, UnreachableError
 from service.daemon.single_instance import Lock
@@ -24,6 +23,7 @@ from service.daemon.skill_worker import SkillWorker
 from service.daemon.supervised_thread import supervised
 from service.learning.skill_file import SkillError
 from service.recording.replay import replay
+from support.cell import Daemon, Tracker, serving, thirdhand
 
 SABOTAGE = """
 import pathlib

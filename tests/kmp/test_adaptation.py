@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from primitives import database, kernel, properties, same_bits, seeds, skill, via
 
 from kmp import KMP, Gaussians, ViaPointMissed
+from support.primitives import database, kernel, properties, same_bits, seeds, skill, via
 
 
 def test_via_points_of_small_variance_are_met():

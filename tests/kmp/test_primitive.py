@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 from kmp import KMP, GaussianKernel, Gaussians
+from support.primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 
 @properties

@@ -10,11 +10,6 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
-from bounds import bounds_hold
-from explained import Explained
-from hostile_bytes import mutated
-from in_process import LEFT, RIGHT
-from wam import JOINT_NAMES
 
 from service.config import robot_description
 from service.contract import cdr
@@ -25,6 +20,11 @@ from service.core.frame import Frame, Vector
 from service.learning.skill_file import decoded
 from service.recording.recording import Recording
 from service.recording.replay import replay, ticks
+from support.bounds import bounds_hold
+from support.explained import Explained
+from support.hostile_bytes import mutated
+from support.in_process import LEFT, RIGHT
+from support.wam import JOINT_NAMES
 
 QUIET_S = 1.0  # of every two, in which nothing is spoilt
 ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")
