@@ -22,6 +22,7 @@ OUTSIDE = {
 }
 VAGUE = {"utils", "util", "common", "base", "manager", "helper", "helpers", "node", "interface", "misc"}
 MOST_LINES, MORE_IN_TESTS = 400, 100
+PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
 MODULES = sorted(path for package in (*PACKAGES, "tests") for path in (ROOT / package).rglob("*.py"))
 PURE = sorted(path for room in ("core", "contract") for path in (ROOT / "service" / room).rglob("*.py"))
 ENTRY_POINTS = [
@@ -136,6 +137,18 @@ def test_tests_share_what_stands_in_support_and_never_import_each_other() -> Non
     tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
     theirs = {path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")} | {"tests"}
     assert [named(path) for path in tests if imported(path) & theirs] == []
+
+
+def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
+    """Nor as an attribute, which the linter finds."""
+    found = []
+    for path in (path for path in MODULES if path.is_relative_to(ROOT / "tests")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+                found += [f"{named(path)}: {name.name}" for name in node.names if re.match("_[a-z]", name.name)]
+            elif isinstance(node, ast.Constant) and re.search(PRIVATE, str(node.value)):
+                found.append(f"{named(path)}: {node.value}")
+    assert found == []
 
 
 def test_everything_that_the_mathematics_offers_is_there_and_sorted() -> None:

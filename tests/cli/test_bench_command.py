@@ -33,7 +33,7 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
 
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
-    monkeypatch.setattr(loads, "_large", bytes)
+    monkeypatch.setattr(loads, "large_skill", bytes)
     (row,) = loads.run(500, 1.0, **QUIET)
     assert row["mode"] == "follow"
     assert row["ticks"] == pytest.approx(500, abs=150)

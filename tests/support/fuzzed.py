@@ -15,13 +15,12 @@ from service.config import robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.controller import Controller
 from service.core.frame import Frame, Vector
 from service.learning.skill_file import decoded
 from service.recording.recording import Recording
 from service.recording.replay import replay, ticks
 from support.bounds import bounds_hold
-from support.explained import Explained
+from support.explained import explained_controller
 from support.hostile_bytes import mutated
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES
@@ -70,8 +69,7 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
     assert result.exact, result.text()
     recording = Recording.open(path)
     skill = decoded(recording.skill, origin=str(path), recorded=True)
-    controller = Controller(recording.settings, skill, urdf=robot_description(recording.settings))
-    controller._setpoint = Explained(recording.settings)
+    controller = explained_controller(recording.settings, skill, urdf=robot_description(recording.settings))
     frames: list[Frame] = []
     measured: list[Vector] = []
     for tick in ticks(recording):
