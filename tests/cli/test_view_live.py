@@ -108,6 +108,7 @@ def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere
     connection.close()
 
 
+@pytest.mark.usefixtures("drawing")
 def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scene_to_who_comes_late(
     page: Page, tmp_path: Path
 ) -> None:
