@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterable
 
 import numpy as np
-from tests_paths import ROOT
 
 from service.config import Settings, robot_description
 from service.contract import incidents, requests, ros2
@@ -20,6 +19,7 @@ from service.contract.roles import ROLES
 from service.core.arm.arm import Arm
 from service.recording.client import Scribe
 from service.viewer.blueprint import curves
+from support.paths import ROOT
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]

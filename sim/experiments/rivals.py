@@ -124,8 +124,8 @@ def ours(skill: Skill) -> Adapt:
 
 def gmr(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     """Gaussian mixture regression alone, which cannot be told of places."""
-    mixture = GaussianMixture.fit(_samples(demonstrations), components=COMPONENTS, seed=SEED)
-    law = _regression(mixture)
+    mixture = GaussianMixture.fit(samples_of(demonstrations), components=COMPONENTS, seed=SEED)
+    law = regression_of(mixture)
     return lambda scene: lambda bench: _rival(skill, law)
 
 
@@ -133,7 +133,7 @@ def paper(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     """KMP with the paper's ell = 0.5 and lambda = 2 (in metres), and each place a bare point of
     variance 1e-6 m².
     """
-    samples = _samples(demonstrations)
+    samples = samples_of(demonstrations)
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED)
     inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=SEED)
     base = KMP.fit(
@@ -182,7 +182,7 @@ def gaussian_process(
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    samples = _samples(demonstrations)[::every]
+    samples = samples_of(demonstrations)[::every]
     inputs, outputs, centre = samples[:, :6], samples[:, 6:], samples[:, 6:].mean(axis=0)
     kernel = ConstantKernel(0.05, (1e-4, 1e2)) * RBF(np.full(6, 0.3), (0.03, 10.0)) + WhiteKernel(1e-4, (1e-6, 1e-2))
     if ell is not None:
@@ -260,7 +260,7 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
     )
 
 
-def _regression(mixture: GaussianMixture) -> Law:
+def regression_of(mixture: GaussianMixture) -> Law:
     """The mean of the mixture's regression, as `regress` gives it, with all that does not depend on
     the query made once.
     """
@@ -279,7 +279,7 @@ def _regression(mixture: GaussianMixture) -> Law:
     return law
 
 
-def _samples(demonstrations: Sequence[Demonstration]) -> Array:
+def samples_of(demonstrations: Sequence[Demonstration]) -> Array:
     return np.concatenate([np.hstack([d.hands, d.tool[:, :3]]) for d in demonstrations])
 
 

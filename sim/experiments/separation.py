@@ -152,7 +152,7 @@ def _judged(
     distance, speed, coming = (np.empty((len(done.hands), 2, count)) for _ in range(3))
     own, table = np.empty(len(done.hands)), np.empty(len(done.hands))
     forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
-    _measure(
+    measure(
         done.joints[:, 0], done.joints[:, 1], done.hands, velocities, *body, moving, people.radius, forearm,
         settings.table.centre[2], distance, speed, coming, own, table,
     )  # fmt: skip
@@ -207,7 +207,7 @@ def _later_by(ticks: int, values: Array) -> Array:
 
 
 @compiled
-def _measure(
+def measure(
     q: Array, dq: Array, hands: Array, velocities: Array, frames: Array, axes: Array, links: Array, ends: Array,
     radii: Array, pairs: Array, moving: int, radius: float, forearm: Array, top: float, distance: Array, speed: Array,
     coming: Array, own: Array, table: Array,

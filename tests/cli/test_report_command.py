@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests_paths import RECORDINGS, ROOT
-from wam import STATE
 
 from service import palette
 from service.cli.main import main
@@ -20,6 +18,8 @@ from service.config import Settings
 from service.core.record import blank
 from service.recording.recording import Recorder, Recording
 from service.report.page import thinned
+from support.paths import RECORDINGS, ROOT
+from support.wam import STATE
 
 GOLDEN = RECORDINGS / "golden.mcap"
 

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
-from wam import JOINT_NAMES
 
 from service.contract import cdr, channels, messages, requests
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
+from support.wam import JOINT_NAMES
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES = ("", "b", "ba", "bas", "base", "base_", "base_l", "a/tracker/over there", "tête")

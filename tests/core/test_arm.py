@@ -15,13 +15,13 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wam import JOINT_NAMES, URDF
 
 from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
 from service.core.arm.arm import Arm
 from service.core.limiter.limiter import Limiter
 from service.core.skill.workspace import clamp
+from support.wam import JOINT_NAMES, URDF
 
 Vector = npt.NDArray[np.float64]
 

@@ -7,9 +7,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
-from tests_paths import RECORDINGS
-from wam import FRAME, URDF
 
 from service.config import Settings
 from service.contract import channels, records
@@ -22,6 +19,9 @@ from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
+from support.paths import RECORDINGS
+from support.wam import FRAME, URDF
 
 PERIOD_S = 0.002
 POSTURE = Settings().arm.posture

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from test_intake import LEFT, PERIOD_S, Hands, follow
 
 from service.config import HandSettings
 from service.core.intake import hand_estimator
 from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE, model
 from service.core.record import Vector
+from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 
 def reach(t: float) -> Vector:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from in_process import frames, ticks_of
 
 from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
@@ -23,6 +22,7 @@ from service.recording.replay import replay
 from sim.scene import Scene
 from sim.script import HandScript
 from sim.teach import demonstrations
+from support.in_process import frames, ticks_of
 
 
 class Model(NamedTuple):

@@ -14,10 +14,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
-from in_process import ASSUMED, LEFT, RIGHT, frames, hand
-from test_intake import LEFT as LEFT_SIDE
-from test_intake import STRAIGHT, Hands
-from wam import URDF
 
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
@@ -26,6 +22,10 @@ from service.core.frame import Tick
 from service.core.intake import plausibility
 from service.core.record import Vector, as_array, copied
 from service.core.skill.skill import Skill
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.tracked import LEFT as LEFT_SIDE
+from support.tracked import STRAIGHT, Hands
+from support.wam import URDF
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
 

@@ -9,9 +9,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from in_process import ASSUMED, frames, ticks_of
 from scipy.spatial.transform import Rotation
-from wam import FRAME, URDF
 
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.config import Settings
@@ -29,6 +27,8 @@ from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, frames, ticks_of
+from support.wam import FRAME, URDF
 
 PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
 

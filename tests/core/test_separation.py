@@ -13,9 +13,7 @@ import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from scipy.optimize import minimize
-from wam import URDF
 
 from service.config import Box, Obstacles, Settings, Table
 from service.contract.records import Flag, Mode
@@ -26,12 +24,14 @@ from service.core.frame import Tick
 from service.core.record import Vector
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
-from service.core.separation.separation import SLIP, Separation, allowed_speed
+from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
-from sim.experiments.separation import _measure
+from sim.experiments.separation import measure
 from sim.scene import Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.wam import URDF
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
 LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)
@@ -121,7 +121,9 @@ def test_rows_are_how_fast_distances_shrink() -> None:
     settings = msgspec.structs.replace(
         ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
     )
-    apart = Separation(settings, URDF)
+    apart, table = Separation(settings, URDF), settings.table
+    low, high = np.array(table.centre) - [*table.half_size, TABLE_DEPTH], np.add(table.centre, [*table.half_size, 0.0])
+    boxes = np.array([[low, high], [(0.45, -0.05, 0.15), (0.55, 0.05, 0.25)]])
     state = start_state(settings, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"], state["hands"][:, 0] = 0, np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]
     random, near, total = np.random.default_rng(4), np.empty(9), 0
@@ -139,7 +141,7 @@ def test_rows_are_how_fast_distances_shrink() -> None:
         for i, j in BODY.pairs:
             found.append(-np.diff([between_segments(at[i], at[j], near) for at in both])[0] / 2e-6)
         for k in np.flatnonzero(BODY.links):
-            for box in apart._boxes:
+            for box in boxes:
                 for share in (nearest_to_box(placed(q)[k], box), 0.0, 1.0):
                     found.append(-np.diff([to_box(at[k], share, box, near) for at in both])[0] / 2e-6)
         expected = np.array(found)
@@ -204,7 +206,7 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     distance, speed, coming, own, table = *(np.empty(size) for _ in range(3)), *(np.empty(len(seen)) for _ in range(2))
     joints, velocities = (np.ascontiguousarray(seen[name]) for name in ("joints", "joint_velocities"))
     forearm = np.array([people.length, 0.0, 0.0])
-    _measure(
+    measure(
         joints, velocities, hands, 0 * hands, *BODY, moving, people.radius, forearm, settings.table.centre[2],
         distance, speed, coming, own, table,
     )  # fmt: skip
@@ -349,7 +351,8 @@ def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -
         assert all(limit >= 0 for limit in limits)
         state["hands"][0, 0] = here.position  # the hand is at the tool: only where it receives it may be touched
         if gentle:
-            apart._contacts[0, :3] = here.position
+            place, *others = taught.via_points
+            apart.expect([msgspec.structs.replace(place, left=tuple(here.position.tolist())), *others])
         apart.look(state, POSTURE, here.position, here.jacobian)
         allowed = apart.allowed[: apart.count] - SLIP
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
@@ -383,7 +386,8 @@ def test_it_costs_little_beside_a_tick(taught: Skill) -> None:
     began = time.perf_counter()
     frames(controller, ticks[1000:1500])
     tick_s = (time.perf_counter() - began) / 500
-    state, here, apart = controller.state, ARM.at(controller.state["joints"][0]), controller._apart
+    state, here, apart = controller.state, ARM.at(controller.state["joints"][0]), Separation(ASSUMED, URDF)
+    apart.expect(taught.via_points)
     began = time.perf_counter()
     for _ in range(500):
         apart.look(state, here.joints, here.position, here.jacobian)

@@ -8,11 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 import ruckig
-from explained import Explained, margin
 from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
-from wam import STATE
 
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
@@ -22,6 +20,8 @@ from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE,
 from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
 from service.core.skill.workspace import Target
 from service.core.stops import fastest_stop
+from support.explained import Explained, margin
+from support.wam import STATE
 
 PERIOD_S = 0.002
 TOOL = ToolSettings()

@@ -8,8 +8,6 @@ import re
 from typing import Any
 
 import pytest
-from in_process import LEFT, RIGHT
-from wam import JOINT_NAMES, URDF
 
 from service.config import HandSettings, Settings
 from service.contract.messages import JointState, PoseStamped
@@ -21,6 +19,8 @@ from service.core.record import blank
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEYS, InputMonitor, in_words
 from service.daemon.status import CellStatus
+from support.in_process import LEFT, RIGHT
+from support.wam import JOINT_NAMES, URDF
 
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 S = 1_000_000_000

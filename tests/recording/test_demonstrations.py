@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer
-from test_recording import START_NS, at_ns, write
 
 from service.contract import cdr, channels, messages
 from service.contract.ros2msg import schema
 from service.demonstrations.files import iter_hands, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import RecordingError
+from support.recorded import START_NS, at_ns, write
 
 
 def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path: Path) -> None:

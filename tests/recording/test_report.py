@@ -9,9 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_process import LEFT, RIGHT, arm, hand
-from tests_paths import RECORDINGS
-from wam import URDF
 
 from service.config import Settings
 from service.contract.records import Flag, Mode, Reason
@@ -24,6 +21,9 @@ from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
 from service.report.report import Report, differing_settings, reported, why_missed
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
+from support.in_process import LEFT, RIGHT, arm, hand
+from support.paths import RECORDINGS
+from support.wam import URDF
 
 SETTINGS = Settings()
 PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)

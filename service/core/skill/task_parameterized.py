@@ -179,7 +179,7 @@ def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vec
 
 
 @compiled
-def _nearest(point: Vector, corners: Vector, count: int, out: Vector) -> float:
+def barycentric_weights(point: Vector, corners: Vector, count: int, out: Vector) -> float:
     """Barycentric coordinates (3,), at least 0 and 1 in sum, of the point between `count` corners
     that is nearest to a point; its distance.
     """
@@ -217,7 +217,7 @@ def _inputs(hands: Vector, rest: Vector, corners: Vector, inputs: Indices, out: 
         while count < 3 and inputs[side, count] >= 0:
             count += 1
         first = 3 * side
-        off[side] = _nearest(hands[first : first + 3], corners[side], count, share)
+        off[side] = barycentric_weights(hands[first : first + 3], corners[side], count, share)
         nearest = math.inf
         for i in range(count):
             nearest = min(nearest, ((hands[first : first + 3] - corners[side, i]) ** 2).sum())
