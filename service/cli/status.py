@@ -113,7 +113,7 @@ def rows(now: Status) -> dict[str, str]:
     )
     found = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
-        "because": now.because,
+        "why": now.because,
         "what to do": now.remedy,
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",

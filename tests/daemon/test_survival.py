@@ -41,7 +41,7 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
         return honest(*arguments, **more)
     setattr(owner, name, method)
 
-sabotaged(daemon.Daemon, "_survey")
+sabotaged(daemon.Daemon, "_status_now")
 sabotaged(controller.Controller, "step")
 sabotaged(daemon.Daemon, "_publish")
 sabotaged(requests.Line, "enqueue")
@@ -84,7 +84,7 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
         Tracker(daemon.session),
     ):
         for name, provoke in {
-            "_survey": lambda: None,
+            "_status_now": lambda: None,
             "enqueue": lambda: daemon.client.ask("resume"),
             "_reply": lambda: daemon.client.ask("resume"),
             "step": lambda: None,
