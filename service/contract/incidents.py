@@ -1,7 +1,8 @@
 """Why the arm does what it does, in words: the one place where a mode, a reason, a flag or a cause
 of rejection is explained, with the figures known at the time, and what to do about it.
 
-Status, `doctor`, log, viewer, report and docs/incidents.md take their words from here.
+Status, `doctor`, log, viewer, report and docs/incidents.md take their words from here. A new reason
+is a member in records.py, its words here, and the stage that decides it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ FAULTS = (Reason.ARM_ERROR, Reason.ARM_SILENT, Reason.TOOL_SPEED, Reason.SETPOIN
 LONGEST_NAME = 64  # of a frame
 FULL_TURN_RAD = 7.0  # no joint is farther from its zero
 
+Excess: TypeAlias = tuple[float, float]  # a value, and the greatest that is accepted
 Member: TypeAlias = Mode | Reason | Flag | Cause | Literal["malformed"]
 
 
@@ -39,13 +41,6 @@ class Incident(NamedTuple):
     def what_to_do(self) -> str:
         """The remedy for people."""
         return self.remedy.replace("`", "")
-
-
-class Excess(NamedTuple):
-    """A value, and the greatest that is accepted."""
-
-    value: float
-    accepted: float
 
 
 class Outside(NamedTuple):
@@ -134,9 +129,10 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
         case Reason.FAR_FROM_DEMONSTRATIONS:
             about = "the skill is not sure where the tool belongs with the hands as they are"
             remedy = "bring the hands back to where it was demonstrated, or demonstrate this too"
-            if (off := seen.deviation_m) is not None:
+            if seen.deviation_m is not None:
+                value_cm, accepted_cm = (100 * value for value in seen.deviation_m)
                 what = "a hand is off its places by" if seen.between_places else "the target's standard deviation is"
-                found = f"{what} {100 * off.value:.1f} cm, {100 * off.accepted:.1f} accepted"
+                found = f"{what} {value_cm:.1f} cm, {accepted_cm:.1f} accepted"
         case Reason.TWO_SOURCES:
             about = "a quarter of what came in the last second says that a hand, or the arm, is somewhere else; or "
             about += "a hand's samples scatter by more than 12 mm"
@@ -152,20 +148,19 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
         case Reason.ARM_ERROR:
             about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
             remedy = "see what blocked or pushed it, then `thirdhand reset`"
-            if (off := seen.error_rad) is not None:
-                found = f"a joint was {off.value:.3f} rad off, {off.accepted:g} accepted"
-            if seen.worst_joint is not None:
-                found += "; now {} is off by {:.3f} rad".format(*seen.worst_joint)
+            if seen.error_rad is not None and seen.worst_joint is not None:
+                found = "a joint was {:.3f} rad off, {:g} accepted; ".format(*seen.error_rad)
+                found += "now {} is off by {:.3f} rad".format(*seen.worst_joint)
         case Reason.ARM_SILENT:
-            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen)
+            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen.sources.get("arm"))
             remedy = "look at its driver and the network, then `thirdhand reset`"
         case Reason.TOOL_SPEED:
             about = "the tool was measured faster than `[tool] fault_speed` for 30 ms"
             remedy = "the arm does not do what it is told: check the driver before `thirdhand reset`"
-            if (speed := seen.measured_speed) is not None:
-                found = f"the tool was measured at {speed.value:.2f} m/s, {speed.accepted:g} accepted"
-            elif (speed := seen.commanded_speed) is not None:
-                found = f"a command came to {speed.value:.2f} m/s, {speed.accepted:g} accepted"
+            if seen.measured_speed is not None:
+                found = "the tool was measured at {:.2f} m/s, {:g} accepted".format(*seen.measured_speed)
+            elif seen.commanded_speed is not None:
+                found = "a command came to {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
         case Reason.SETPOINT:
             about = "a bound of the setpoint was passed, which cannot happen"
             remedy = "keep the recording and report it"
@@ -273,9 +268,8 @@ def _contest(seen: Evidence) -> str:
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
 
 
-def _silence(seen: Evidence) -> str:
+def _silence(source: Source | None) -> str:
     """For how long the arm says nothing; empty where it does."""
-    source = seen.sources.get("arm")
     if source is None or source.fresh:
         return ""
     return "no joint states came yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"
@@ -288,9 +282,12 @@ def _not_ready(seen: Evidence) -> str:
         return ""
     if _is_refused(source):
         return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
-    if not source.fresh or out is None:
-        return _silence(seen) or "the arm has not told one posture for long enough"
-    return f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+    at = (
+        ""
+        if out is None
+        else f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+    )
+    return _silence(source) or at or "the arm has not told one posture for long enough"
 
 
 def _is_refused(source: Source) -> bool:

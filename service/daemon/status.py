@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from service.config import Settings
-from service.contract.incidents import MALFORMED, Evidence, Excess, Outside, explained, word
+from service.contract.incidents import MALFORMED, Evidence, Outside, explained, word
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
@@ -85,13 +86,13 @@ class CellStatus(NamedTuple):
             sources=self.sources,
             contested=SETTLED,
             scatter_mm=1e3 * SCATTERED_M,
-            deviation_m=Excess(float(self.frame["deviation"]), skill.threshold),
+            deviation_m=(float(self.frame["deviation"]), skill.threshold),
             between_places=skill.between is not None,
             outside=self._outside(),
-            error_rad=Excess(error_rad, settings.arm.fault_error_rad),
+            error_rad=(error_rad, settings.arm.fault_error_rad),
             worst_joint=(settings.joints.names[int(errors.argmax())], float(errors.max())),
-            measured_speed=Excess(speed, limit) if speed > limit else None,
-            commanded_speed=Excess(speed, settings.tool.max_speed),
+            measured_speed=(speed, limit) if speed > limit else None,
+            commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
         )
 
@@ -110,11 +111,10 @@ def outcome(frame: Frame) -> tuple[Mode, Reason]:
 
 def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
     """What was rejected of all sources, by cause; what was malformed by its key."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():
-            counter = f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause
-            counts[counter] = counts.get(counter, 0) + count
+            counts[f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause] += count
     return counts
 
 

@@ -94,74 +94,61 @@ class Columns:
 
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
     """The columns of a recording. Raises RecordingError on what is not understood."""
-    return _Reading(recording, progress).columns()
+    found, last, gaps = Columns(recording), None, list[Gap]()
+    layout = frame_layout(len(recording.settings.joints.names))
+    blocks: list[Records] = []
+    block: list[Record] = []
+    timing: list[Record] = []
+
+    def kept() -> Records:
+        return repack_fields(np.array(block, layout)[list(KEPT)])
+
+    _take_skill(found, recording.skill, 0)
+    for step in recording.steps():
+        if step.lost or step.damage:
+            gaps.append(Gap(last, step.tick, step.lost, step.damage))
+        last = step.tick
+        if step.frame is None:
+            continue
+        found.start_ns = found.start_ns or step.time_ns
+        _take_events(found, step)
+        if step.lost or step.damage:
+            found.breaks.append(BLOCK * len(blocks) + len(block))
+        block.append(step.frame)
+        if step.timing is not None:
+            timing.append(step.timing)
+        if len(block) == BLOCK:
+            blocks.append(kept())
+            block.clear()
+            progress(BLOCK * len(blocks))
+    found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
+    found.statuses = list(_statuses(recording))
+    found.gaps = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
+    if found.skills and len(found.frames):
+        found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
+    return found
 
 
-class _Reading:
-    """One pass over the steps of a recording."""
+def _take_events(found: Columns, step: Step) -> None:
+    """Counts what came, and keeps requests and skills."""
+    if step.skill:
+        _take_skill(found, step.skill, step.tick)
+    for kind, payload in step.events:
+        found.samples[kind] += 1
+        if kind == "skill":
+            _take_skill(found, payload, step.tick)
+        elif kind in ORDERS:
+            found.orders.append(Order(step.tick, kind, cdr.decode_string(payload)))
 
-    def __init__(self, recording: Recording, progress: Callable[[int], None]) -> None:
-        self._recording, self._progress = recording, progress
-        self._found = Columns(recording)
-        self._layout = frame_layout(len(recording.settings.joints.names))
 
-    def columns(self) -> Columns:
-        """What is found."""
-        found, last, gaps = self._found, None, list[Gap]()
-        blocks: list[Records] = []
-        block: list[Record] = []
-        timing: list[Record] = []
-        self._skill(self._recording.skill, 0)
-        for step in self._recording.steps():
-            if step.lost or step.damage:
-                gaps.append(Gap(last, step.tick, step.lost, step.damage))
-            last = step.tick
-            if step.frame is None:
-                continue
-            if not found.start_ns:
-                found.start_ns = step.time_ns
-            self._events(step)
-            if step.lost or step.damage:
-                found.breaks.append(BLOCK * len(blocks) + len(block))
-            block.append(step.frame)
-            if step.timing is not None:
-                timing.append(step.timing)
-            if len(block) == BLOCK:
-                blocks.append(self._kept(block))
-                block.clear()
-                self._progress(BLOCK * len(blocks))
-        found.frames = np.concatenate([*blocks, self._kept(block)])
-        found.timing = np.array(timing, TIMING)
-        found.statuses = list(_statuses(self._recording))
-        found.gaps = [*map(str, gaps), *self._recording.unsaid(gaps, last=last)]
-        if found.skills and len(found.frames):
-            found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
-        return found
-
-    def _kept(self, block: list[Record]) -> Records:
-        kept: Records = repack_fields(np.array(block, self._layout)[list(KEPT)])
-        return kept
-
-    def _events(self, step: Step) -> None:
-        """Counts what came, and keeps what is told later."""
-        found = self._found
-        if step.skill:
-            self._skill(step.skill, step.tick)
-        for kind, payload in step.events:
-            found.samples[kind] += 1
-            if kind == "skill":
-                self._skill(payload, step.tick)
-            elif kind in ORDERS:
-                found.orders.append(Order(step.tick, kind, cdr.decode_string(payload)))
-
-    def _skill(self, file: bytes, tick: int) -> None:
-        try:
-            skill = decoded(file, origin=self._recording.path.name, recorded=True)
-        except SkillError as error:
-            self._found.remarks.append(f"a skill is not understood, its places are not told: {error}")
-            return
-        if not self._found.skills or skill.digest != self._found.skills[-1].skill.digest:
-            self._found.skills.append(InForce(tick, skill))
+def _take_skill(found: Columns, file: bytes, tick: int) -> None:
+    try:
+        skill = decoded(file, origin=found.recording.path.name, recorded=True)
+    except SkillError as error:
+        found.remarks.append(f"a skill is not understood, its places are not told: {error}")
+        return
+    if not found.skills or skill.digest != found.skills[-1].skill.digest:
+        found.skills.append(InForce(tick, skill))
 
 
 def _statuses(recording: Recording) -> Iterator[Said]:

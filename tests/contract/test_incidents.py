@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests_paths import ROOT
 
-from service.contract.incidents import MALFORMED, Evidence, Excess, Member, explained, in_full, remedy, word
+from service.contract.incidents import MALFORMED, Evidence, Member, explained, in_full, remedy, word
 from service.contract.records import Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 
@@ -59,7 +59,7 @@ def test_a_reason_is_named_where_it_is_decided_and_explained_and_hardly_elsewher
 
 
 def test_without_figures_the_sentence_is_the_general_one_and_with_them_theirs() -> None:
-    off = Evidence(deviation_m=Excess(0.123, 0.1))
+    off = Evidence(deviation_m=(0.123, 0.1))
     assert explained(Reason.FAR_FROM_DEMONSTRATIONS).why.startswith("the skill is not sure")
     found = "the target's standard deviation is 12.3 cm, 10.0 accepted"
     assert explained(Reason.FAR_FROM_DEMONSTRATIONS, off).why == found
