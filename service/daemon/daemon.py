@@ -124,7 +124,7 @@ class Daemon:
         self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
-        self._status = encode_json(self._survey())
+        self._status = encode_json(self._status_now())
         self._requests = Requests(
             self._session,
             settings,
@@ -272,7 +272,7 @@ class Daemon:
         said: tuple[str, str] | None = None
         told: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
-            status = self._survey()
+            status = self._status_now()
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
@@ -292,10 +292,10 @@ class Daemon:
                 said = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*said), status.tick, in_full(status.because, status.remedy))
 
-    def _survey(self) -> Status:
+    def _status_now(self) -> Status:
         """The status at this moment."""
         frame, state, clock = self._frame, self._controller.state, self._clock
-        sources = self._sources.survey(self._controller, state, time.monotonic())
+        sources = self._sources.update(self._controller, state, time.monotonic())
         return CellStatus(frame, self._controller, state, sources, self._settings, self._failure).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),

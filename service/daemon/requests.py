@@ -15,6 +15,8 @@ import zenoh
 from service.client import ENCODINGS
 from service.config import Settings
 from service.contract import channels
+from service.contract.incidents import word
+from service.contract.records import Mode
 from service.contract.requests import (
     Add,
     Clear,
@@ -220,13 +222,13 @@ class Requests:
             time.sleep(DECIDED_S)
         mode, reason = outcome(self._frame())
         note = ""
-        if suffix == "reset" and before != "fault":
+        if suffix == "reset" and before is not Mode.FAULT:
             note = "there was no fault: nothing was reset"
-        elif suffix == "resume" and before == "follow":
+        elif suffix == "resume" and before is Mode.FOLLOW:
             note = "there was no hold to end"
-        elif suffix == "resume" and mode == "fault":
+        elif suffix == "resume" and mode is Mode.FAULT:
             note = "a fault is ended by reset, not by resume"
-        return Reply(tick, mode=mode, reason=reason, note=note)
+        return Reply(tick, mode=word(mode), reason=word(reason), note=note)
 
     def _through_the_loop(self, event: Event) -> int:
         pending = Pending(event)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.config import Settings
+from service.contract.incidents import word
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES, TIMING
 from service.core.record import Record
@@ -21,7 +22,7 @@ from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import FARTHEST
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.core.skill.skill import standard_deviations
-from service.viewer.banner import banner, title
+from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import Trees
 
@@ -205,10 +206,8 @@ class Chunks:
         if not told:
             return
         modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
-        words = [Mode(modes[i]).name.lower() for i in told]
-        causes = [Reason(reasons[i]).name.lower() if reasons[i] else "" for i in told]
-        yield columns("/mode/mode", told, rr.StateChange.columns(state=words))
-        yield columns("/mode/reason", told, rr.StateChange.columns(state=causes))
+        yield columns("/mode/mode", told, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in told]))
+        yield columns("/mode/reason", told, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in told]))
         for i in told:
             picture = banner(modes[i], reasons[i])
             layout = rr.components.ImageFormat(
@@ -218,7 +217,7 @@ class Chunks:
             yield columns("/scene/banner", [i], look)
         for i in changed:  # each apart: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
-            yield columns("/log", [i], rr.TextLog.columns(text=[title(modes[i], reasons[i])], level=[level]))
+            yield columns("/log", [i], rr.TextLog.columns(text=[line(modes[i], reasons[i])], level=[level]))
 
     def _scene(
         self,

@@ -87,7 +87,7 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
         ["follow"],
     ]
     assert Counter(row["TextLog:text"][0] for row in rows["/log"]) == {
-        "hold: no hands": 1,
+        "hold: no hands: a hand has not been seen since the start": 1,
         "follow": 1,
         "handover taught": 1,
     }
