@@ -18,7 +18,7 @@ from pathlib import Path
 
 from service.child import python
 from service.contract.explain import ExplainedError
-from service.recording.client import NOT_RECORDED
+from service.recording.scribe import NOT_RECORDED
 
 START_TIMEOUT_S, LONG_START_S = 180.0, 6.0
 STOP_TIMEOUT_S = 60.0

@@ -18,8 +18,8 @@ from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm.arm import Arm
-from service.recording.client import Scribe
-from service.viewer.blueprint import curves
+from service.recording.scribe import Scribe
+from service.viewer.blueprint import plot_views
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]
@@ -64,7 +64,7 @@ def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
 
 
 def test_each_view_that_a_document_names_by_its_title_is_there() -> None:
-    titles = {view.title for view in curves(Settings()).values()}
+    titles = {view.title for view in plot_views(Settings()).values()}
     for name in ("incidents.md", "viewing.md"):
         text = (ROOT / "docs" / name).read_text(encoding="utf-8")
         told = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}

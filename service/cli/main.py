@@ -39,9 +39,9 @@ RUN_BY = {
     "reset": "cli.clients",
     "cells": "cli.cells",
     "view": "cli.view",
-    "report": "cli.report",
+    "report": "cli.report_command",
     "certificates": "cli.certificates",
-    "bench": "timing.bench",
+    "bench": "timing.benchmark",
 }
 SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
 PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them

@@ -15,8 +15,8 @@ from service.cli.usage import UsageError
 from service.config import Settings, converted, load
 from service.daemon import daemon
 from service.described_arm import SettingsError
-from service.recording.client import Scribe
 from service.recording.paths import skills_folder
+from service.recording.scribe import Scribe
 from service.shipped import SHIPPED_SKILL
 
 

@@ -31,7 +31,7 @@ from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
 from service.launch import free_port
 from service.network_settings import is_local
-from service.recording.recording import THINGS, Recording
+from service.recording.recording import OBJECTS, Recording
 from service.recording.steps import Gap
 from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program
@@ -150,7 +150,7 @@ def convert(
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
-        notes = recording.notes("requests", "log", THINGS)
+        notes = recording.notes("requests", "log", OBJECTS)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
@@ -173,7 +173,7 @@ def convert(
             viewer.add(step.frame, time_ns, step.timing, step.events)
             count += 1
             progress(count)
-        missing = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
+        missing = [*map(str, gaps), *recording.unreported(gaps, last=last)]
         for text in missing[unshown:]:
             viewer.log(text, "WARN", time_ns)
         viewer.close()

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 
 from service.contract import cdr
-from service.contract.messages import Thing, WireError
+from service.contract.messages import SceneObject, WireError
 
 SHAPES = {1: "box", 2: "ball", 3: "cylinder"}  # and the numbers of a Marker's type
 NUMBERS = {shape: number for number, shape in SHAPES.items()}
@@ -23,7 +23,7 @@ _UV, _COUNT, _BYTE = struct.Struct("<2f"), struct.Struct("<I"), struct.Struct("<
 _LIFETIME = struct.Struct("<II")
 
 
-def encode_things(stamp_ns: int, things: Sequence[Thing]) -> bytes:
+def encode_objects(stamp_ns: int, things: Sequence[SceneObject]) -> bytes:
     """CDR bytes of a MarkerArray, one marker for each thing."""
     out = cdr.Writer()
     out.pack(_COUNT, len(things), align=4)
@@ -50,7 +50,7 @@ def encode_things(stamp_ns: int, things: Sequence[Thing]) -> bytes:
     return out.bytes()
 
 
-def decode_things(data: bytes) -> tuple[Thing, ...]:
+def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
     """The things in the CDR bytes of a MarkerArray; markers of other kinds are passed over.
 
     Raises WireError.
@@ -75,14 +75,14 @@ def decode_things(data: bytes) -> tuple[Thing, ...]:
         reader.skip(_BYTE, 1)
         reader.unpack(_BYTE, 1)
         if action == _ADD and kind in SHAPES:
-            found.append(_checked(Thing(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
+            found.append(_checked(SceneObject(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
     reader.end()
     if len(found) > MOST_THINGS or len({thing.name for thing in found}) < len(found):
         raise WireError(f"{len(found)} things; up to {MOST_THINGS}, each with a name of its own, accepted")
     return tuple(found)
 
 
-def _checked(thing: Thing) -> Thing:
+def _checked(thing: SceneObject) -> SceneObject:
     numbers = (*thing.position, *thing.size)
     if not all(math.isfinite(value) and abs(value) <= LARGEST_M for value in numbers) or min(thing.size) <= 0:
         raise WireError(f"thing {thing.name[:LONGEST_NAME]!r}: a position or size beyond {LARGEST_M:g} m, or no size")

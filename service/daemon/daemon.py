@@ -32,6 +32,7 @@ from service.core.separation.separation import FARTHEST, IRRELEVANT
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
+from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
@@ -44,15 +45,14 @@ from service.daemon.clock import (
 )
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.measured_tool import MeasuredTool
-from service.daemon.requests import Requests
+from service.daemon.object_listener import ObjectListener
+from service.daemon.queryables import Queryables
 from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import CellStatus
-from service.daemon.streams import Streams
-from service.daemon.things import Things
 from service.learning.skill_file import SkillError
-from service.recording.client import Scribe
+from service.recording.scribe import Scribe
 
 log = logging.getLogger("thirdhand")
 STOP_TIMEOUT_S = 3.0
@@ -120,11 +120,11 @@ class Daemon:
         self._laps: list[tuple[str, int]] = []
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         lock.tell(self.endpoints)
-        self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
-        self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
+        self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
+        self._things = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._survey())
-        self._requests = Requests(
+        self._requests = Queryables(
             self._session,
             settings,
             skill,

@@ -140,7 +140,7 @@ class _Reading:
                 self._progress(BLOCK * len(blocks))
         found.frames = np.concatenate([*blocks, self._kept(block)])
         found.timing = np.array(timing, TIMING)
-        found.gaps = [*map(str, gaps), *self._recording.unsaid(gaps, last=last)]
+        found.gaps = [*map(str, gaps), *self._recording.unreported(gaps, last=last)]
         if found.skills and len(found.frames):
             found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
         return found

@@ -37,7 +37,7 @@ from service.learning.skill_file import with_file
 from service.recording.replay import replay
 from service.shipped import SHIPPED_SKILL, recordings, shipped_skill
 from service.timing.probe import TRACKER_HZ, hands_of
-from service.timing.probes import probe
+from service.timing.probe_processes import probe
 from service.viewer.stream import rerun_program
 
 QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
@@ -63,7 +63,7 @@ class LoadError(ExplainedError):
 
 
 @dataclass(frozen=True)
-class Cell:
+class LoadedCell:
     """A running daemon, and what a load needs to reach it."""
 
     service: Launched
@@ -79,12 +79,12 @@ class Cell:
 
 
 @contextlib.contextmanager
-def _nothing(cell: Cell) -> Iterator[None]:
+def _nothing(cell: LoadedCell) -> Iterator[None]:
     yield
 
 
 @contextlib.contextmanager
-def _frozen(cell: Cell) -> Iterator[None]:
+def _frozen(cell: LoadedCell) -> Iterator[None]:
     pid = cell.scribe()
     os.kill(pid, signal.SIGSTOP)
     yield
@@ -93,13 +93,13 @@ def _frozen(cell: Cell) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _killed(cell: Cell) -> Iterator[None]:
+def _killed(cell: LoadedCell) -> Iterator[None]:
     os.kill(cell.scribe(), signal.SIGKILL)
     yield
 
 
 @contextlib.contextmanager
-def _full(cell: Cell) -> Iterator[None]:
+def _full(cell: LoadedCell) -> Iterator[None]:
     """The scribe's files may not grow any more, which fails as a full disk does."""
     pid, none = cell.scribe(), resource.RLIM_INFINITY
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, none))
@@ -109,7 +109,7 @@ def _full(cell: Cell) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stalled(cell: Cell) -> Iterator[None]:
+def _stalled(cell: LoadedCell) -> Iterator[None]:
     """A viewer that has begun to listen, and reads no more."""
     with tempfile.TemporaryDirectory() as folder:
         url = f"rerun+http://127.0.0.1:{cell.live_port}/proxy"
@@ -121,9 +121,9 @@ def _stalled(cell: Cell) -> Iterator[None]:
             yield
 
 
-def _asking(kind: str) -> Callable[[Cell], contextlib.AbstractContextManager[None]]:
+def _asking(kind: str) -> Callable[[LoadedCell], contextlib.AbstractContextManager[None]]:
     @contextlib.contextmanager
-    def asked(cell: Cell) -> Iterator[None]:
+    def asked(cell: LoadedCell) -> Iterator[None]:
         with asking(kind, cell.service.endpoint) as process:
             yield
             if process.poll() is not None:
@@ -137,7 +137,7 @@ class Load:
     """One of them: its name for people, and what puts it on."""
 
     what: str
-    put_on: Callable[[Cell], contextlib.AbstractContextManager[None]] = _nothing
+    put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[None]] = _nothing
     program: tuple[str, ...] = ("-m", "service")
 
 
@@ -228,7 +228,7 @@ def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[
             open_session(connect=[service.endpoint]) as session,
             asking("hands", service.endpoint),
         ):
-            cell = Cell(service, Client(session), port)
+            cell = LoadedCell(service, Client(session), port)
             until_following(cell.client)
             with load.put_on(cell):
                 before = cell.client.status()

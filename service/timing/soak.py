@@ -15,7 +15,7 @@ import numpy as np
 from service.client import Client, open_session
 from service.launch import launched
 from service.timing.loads import asking, until_following
-from service.timing.probes import family
+from service.timing.probe_processes import family
 
 LONGEST_PAUSE_S, FEWEST = 5.0, 60  # between samples, of samples
 WARM_UP = 0.2  # share of the time that is not counted

@@ -17,13 +17,13 @@ LETTERS, MARGIN = 44, 24
 
 def title(mode: int, reason: int) -> str:
     """Mode and reason in words: `hold: no hands`."""
-    said = Mode(mode).name.lower()
-    return f"{said}: {Reason(reason).name.lower().replace('_', ' ')}" if reason else said
+    name = Mode(mode).name.lower()
+    return f"{name}: {Reason(reason).name.lower().replace('_', ' ')}" if reason else name
 
 
 @functools.cache
 def banner(mode: int, reason: int) -> NDArray[np.uint8]:
-    """The picture (HEIGHT, WIDTH, 3) that says mode and reason."""
+    """The picture (HEIGHT, WIDTH, 3) that shows mode and reason."""
     image = Image.new("RGB", (WIDTH, HEIGHT), palette.MODES[Mode(mode)])
     draw, text, size = ImageDraw.Draw(image), title(mode, reason), LETTERS
     while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:

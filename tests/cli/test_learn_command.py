@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cell import thirdhand
 
-from service.demonstrations.files import write_demonstration
+from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations

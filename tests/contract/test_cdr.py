@@ -87,9 +87,9 @@ turns = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda turn: math.hypot(*t
 
 
 @st.composite
-def a_thing(draw: st.DrawFn) -> messages.Thing:
+def a_thing(draw: st.DrawFn) -> messages.SceneObject:
     turn = draw(turns)
-    return messages.Thing(
+    return messages.SceneObject(
         draw(st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=20)),
         draw(st.sampled_from(("box", "ball", "cylinder"))),
         draw(st.sampled_from(FRAMES)),
@@ -101,7 +101,7 @@ def a_thing(draw: st.DrawFn) -> messages.Thing:
 
 
 @given(stamps, st.lists(a_thing(), max_size=5, unique_by=lambda thing: thing.name))
-def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.Thing]) -> None:
+def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.SceneObject]) -> None:
     data = channels.THINGS.encode(stamp_ns, things)
     read = ROS.deserialize_cdr(data, channels.THINGS.type)
     assert bytes(ROS.serialize_cdr(read, channels.THINGS.type)) == data
@@ -125,7 +125,9 @@ def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: l
     ],
 )
 def test_a_thing_that_cannot_be_is_refused_in_words(change: dict[str, Any], error: str) -> None:
-    thing = messages.Thing("board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1))
+    thing = messages.SceneObject(
+        "board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1)
+    )
     with pytest.raises(messages.WireError, match=error):
         channels.THINGS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
     with pytest.raises(messages.WireError, match="a name of its own"):

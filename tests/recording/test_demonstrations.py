@@ -13,7 +13,7 @@ from test_recording import START_NS, at_ns, write
 
 from service.contract import cdr, channels, messages
 from service.contract.ros2msg import schema
-from service.demonstrations.files import iter_hands, read_demonstration, write_demonstration
+from service.demonstrations.demonstration_reader import iter_hands, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import RecordingError
 

@@ -22,9 +22,9 @@ from test_recording import SKILL, at_ns, state_after, ticks
 
 from service.config import Files, Settings
 from service.core.frame import Event, Record, Tick, encode
-from service.recording.client import Scribe
 from service.recording.protocol import pack, unpack
 from service.recording.recording import Recording
+from service.recording.scribe import Scribe
 
 SETTINGS = Settings(cell="hall/bench-1", rate_hz=50)
 

@@ -18,7 +18,7 @@ from service.contract.requests import encode_json
 KEY = "objects"
 
 
-class Things:
+class ObjectListener:
     """The newest that was told, noted; what is not understood is said, once until that changes."""
 
     def __init__(

@@ -20,7 +20,7 @@ MOST_WAITING = 256  # messages: half a second of commands
 CLOSED_WITHIN_S = 2.0
 
 
-class Ros2:
+class Ros2Domain:
     """The topics of a cell in a ROS 2 domain, with the liveliness tokens by which tools list them.
 
     `publish` is for the loop and never waits: what a thread that is behind cannot take is dropped.

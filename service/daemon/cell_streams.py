@@ -15,12 +15,12 @@ from service.contract import channels, ros2
 from service.contract.messages import WireError
 from service.core.frame import Event
 from service.daemon.input_monitor import Arrivals
-from service.daemon.ros2 import Ros2
+from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 
 
-class Streams:
+class CellStreams:
     """What a cell hears and says on a session, with a ROS 2 domain where its settings name one.
 
     `receive` and `publish` are for the loop; what came is told to `arrivals`, by channel.
@@ -48,7 +48,7 @@ class Streams:
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
-        self._ros2 = None if domain is None else Ros2(session, cell, domain, heard=heard, failed=failed)
+        self._ros2 = None if domain is None else Ros2Domain(session, cell, domain, heard=heard, failed=failed)
 
     def receive(self) -> list[Event]:
         """The newest message of each source, if it is new and can be read."""

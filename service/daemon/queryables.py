@@ -48,7 +48,7 @@ ORDERS = ("hold", "resume", "reset")
 COMPUTED = "teaching"  # the line of what the skill worker computes for
 
 
-class Pending:
+class PendingEvent:
     """An event on its way into the loop, and the tick that took it.
 
     Either the loop takes it or its asker gives it up, never both.
@@ -80,7 +80,7 @@ class Pending:
         return self._tick
 
 
-class Line:
+class RequestQueue:
     """Requests that wait for a thread of their own; beyond MOST_WAITING they are refused."""
 
     def __init__(self, name: str, answer: Callable[[str, zenoh.Query], None], failed: Callable[[str], None]) -> None:
@@ -109,7 +109,7 @@ class Line:
             item = None  # the asker is told of the end where its query is let go
 
 
-class Requests:
+class Queryables:
     """The queryables of one cell.
 
     What is known is answered where it comes in. Each of hold, resume and reset has a line of its
@@ -130,7 +130,7 @@ class Requests:
         keep: Callable[[bytes], object],
         failed: Callable[[str], None],
     ) -> None:
-        self.inbox: deque[Pending] = deque()
+        self.inbox: deque[PendingEvent] = deque()
         self._settings = settings
         self._skill, self._in_force = skill, in_force(skill)
         self._workshop = skill_worker
@@ -141,7 +141,7 @@ class Requests:
         self._keep = keep
         self._failed = failed
         self._saved = SavedViaPoints(settings)
-        self._lines = {name: Line(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
+        self._lines = {name: RequestQueue(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
@@ -229,7 +229,7 @@ class Requests:
         return Reply(tick, mode=mode, reason=reason, note=note)
 
     def _through_the_loop(self, event: Event) -> int:
-        pending = Pending(event)
+        pending = PendingEvent(event)
         self.inbox.append(pending)
         return pending.wait()
 

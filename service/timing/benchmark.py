@@ -23,7 +23,7 @@ from service.recording.recording import Recording
 from service.shipped import SHIPPED_SKILL, recordings
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
-from service.timing.probes import BenchError, echo, family, probe
+from service.timing.probe_processes import BenchError, echo, family, probe
 
 PROGRAM = ("-m", "service")
 PARTS = 6  # of the time: the empty loop before and after, the core before and after, the whole for two
