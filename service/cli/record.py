@@ -1,6 +1,4 @@
-"""`thirdhand record`: captures demonstrations from a running cell; shows, trims and
-deletes them.
-"""
+"""`thirdhand record`: captures demonstrations of a running cell; shows, trims and deletes them."""
 
 from __future__ import annotations
 
@@ -136,7 +134,7 @@ def _progress(line: str) -> None:
 
 
 class _Ended:
-    """Whether Enter was pressed; standard input that ends, or is another's, says nothing."""
+    """Whether Enter was pressed; standard input that ends, or is another's, is ignored."""
 
     def __init__(self) -> None:
         self._listens = True

@@ -81,9 +81,7 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Exit code 0 if every recorded frame is close enough; with `--exact`, if none is missing and
-    all are identical.
-    """
+    """Exit code 0 if all frames are close enough; with `--exact`, complete and identical."""
     counts = [Recording.open(path).ticks() for path in args.files]
     total = None if None in counts or args.after is not None else sum(filter(None, counts))
     with progress("replaying", total=total) as done:

@@ -117,9 +117,7 @@ class Capture:
 
     @property
     def streams(self) -> dict[str, list[Sample]]:
-        """The streams by which it is judged: both hands, and the tool as it is tracked, else the
-        arm's joints.
-        """
+        """The streams of both hands, and of the tool if it is tracked, else of the arm's joints."""
         return {key: self.samples[key] for key in (*HANDS, TOOL if self.samples[TOOL] else JOINT_STATES)}
 
     @property

@@ -1,6 +1,4 @@
-"""Demonstrations on disk, one file each (a take): their contents as text and as a picture;
-trimming.
-"""
+"""Demonstrations on disk, one file each (a take): shown as text or as a picture, trimmed."""
 
 from __future__ import annotations
 
@@ -171,9 +169,7 @@ def _blocks(speed: Vector) -> str:
 
 
 def draw(found: Summary, path: Path) -> None:
-    """Writes a picture of a take, a PNG: positions over time, gaps shaded, and a view
-    from above.
-    """
+    """Writes a picture of a take, a PNG: positions over time, gaps shaded, and from above."""
     from matplotlib.figure import Figure  # heavy, and most do without
 
     figure = Figure(figsize=(11, 6.5), layout="constrained", dpi=110)

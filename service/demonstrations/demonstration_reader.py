@@ -1,6 +1,4 @@
-"""Reads and writes demonstrations; those of others are brought to frame `base` and to common
-stamps.
-"""
+"""Reads and writes demonstrations; they are brought to frame `base` and to common stamps."""
 
 from __future__ import annotations
 
@@ -160,9 +158,7 @@ def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
 
 
 def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
-    """The words for a position of a stream, as published, that is too far from the base plate, and
-    the remedy.
-    """
+    """Words and remedy for a stream's position, as published, that is too far away."""
     if is_by_tracker(name, frame, hands):
         return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
     rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
@@ -251,9 +247,7 @@ def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
 
 
 class PoseStreams:
-    """Finds the topics of a file that are the wanted streams of a type; one topic each, in any
-    cell.
-    """
+    """Finds the topics of a file that hold the wanted streams; one topic each, in any cell."""
 
     def __init__(self, path: Path, names: tuple[str, ...], kind: str = POSE.type) -> None:
         self._path, self._names, self._kind = path, names, kind

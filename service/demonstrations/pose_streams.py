@@ -93,9 +93,7 @@ class Recorded:
 
     @classmethod
     def open(cls, path: str | Path) -> Recorded:
-        """The messages of an MCAP file, a bag's folder, a `.db3` or a `.bag`. Raises
-        RecordingError.
-        """
+        """The messages of an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
         path = Path(path)
         found = cls(path)
         if path.is_dir() or path.suffix in (".db3", ".bag"):
@@ -308,7 +306,7 @@ def _by_ending(recorded: Recorded, name: str) -> PoseTopic | None:
 
 
 def _by_words(recorded: Recorded, name: str) -> PoseTopic:
-    """The one stream whose name says so. Raises RecordingError."""
+    """The one stream with a fitting word in its name. Raises RecordingError."""
     others = {word for other in SIDES[:2] if other != name for word in WORDS[other]}
     streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
     words = {source: _words(str(source)) for source in streams}

@@ -1,6 +1,4 @@
-"""Writes MCAP files: profile `ros2`, small chunks with checksums, whole records even where the disk
-is full.
-"""
+"""Writes MCAP files: profile `ros2`, small checked chunks, whole records also on a full disk."""
 
 from __future__ import annotations
 
@@ -22,9 +20,7 @@ CHUNK_BYTES = 128 * 1024  # a kill loses at most this between two flushes; a rea
 
 
 class RecordingError(ExplainedError, ValueError):
-    """A file is not the recording that is needed; the message says which, why, and what
-    would do.
-    """
+    """A file is not the recording that is needed; the message says why, and what would be."""
 
 
 @functools.cache
@@ -154,9 +150,7 @@ class McapFile:
         self._pending = 0
 
     def lost_name(self) -> str:
-        """Empty while the file is at its path; else `removed`, or `moved` if it has
-        another name.
-        """
+        """Empty while the file is at its path; else `removed`, or `moved` to another name."""
         links, own_file = self._stream.links()
         with contextlib.suppress(OSError):
             found = os.stat(self.path)

@@ -1,6 +1,4 @@
-"""Reads MCAP files: verifies every checksum, reads up to where a file was cut, and continues behind
-damage.
-"""
+"""Reads MCAP files: verifies every checksum, reads up to a cut, continues behind damage."""
 
 from __future__ import annotations
 

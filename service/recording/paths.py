@@ -1,6 +1,4 @@
-"""The paths of a cell's recordings: the next ones' names, and which old ones are removed to keep
-within the limits.
-"""
+"""The paths of a cell's recordings: names for the next ones; old ones beyond the limits."""
 
 from __future__ import annotations
 
@@ -59,9 +57,7 @@ class RecordingPaths:
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
     def prune(self, writing: Path | None) -> list[Path]:
-        """Removes this cell's oldest recordings beyond the limits, never the one being written;
-        what was removed.
-        """
+        """The oldest recordings beyond the limits, now removed; never the one being written."""
         keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
         if self._folder is None or not (keep_bytes or keep_s):
             return []

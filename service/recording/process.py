@@ -160,9 +160,7 @@ class ScribeProcess:
             self._errors.clear()
 
     def report_kept(self) -> None:
-        """Sends a report if more is on disk: unreported ticks count as lost if this
-        process dies.
-        """
+        """Sends a report if more is on disk: unreported ticks count as lost if it dies."""
         if self._segments.kept != self._reported_kept:
             self.report()
 

@@ -1,6 +1,4 @@
-"""The messages between the control process and the scribe: its setup, one for each tick, notes, and
-its reports.
-"""
+"""The messages between control process and scribe: setup, ticks, notes and reports."""
 
 from __future__ import annotations
 

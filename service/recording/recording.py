@@ -95,9 +95,7 @@ class Recorder:
         return self._file.lost_name()
 
     def _begin(self, time_ns: int) -> None:
-        """Writes the robot's description and the initial state, at the time of the first
-        message.
-        """
+        """Writes the robot's description and the initial state, timed as the first message."""
         self._begun = True
         self._put("/robot_description", cdr.encode_string(with_markers(self._urdf)), time_ns, qos=_LATCHED)
         if self._state is not None:

@@ -280,9 +280,7 @@ class Scribe:
         return running
 
     def _listen(self, *, timeout_s: float) -> None:
-        """Reads the reports that have come; with its first one a process begins to
-        receive ticks.
-        """
+        """Reads the reports that have come; a process receives ticks from its first one on."""
         assert self._child is not None
         source = self._child.socket
         poll = select.poll()  # select() knows no descriptor above 1023

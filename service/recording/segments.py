@@ -60,9 +60,7 @@ class Segments:
 
     @property
     def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
-        """`starting` before there is a skill, `recording`, `interrupted`, or `drawing` where no
-        recording is wanted.
-        """
+        """`starting` before there is a skill; `drawing` where no recording is wanted."""
         if self._skill is None or not self._wanted:
             return "starting" if self._skill is None else "drawing"
         return "interrupted" if self._recorder is None else "recording"
@@ -74,9 +72,7 @@ class Segments:
             self._recorder = self._opened(state)
 
     def _opened(self, state: Record | None) -> Recorder | None:
-        """A new recording if it can be begun, with a new drawing beside it; the first drawing is
-        begun in any case.
-        """
+        """A new recording and drawing, if it can be begun; the first drawing begins in any case."""
         self._tried = time.monotonic()
         path, rrd = self._paths.next()
         self._wanted = path is not None
@@ -170,9 +166,7 @@ class Segments:
             self._recorder = None
 
     def _safely(self, act: Callable[[Recorder], None]) -> None:
-        """Does one thing with the recording. Where that fails the recording ends, and its pending
-        ticks are lost.
-        """
+        """Acts on the recording; where that fails it ends, and its pending ticks are lost."""
         recorder = self._recorder
         if recorder is None:
             return

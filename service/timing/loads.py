@@ -1,8 +1,7 @@
-"""What happens beside a loop in its days: each done to a running daemon, and to an empty loop in
-its place, for `thirdhand bench --loads`.
+"""Loads beside a running daemon, and beside an empty loop in its place, for `thirdhand bench
+--loads`.
 
-`python -m service.timing.loads KIND ENDPOINT` is the part of it that asks and publishes, a
-process of its own.
+`python -m service.timing.loads KIND ENDPOINT` is a process that sends requests or hands.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ sys.exit(main(sys.argv[1:]))
 
 
 class LoadError(ExplainedError):
-    """A load could not be put on; the message says what failed."""
+    """A load could not be applied; the message says why."""
 
 
 @dataclass(frozen=True)
 class LoadedCell:
-    """A running daemon, and what a load needs to reach it."""
+    """A running daemon under load, and what a load needs to reach it."""
 
     service: Launched
     client: Client
@@ -100,7 +99,7 @@ def _killed(cell: LoadedCell) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _full(cell: LoadedCell) -> Iterator[None]:
-    """The scribe's files may not grow any more, which fails as a full disk does."""
+    """Limits the size of the scribe's files, which fails as a full disk does."""
     pid, none = cell.scribe(), resource.RLIM_INFINITY
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, none))
     yield
@@ -110,7 +109,7 @@ def _full(cell: LoadedCell) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stalled(cell: LoadedCell) -> Iterator[None]:
-    """A viewer that has begun to listen, and reads no more."""
+    """A viewer that connects, and then stops reading."""
     with tempfile.TemporaryDirectory() as folder:
         url = f"rerun+http://127.0.0.1:{cell.live_port}/proxy"
         with _process([str(rerun_program()), "--save", str(Path(folder) / "live.rrd"), url]) as viewer:
@@ -134,7 +133,7 @@ def _asking(kind: str) -> Callable[[LoadedCell], contextlib.AbstractContextManag
 
 @dataclass(frozen=True)
 class Load:
-    """One of them: its name for people, and what puts it on."""
+    """A load: its name for people, and what applies it."""
 
     what: str
     put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[None]] = _nothing
@@ -142,7 +141,7 @@ class Load:
 
 
 def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
-    """Acts at a rate, or as fast as it can, until killed."""
+    """Calls `act` at a rate, or as fast as it can, until killed."""
     began, k = time.monotonic(), 0
     while True:
         with contextlib.suppress(RefusedError):
@@ -158,7 +157,7 @@ def _status(client: Client, session: Any) -> None:
 
 
 def _teaching(client: Client, session: Any) -> None:
-    """A place, taught over and over, a millimetre beside where it was."""
+    """Teaches one via-point over and over, alternating by a millimetre."""
     skill = shipped_skill()
     primitive = skill.primitive
     x = primitive.inputs[0].tolist()
@@ -203,9 +202,11 @@ LOADS = (
 
 
 def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """For each load what the daemon's loop misses and how late it is, for so many seconds, and the
-    same of an empty loop while all the rest goes on; and how much of what was recorded replays bit
-    for bit. Raises LoadError and LaunchError.
+    """A row for each load: missed deadlines and lateness of the daemon's loop over `seconds` [s],
+    the same of an empty loop under the same load, and how much of the recording replays bit for
+    bit.
+
+    Raises LoadError and LaunchError.
     """
     with tempfile.TemporaryDirectory() as name:
         skills = Path(name)
@@ -256,7 +257,7 @@ def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[
 
 
 def _let_others_first(pid: int) -> bool:
-    """Takes real-time scheduling from a daemon's loop; whether it had it."""
+    """Whether a daemon's loop had real-time scheduling, which is taken from it."""
     had = os.sched_getscheduler(pid) == os.SCHED_FIFO
     if had:
         os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
@@ -264,7 +265,7 @@ def _let_others_first(pid: int) -> bool:
 
 
 def until_following(client: Client) -> None:
-    """Waits until a daemon follows the hands, and a little more. Raises LoadError."""
+    """Waits until a daemon follows the hands, and SETTLE_S more. Raises LoadError."""
     until = time.monotonic() + 15.0
     while (now := client.status()).mode != "follow":
         if time.monotonic() > until:
@@ -274,7 +275,7 @@ def until_following(client: Client) -> None:
 
 
 def _large() -> bytes:
-    """The file of a skill of many points: the shipped one's over and over, a little beside."""
+    """The file of a skill of LARGE points: copies of the shipped skill's with noise."""
     skill = shipped_skill()
     inputs, reference = skill.primitive.inputs, skill.primitive.reference
     pick = np.arange(LARGE) % len(inputs)
@@ -293,7 +294,7 @@ def _large() -> bytes:
 
 @contextlib.contextmanager
 def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
-    """One of ASKING as a process of its own, which has begun. Raises LoadError."""
+    """One of ASKING as a running process of its own. Raises LoadError."""
     with _process([sys.executable, "-m", "service.timing.loads", kind, endpoint]) as process:
         assert process.stdout is not None
         if not process.stdout.readline():

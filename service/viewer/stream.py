@@ -139,9 +139,7 @@ class _Destination:
             self.put(list(self._dynamic.chunks(batch)))
 
     def _finish(self) -> None:
-        """Sends what is pending; to a file also its blueprint, now that the curves' range
-        is known.
-        """
+        """Sends what is pending; to a file also its blueprint, with the curves' ranges."""
         self.send()
         if self._open and not self._live and self._dynamic.end_s > 0:
             tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
@@ -293,9 +291,7 @@ class Viewer:
     def add(
         self, frame: Record, time_ns: int, timing: Record | None = None, events: Iterable[tuple[str, bytes]] = ()
     ) -> None:
-        """Draws a frame at a time [ns], and what its `events` (kind, bytes) say of arm
-        and skill.
-        """
+        """Draws a frame at a time [ns], and the arm and skill in its `events` (kind, bytes)."""
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):

@@ -102,16 +102,16 @@ def a_thing(draw: st.DrawFn) -> messages.SceneObject:
 
 @given(stamps, st.lists(a_thing(), max_size=5, unique_by=lambda thing: thing.name))
 def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.SceneObject]) -> None:
-    data = channels.THINGS.encode(stamp_ns, things)
-    read = ROS.deserialize_cdr(data, channels.THINGS.type)
-    assert bytes(ROS.serialize_cdr(read, channels.THINGS.type)) == data
+    data = channels.OBJECTS.encode(stamp_ns, things)
+    read = ROS.deserialize_cdr(data, channels.OBJECTS.type)
+    assert bytes(ROS.serialize_cdr(read, channels.OBJECTS.type)) == data
     assert [(item.ns, item.header.frame_id, item.scale.x) for item in read.markers] == [
         (thing.name, thing.frame_id, thing.size[0]) for thing in things
     ]
-    assert channels.THINGS.decode(data) == tuple(things)
+    assert channels.OBJECTS.decode(data) == tuple(things)
     if things:
         with pytest.raises(messages.WireError):
-            channels.THINGS.decode(data[: len(data) // 2])
+            channels.OBJECTS.decode(data[: len(data) // 2])
 
 
 @pytest.mark.parametrize(
@@ -129,9 +129,9 @@ def test_a_thing_that_cannot_be_is_refused_in_words(change: dict[str, Any], erro
         "board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1)
     )
     with pytest.raises(messages.WireError, match=error):
-        channels.THINGS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
+        channels.OBJECTS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
     with pytest.raises(messages.WireError, match="a name of its own"):
-        channels.THINGS.decode(channels.THINGS.encode(1, [thing, thing]))
+        channels.OBJECTS.decode(channels.THINGS.encode(1, [thing, thing]))
 
 
 @given(stamps, st.lists(finite, min_size=14, max_size=14))

@@ -239,11 +239,11 @@ def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill:
     controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
     tool, wanted = MeasuredTool(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
-    assert tool.told(controller.state) is None
+    assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))
-    np.testing.assert_allclose(tool.told(controller.state), wanted, atol=1e-4)
+    np.testing.assert_allclose(tool.position(controller.state), wanted, atol=1e-4)
     controller.step(Tick(200))
-    assert tool.told(controller.state) is None
+    assert tool.position(controller.state) is None
 
 
 def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
