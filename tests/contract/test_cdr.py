@@ -129,9 +129,9 @@ def test_a_thing_that_cannot_be_is_refused_in_words(change: dict[str, Any], erro
         "board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1)
     )
     with pytest.raises(messages.WireError, match=error):
-        channels.OBJECTS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
+        channels.OBJECTS.decode(channels.OBJECTS.encode(1, [thing._replace(**change)]))
     with pytest.raises(messages.WireError, match="a name of its own"):
-        channels.OBJECTS.decode(channels.THINGS.encode(1, [thing, thing]))
+        channels.OBJECTS.decode(channels.OBJECTS.encode(1, [thing, thing]))
 
 
 @given(stamps, st.lists(finite, min_size=14, max_size=14))
