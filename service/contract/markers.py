@@ -1,5 +1,5 @@
-"""Things on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
-Foxglove draw as it is. Of a marker, what a thing needs is kept: boxes, balls and cylinders.
+"""Objects on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
+Foxglove draw as it is. Only what an object needs is kept: boxes, ellipsoids and cylinders.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class _WholeWrites:
 class McapFile:
     """An MCAP file that is being written: profile `ros2`, zstd, small chunks.
 
-    Channels are made at their first message. Chunks end only at a call of `part_ends`, so that the
+    Channels are made at their first message. A chunk ends only at a call of `part_ends`, so the
     messages of one tick are kept or lost together. Errors of the file system are raised; the file
     then holds what was written before.
     """

@@ -331,8 +331,8 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     assert "example:" in done.stdout
 
 
-def test_the_client_in_the_readme_works(shared_daemon: Any) -> None:
-    code = (ROOT / "README.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
+def test_the_client_on_the_page_of_the_wire_works(shared_daemon: Any) -> None:
+    code = (ROOT / "docs" / "wire.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
     code = code.replace("tcp/127.0.0.1:7447", shared_daemon.endpoint)
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
