@@ -35,7 +35,7 @@ GROUPS = {
         "access",
     ),
     "Reference": ("settings", "wire", "incidents", "glossary"),
-    "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments"),
+    "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments", "evidence"),
 }
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from service.child import python
 from service.contract.explain import ExplainedError
-from service.recording.client import NOT_RECORDED
+from service.recording.scribe import NOT_RECORDED
 
 START_TIMEOUT_S, LONG_START_S = 180.0, 6.0
 STOP_TIMEOUT_S = 60.0
@@ -32,14 +32,14 @@ NO_BENCH = (
 
 
 class LaunchError(ExplainedError, RuntimeError):
-    """A daemon that did not start or did not end; the message says what it said."""
+    """A daemon did not start or did not end; the message has its output."""
 
 
 def check_bench() -> None:
     """Raises LaunchError where the bench cannot run here."""
     try:
         found = importlib.util.find_spec("pybullet")
-    except ValueError:  # as it says of a module that was put away on purpose
+    except ValueError:  # raised for a module that was removed from sys.modules on purpose
         found = None
     if found is None:
         raise LaunchError(NO_BENCH)
@@ -62,9 +62,9 @@ class Launched:
             raise LaunchError(f"the service did not end within {timeout_s:g} s of being asked to") from None
 
     def missing(self) -> str:
-        """What its recordings lack, by its last words; empty: nothing."""
-        said = self.log.read_text().splitlines()[-1:]
-        return "".join(line.split(maxsplit=2)[-1] for line in said if line.endswith(NOT_RECORDED))
+        """What its recordings lack, by the last line of its log; empty: nothing."""
+        last_lines = self.log.read_text().splitlines()[-1:]
+        return "".join(line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED))
 
 
 @contextlib.contextmanager
@@ -79,10 +79,9 @@ def launched(
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
-    Raises LaunchError.
-
-    Its configuration (with `network` for its door), log and saved via-points are in `folder`, its
-    recordings in `record` and its skills in `skills` where those are given.
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record` and its
+    skills in `skills`, where given. `network` is the section [network] of its configuration. Raises
+    LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
@@ -108,7 +107,7 @@ def launched(
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:
-    """Where a daemon says that it listens."""
+    """The endpoint at which a daemon listens, by its output. Raises LaunchError."""
     assert process.stdout is not None
     if not select.select([process.stdout], [], [], LONG_START_S)[0]:
         say("its first start on this machine compiles what the loop runs: about half a minute")
@@ -123,26 +122,24 @@ def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], No
 
 
 def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda line: None) -> str:
-    """The report of one run of the bench (`python -m sim` with the arguments) as JSON; it `say`s
-    how it goes.
-
-    Raises LaunchError.
+    """The report of one run of the bench (`python -m sim` with the arguments) as JSON; `say` is
+    called with its progress. Raises LaunchError.
     """
     command, environment = python("-m", "sim", "--connect", endpoint, "--once", "--json", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
     clock.start()
-    said: list[str] = []
+    lines: list[str] = []
     try:
         assert process.stderr is not None
         assert process.stdout is not None
         for line in process.stderr:
-            said.append(line.rstrip())
-            say(f"  {said[-1]}")
+            lines.append(line.rstrip())
+            say(f"  {lines[-1]}")
         report = process.stdout.read()
         if process.wait() != 0:
             raise LaunchError(
-                f"the bench ended with code {process.returncode}: {said[-1] if said else 'it gave no reason'}"
+                f"the bench ended with code {process.returncode}: {lines[-1] if lines else 'it gave no reason'}"
             )
     finally:
         clock.cancel()

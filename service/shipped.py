@@ -19,7 +19,7 @@ def recordings() -> Path:
 
 
 def shipped_skill() -> Skill:
-    """The skill that the service runs unless told otherwise."""
+    """The skill that the service runs by default."""
     from service.learning.skill_file import decoded  # heavy, and most commands do without
 
     path = recordings() / SHIPPED_SKILL

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.config import Settings
-from service.contract.messages import BASE, Thing
+from service.contract.messages import BASE, SceneObject
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
@@ -303,7 +303,7 @@ class Bench:
             carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
         self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
 
-    def things(self) -> tuple[Thing, ...]:
+    def things(self) -> tuple[SceneObject, ...]:
         """What lies on the bench or is held, as viewers draw it: what the arm holds in the frame of
         its plate, all else in base.
         """
@@ -312,7 +312,7 @@ class Bench:
             holder, grip = self._held.get(body, (None, None))
             held = grip is not None and holder == self.world.arm
             frame, pose = (self._plate, grip) if held and grip else (BASE, self.world.pose(body))
-            found.append(Thing(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
+            found.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
         return tuple(found)
 
     def _held_by_arm(self) -> list[int]:

@@ -22,7 +22,7 @@ from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
-from service.demonstrations.files import write_demonstration
+from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
 from sim import sessions
 from sim.people import Places

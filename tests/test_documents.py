@@ -1,6 +1,5 @@
-"""The manual for incidents tells of every mode, reason, flag and counter; the table of faults names
-tests that are there and the figures that were measured. The tables of the wire and of ROS 2's
-topics are the table of channels.
+"""The pages agree with the code: incidents, faults with their figures, tests behind promises, the
+wire, ROS 2 topics. Their prose is short, and words that the glossary retires do not come back.
 """
 
 from __future__ import annotations
@@ -8,8 +7,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from service.config import Settings, robot_description
 from service.contract import incidents, requests, ros2
@@ -17,8 +18,8 @@ from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm.arm import Arm
-from service.recording.client import Scribe
-from service.viewer.blueprint import curves
+from service.recording.scribe import Scribe
+from service.viewer.blueprint import plot_views
 from support.paths import ROOT
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
@@ -66,7 +67,7 @@ def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
 
 
 def test_each_view_that_a_document_names_by_its_title_is_there() -> None:
-    titles = {view.title for view in curves(Settings()).values()}
+    titles = {view.title for view in plot_views(Settings()).values()}
     for name in ("incidents.md", "viewing.md"):
         text = (ROOT / "docs" / name).read_text(encoding="utf-8")
         told = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
@@ -87,24 +88,30 @@ def test_the_table_of_signs_is_the_arms() -> None:
     assert f"{arm.at(np.zeros(7)).position[2]:.3f} m above" in text
 
 
-def rows_of_faults() -> list[list[str]]:
-    """The cells of each row of the tables of faults."""
-    lines = (line for line in FAULTS.splitlines() if line.startswith("| ") and not line.startswith("| fault |"))
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+def cells_below(text: str, head: str) -> list[list[str]]:
+    """The cells of each row of all tables in a text whose first column has this head."""
+    tables = re.findall(rf"^\| {head} \|.*\n\|---.*\n((?:\|.*\n?)+)", text, flags=re.MULTILINE)
+    return [[cell.strip() for cell in row.strip("|").split("|")] for rows in tables for row in rows.splitlines()]
 
 
-def test_each_fault_names_a_test_that_is_there() -> None:
-    rows = rows_of_faults()
-    assert len(rows) >= len(MEASURED) + 10
-    for *_, tests in rows:
-        named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", tests)
-        assert named, tests
+@pytest.mark.parametrize(
+    ("page", "head", "least"), [("faults.md", "fault", len(MEASURED) + 10), ("bounds.md", "bound", 10)]
+)
+def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(page: str, head: str, least: int) -> None:
+    promises = [row[0] for row in cells_below((ROOT / "docs" / page).read_text(encoding="utf-8"), head)]
+    rows = cells_below((ROOT / "docs" / "evidence.md").read_text(encoding="utf-8"), head)
+    assert [row[0] for row in rows] == promises
+    assert len(rows) >= least
+    for promise, tests in rows:
+        named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", tests)
+        assert named, promise
         for file, test in named:
-            assert f"\ndef {test}(" in (ROOT / file).read_text(encoding="utf-8"), f"{file}::{test}"
+            text = (ROOT / file).read_text(encoding="utf-8")
+            assert re.search(rf"^(def|class) {test}\b" if test else r"^def test_|^Test", text, re.MULTILINE), tests
 
 
 def test_each_fault_has_the_figures_that_were_measured() -> None:
-    rows = {row[0]: row[2:6] for row in rows_of_faults() if len(row) == 7}
+    rows = {row[0]: row[2:6] for row in cells_below(FAULTS, "fault") if len(row) == 6}
     assert set(rows) == set(MEASURED)
     for name, one in MEASURED.items():
         figures = (one.get(key) for key in ("hold_ms", "rest_ms", "travelled_mm", "lost_ticks"))
@@ -163,3 +170,63 @@ def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() 
         return panels(part["first"]) | panels(part["second"]) if isinstance(part, dict) else {str(part)}
 
     assert panels(layout["layout"]) == set(layout["configById"])
+
+
+# In the code still, and being replaced: once one is gone, it belongs into the glossary's table.
+RETIRING = ("survey", "repose", "paces", "LEVER", "COMES", "LEAVES", "rehearse", "FASTEST")
+
+
+def with_word(word: str) -> list[str]:
+    """Sources and pages, but the glossary, that hold a whole word."""
+    pattern = re.compile(rf"(?<!\w){re.escape(word)}" + r"(?!\w)" * word[-1].isalnum())
+    folders = (ROOT / name for name in ("service", "kmp", "sim", "docs", "examples"))
+    files = [path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".md", ".html")]
+    pages = [path for path in (*files, ROOT / "README.md") if path.name != "glossary.md"]
+    return [str(path.relative_to(ROOT)) for path in pages if pattern.search(path.read_text(encoding="utf-8"))]
+
+
+def test_a_word_that_the_glossary_retires_does_not_come_back() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    retired = [word for row in cells_below(text, "retired") for word in re.findall(r"`([^`]+)`", row[0])]
+    assert len(retired) >= 20
+    assert {word: found for word in retired if (found := with_word(word))} == {}
+    assert not set(retired) & set(RETIRING)
+    assert [word for word in RETIRING if not with_word(word)] == [], "gone: move it to the table in docs/glossary.md"
+
+
+def sentences(page: Path) -> list[str]:
+    """The sentences of a page's prose and lists, without tables, headings and code."""
+    text = re.sub(r"^```.*?^```$|<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = "\n".join(line for line in text.splitlines() if not line.startswith(("|", "#", "!", "    ")))
+    blocks = re.split(r"\n\s*\n|^\s*(?:[*-]|\d+\.) ", text, flags=re.MULTILINE)
+    return [
+        one for block in blocks for one in re.split(r"(?<=[.!?])\s+(?=`|\W*[A-Z\d])", " ".join(block.split())) if one
+    ]
+
+
+# All but the log of changes.
+PAGES = sorted(
+    path
+    for folder in (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
+    for path in folder.glob("*.md")
+    if path.name != "CHANGELOG.md"
+)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_sentences_of_a_page_have_25_words_on_average_at_most(page: Path) -> None:
+    words = [len(sentence.split()) for sentence in sentences(page)]
+    assert sum(words) <= 25 * len(words), f"{sum(words) / len(words):.1f} words a sentence"
+
+
+def test_the_readme_is_read_in_five_minutes_and_the_data_flow_is_drawn_once() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+    drawn = [page.name for page in PAGES if "Tick(index, inbox)" in page.read_text(encoding="utf-8")]
+    assert drawn == ["how-it-works.md"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_prose_has_lines_of_100_characters_at_most(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    assert [line for line in text.splitlines() if len(line) > 100 and not line.startswith(("|", "!", "<!--"))] == []

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.timing import bench
+from service.timing import benchmark
 
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
@@ -61,16 +61,16 @@ def complaints(report: dict[str, Any]) -> list[str]:
 
 
 def test_the_loop_keeps_its_time() -> None:
-    report = bench.run(RATE_HZ, SECONDS)
+    report = benchmark.run(RATE_HZ, SECONDS)
     if complaints(report):
         print(f"measured again: {complaints(report)}", file=sys.stderr)
-        report = bench.run(RATE_HZ, SECONDS)
-    assert not complaints(report), bench.text(report)
+        report = benchmark.run(RATE_HZ, SECONDS)
+    assert not complaints(report), benchmark.text(report)
     assert report["whole"]["latency_ms"]["p50"] > 0
     assert report["whole"]["round_trip_ms"]["p50"] > 0
 
 
 @pytest.mark.parametrize("thread", [False, True], ids=["a millisecond of work", "a busy thread"])
 def test_what_breaks_it_is_found(thread: bool) -> None:
-    report = bench.run(RATE_HZ, SECONDS / 2, program=("-c", PLANTED.format(thread=thread)))
-    assert complaints(report), bench.text(report)
+    report = benchmark.run(RATE_HZ, SECONDS / 2, program=("-c", PLANTED.format(thread=thread)))
+    assert complaints(report), benchmark.text(report)

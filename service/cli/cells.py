@@ -1,4 +1,4 @@
-"""`thirdhand cells`: the daemons on a network, and what each does."""
+"""`thirdhand cells`: the daemons on a network, and the status of each."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import msgspec
 
 from service.cli.clients import reached
 from service.client import Cell
-from service.client import cells as found
+from service.client import cells as served_cells
 
 
 def cells(args: argparse.Namespace) -> int:
     """Exit code 0 if any daemon is alive, 1 if none is."""
     with reached(args) as session:
-        there = found(session)
+        served = served_cells(session)
     if args.json:
-        print(msgspec.json.format(msgspec.json.encode([cell._asdict() for cell in there])).decode())
-    elif there:
-        width = max(len(cell.name) for cell in there)
-        for cell in there:
-            print(f"{cell.name:<{width}}  {said(cell)}")
-    if not there:
+        print(msgspec.json.format(msgspec.json.encode([cell._asdict() for cell in served])).decode())
+    elif served:
+        width = max(len(cell.name) for cell in served)
+        for cell in served:
+            print(f"{cell.name:<{width}}  {description(cell)}")
+    if not served:
         print("thirdhand cells: no daemon is alive on this network", file=sys.stderr)
-    return 0 if there else 1
+    return 0 if served else 1
 
 
-def said(cell: Cell) -> str:
-    """What a daemon does, in a line."""
+def description(cell: Cell) -> str:
+    """A daemon's status in one line."""
     now = cell.status
     if now is None:
-        return f"alive as Zenoh session {cell.session}, and does not tell its status"
+        return f"alive as Zenoh session {cell.session}, but without a status"
     mode = now.mode + (f" ({now.reason})" if now.reason else "")
     hands = ", ".join(now.hand_age_ms) or "no hands"
     return f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"

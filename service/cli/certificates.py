@@ -1,5 +1,5 @@
-"""`thirdhand certificates`: a small authority of one's own, a certificate for each role, and more
-by the same authority.
+"""`thirdhand certificates`: a small authority of one's own, a certificate for each role, and
+further certificates by the same authority.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def certificates(args: argparse.Namespace) -> int:
 
 
 def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """An authority, its key in the folder."""
+    """A new authority, its key written to the folder."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("thirdhand authority")
     authority = (
@@ -75,7 +75,7 @@ def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.Ellipt
 
 
 def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """The authority that this command made in a folder before. Raises ExplainedError."""
+    """The authority that this command made in the folder before. Raises ExplainedError."""
     try:
         key = serialization.load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
         beside = next(iter(sorted(folder.glob(f"*/{AUTHORITY}"))), folder / DAEMON / AUTHORITY)
@@ -95,7 +95,7 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
 
 
 def _free_name(folder: Path, role: str, wanted: str | None) -> str:
-    """A name that no certificate of the role had: who is revoked by name stays so."""
+    """A name that no certificate of the role had before, so that a revoked name stays revoked."""
     taken = {path.name for path in folder.iterdir()}
     if role != DAEMON and (folder / GIVEN).exists():  # also those that were moved to their machines
         taken |= set((folder / GIVEN).read_text(encoding="utf-8").split())
@@ -112,9 +112,10 @@ def _free_name(folder: Path, role: str, wanted: str | None) -> str:
 def _write(
     folder: Path, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey, *, hosts: list[str], days: int
 ) -> datetime.datetime:
-    """A folder, named as its holder, with certificate, key and the authority's certificate, all
-    private to their user; until when it is valid. A daemon's or router's is for what clients reach
-    as `hosts`.
+    """The end of the validity of a certificate, which is written with its key and the authority's
+    certificate to a folder named as its holder, private to its user.
+
+    A daemon's or router's is valid for `hosts`.
     """
     record = os.open(folder.parent / GIVEN, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(record, "a", encoding="utf-8") as given:
@@ -139,7 +140,7 @@ def _write(
 
 
 def now() -> datetime.datetime:
-    """The time by which certificates are made."""
+    """The current time in UTC."""
     return datetime.datetime.now(datetime.UTC)
 
 

@@ -19,7 +19,7 @@ from service.contract.incidents import in_brief, remedy
 
 
 def via_points(args: argparse.Namespace) -> int:
-    """Exit code 0 once the daemon has carried it out."""
+    """Exit code 0 once the daemon has carried out the request."""
     request: Any = {"op": args.action}
     if args.action == "remove":
         request["names"] = args.names
@@ -27,7 +27,7 @@ def via_points(args: argparse.Namespace) -> int:
         request = _add(args)
     with reached(args) as session:
         client = Client(session, args.cell)
-        there = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
+        before = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
         reply = client.ask("via_points", request)
     for point in reply["points"]:
         tool = " ".join(f"{v:.3f}" for v in point["tool"])
@@ -39,7 +39,7 @@ def via_points(args: argparse.Namespace) -> int:
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
-    if replaced := [point["name"] for point in there if point["name"] in _names(request)]:
+    if replaced := [point["name"] for point in before if point["name"] in _names(request)]:
         print(f"replaced, as there was one of this name: {', '.join(replaced)}")
     for warning in reply.get("warnings", ()):
         print(f"warning: {warning}", file=sys.stderr)
@@ -47,7 +47,7 @@ def via_points(args: argparse.Namespace) -> int:
 
 
 def _names(request: Any) -> list[str]:
-    """Of the via-points that a request adds."""
+    """The names of the via-points that a request adds."""
     if isinstance(request, requests.Add):
         return [point.name for point in request.points]
     return [point["name"] for point in request["points"]]
@@ -57,17 +57,17 @@ def _add(args: argparse.Namespace) -> Any:
     if args.file:
         return added_in(Path(args.file))
     if args.here and args.name:
-        for name, place in still(args).items():
-            setattr(args, name, getattr(args, name) or place)
+        for name, position in still(args).items():
+            setattr(args, name, getattr(args, name) or position)
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError("a name, and --here or --left, --right and --tool, are needed, or --file")
-    told = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
-    point = {"name": args.name, **{k: getattr(args, k) for k in told}}
+    fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
+    point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
 
 
 def hold(args: argparse.Namespace) -> int:
-    """Exit code 0 once the arm is told to stop, resume or reset; tells the mode that resulted."""
+    """Exit code 0 once hold, resume or reset is in force; prints the mode that resulted."""
     reply = ask(args, args.command)
     mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
     print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
@@ -80,10 +80,7 @@ resume = reset = hold
 
 
 def reached(args: argparse.Namespace) -> zenoh.Session:
-    """A session to where a command line says that a daemon or router is.
-
-    Raises UnreachableError.
-    """
+    """A session to the daemon or router that the command line names. Raises UnreachableError."""
     return open_session(
         connect=args.connect or (),
         otherwise=[ENDPOINT],
@@ -94,6 +91,6 @@ def reached(args: argparse.Namespace) -> zenoh.Session:
 
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
-    """The reply to one request, as it came. Raises UnreachableError and RefusedError."""
+    """The reply to one request, as received. Raises UnreachableError and RefusedError."""
     with reached(args) as session:
         return Client(session, args.cell).ask(suffix, request)

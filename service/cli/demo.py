@@ -26,13 +26,13 @@ from service.report.report import Report, why_missed
 from service.report.report import report as report_of
 
 START_TIMEOUT_S = 60.0
-AFTER_S = 1.0  # that is looked at behind the nearest that the tool came
-PLACES = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # at which the events are to be
+AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
+PLACES = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # via-points of the events
 EVENTS = {"handover": "board handed over", "grasp": "magnifying glass fetched", "carry": "glass held over the board"}
 
 
 class DemoError(ExplainedError):
-    """The demonstration could not be run; the message says what failed."""
+    """The demo could not be run; the message says what failed."""
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -92,7 +92,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 
 
 def _why(found: Report, begun_s: float, events: dict[str, Any], name: str) -> str:
-    """Why an event was missed: what the recording tells from the event before it until after it."""
+    """Why an event was missed, by the recording from the event before it on."""
     names = list(events)
     before = [events[one]["time_s"] for one in names[: names.index(name)]]
     until_s = events[name]["time_s"] + AFTER_S

@@ -1,4 +1,4 @@
-"""`thirdhand via-points add NAME --here`: hands and tool as a running daemon sees them."""
+"""`thirdhand via-points add NAME --here`: the positions of hands and tool by a running daemon."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 
-STILL_S, STILL_M = 1.0, 0.015  # so long they move no more than that
-OLDEST_MS, TIMEOUT_S, POLL_S = 200.0, 30.0, 0.05
+STILL_S, STILL_M = 1.0, 0.015  # still: no more motion than STILL_M over STILL_S
+OLDEST_MS = 200.0  # of a hand
+TIMEOUT_S, POLL_S = 30.0, 0.05
 
 
 class NotHereError(ExplainedError, RuntimeError):
-    """Hands or tool cannot be taken as they are now."""
+    """The positions of hands or tool are not known, or do not hold still."""
 
 
 def still(args: argparse.Namespace) -> dict[str, list[float]]:
-    """Where hands and tool are [m] once they hold still, but for what the arguments say: the tool
-    as measured where the arm tells its joints, else as commanded.
+    """The positions of hands and tool [m] that the arguments do not give, once they hold still.
 
-    Raises NotHereError where they are not seen, or move, for too long.
+    The tool's is measured where the arm publishes its joints, else commanded. Raises NotHereError
+    where hands or tool are not seen, or move, for TIMEOUT_S.
     """
     wanted = [name for name in (*SIDES, "tool") if not getattr(args, name)]
     print(
@@ -44,8 +45,8 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
             if lacking:
                 seen.clear()
             else:
-                places = {**now["hands_m"], "tool": now["tool_measured_m"] or now["tool_m"]}
-                seen.append((at_s, {name: places[name] for name in wanted}))
+                positions = {**now["hands_m"], "tool": now["tool_measured_m"] or now["tool_m"]}
+                seen.append((at_s, {name: positions[name] for name in wanted}))
                 while any(math.dist(seen[0][1][name], seen[-1][1][name]) > STILL_M for name in wanted):
                     seen.pop(0)
                 if at_s - seen[0][0] >= STILL_S:
@@ -56,7 +57,7 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
 
 
 def _not_seen(status: dict[str, Any], wanted: list[str]) -> str:
-    """What of the hands and the tool is not known now, in words; empty: all is."""
+    """The first of the wanted positions that is not known now, in words; empty: all are."""
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
         if age_ms is None or age_ms > OLDEST_MS:

@@ -1,8 +1,8 @@
-"""The page of `thirdhand view live --web`: mode and reason, hold, resume and reset as buttons, and
-Rerun's web viewer, all behind one address.
+"""The page of `thirdhand view live --web`: mode and reason, buttons for hold, resume and reset, and
+Rerun's web viewer, all at one address.
 
-The viewer's program and the daemon's stream are passed on from where they are on this machine. A
-request that changes something needs the token in the page, which no other site can read.
+It is a proxy for the viewer's server and the daemon's stream on this machine. A request that
+changes something needs the token in the page, which no other site can read.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from service.contract import channels
 from service.contract.explain import ExplainedError
 
 ORDERS = ("hold", "resume", "reset")
-STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # what a viewer asks of the daemon's stream
+STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
 PIECE = 64 * 1024
-MOST_ASKED = 4096  # bytes of a request's body
+MOST_BODY = 4096  # bytes of a request
 TIMEOUT_S = 10.0
 START_S = 15.0
-_FOREIGN = re.compile(r"<link\b[^>]*https:[^>]*>")  # what the viewer's page would fetch from elsewhere
+_FOREIGN = re.compile(r"<link\b[^>]*https:[^>]*>")  # links of the viewer's page to other sites
 _DROPPED = {"connection", "keep-alive", "transfer-encoding", "content-length", "date", "server"}
 
 
 class Address(NamedTuple):
-    """Where something listens."""
+    """Host and port of a server."""
 
     host: str
     port: int
@@ -51,7 +51,7 @@ class Address(NamedTuple):
 
 
 class Latest:
-    """The newest status of the daemon, and how old it is."""
+    """The newest status of the daemon, and its age."""
 
     def __init__(self, session: zenoh.Session, cell: str, first: dict[str, Any]) -> None:
         self._status, self._at = first, time.monotonic()
@@ -61,8 +61,8 @@ class Latest:
         with contextlib.suppress(ValueError):
             self._status, self._at = json.loads(sample.payload.to_bytes()), time.monotonic()
 
-    def told(self) -> dict[str, Any]:
-        """Mode, reason, its cause and what to do about it, age [s], and the rest in one line."""
+    def summary(self) -> dict[str, Any]:
+        """Mode, reason, cause, remedy, age [s], and further facts in one line."""
         now = self._status
         hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now["hand_age_ms"].items())
         near = f"{100 * now['hand_distance_m']:.0f} cm to the nearest, " if hands else ""
@@ -95,42 +95,42 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         super().__init__(*args)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Says nothing of each request."""
+        """Logs nothing."""
 
     def do_GET(self) -> None:
         if self._is_foreign():
-            return self._say(403, "This page is for this machine's own address, not for another name.")
+            return self._respond(403, "This page is for this machine's own address, not for another name.")
         path = urlsplit(self.path).path
         if path == "/":
-            return self._say(200, self._page.html(self.headers["Host"]), kind="text/html; charset=utf-8")
+            return self._respond(200, self._page.html(self.headers["Host"]), kind="text/html; charset=utf-8")
         if path == "/status":
-            return self._say(200, json.dumps(self._page.latest.told()), kind="application/json")
+            return self._respond(200, json.dumps(self._page.latest.summary()), kind="application/json")
         if path.startswith("/viewer/"):
             return self._pass_on(self._page.viewer, "GET", path.removeprefix("/viewer"), None)
-        return self._say(404, "There is nothing of this name.")
+        return self._respond(404, "There is nothing of this name.")
 
     def do_POST(self) -> None:
         size = self.headers.get("Content-Length", "0")
-        body = self.rfile.read(int(size)) if size.isdecimal() and int(size) <= MOST_ASKED else None
+        body = self.rfile.read(int(size)) if size.isdecimal() and int(size) <= MOST_BODY else None
         if body is None:
             self.close_connection = True
-            return self._say(413, f"A body of at most {MOST_ASKED} bytes is accepted.")
+            return self._respond(413, f"A body of at most {MOST_BODY} bytes is accepted.")
         if self._is_foreign():
-            return self._say(403, "This page is for this machine's own address, not for another name.")
+            return self._respond(403, "This page is for this machine's own address, not for another name.")
         if self.path == STREAM:
             return self._pass_on(self._page.stream, "POST", self.path, body)
         name = self.path.removeprefix("/")
         if name not in ORDERS:
-            return self._say(404, "There is nothing of this name.")
+            return self._respond(404, "There is nothing of this name.")
         if not hmac.compare_digest(self.headers.get("X-Thirdhand-Token", ""), self._page.token):
-            return self._say(403, "The token of the page is needed: load it anew.")
+            return self._respond(403, "The token of the page is needed: load it anew.")
         try:
-            return self._say(200, self._page.order(name))
+            return self._respond(200, self._page.order(name))
         except ExplainedError as error:
-            return self._say(502, f"{name} was NOT carried out: {error}")
+            return self._respond(502, f"{name} was NOT carried out: {error}")
 
     def _is_foreign(self) -> bool:
-        """Whether another site asks, or by a name that somebody may have made point here."""
+        """Whether the request is from another site, or to another host's name."""
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return True
@@ -140,7 +140,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         except ValueError:
             return True
 
-    def _say(self, code: int, text: str, *, kind: str = "text/plain; charset=utf-8", within: str = "'none'") -> None:
+    def _respond(
+        self, code: int, text: str, *, kind: str = "text/plain; charset=utf-8", within: str = "'none'"
+    ) -> None:
         data = text.encode()
         self.send_response(code)
         for name, value in (
@@ -155,20 +157,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def _pass_on(self, to: Address, method: str, path: str, body: bytes | None) -> None:
-        """The answer of another server of this machine, piece by piece as it comes."""
-        asked = {name: value for name, value in self.headers.items() if name.lower() not in ("host", "origin")}
+        """Passes on the answer of another server of this machine, piece by piece."""
+        headers = {name: value for name, value in self.headers.items() if name.lower() not in ("host", "origin")}
         connection = http.client.HTTPConnection(to.host, to.port, timeout=None if body else TIMEOUT_S)
         try:
-            connection.request(method, path, body, asked)
+            connection.request(method, path, body, headers)
             answer = connection.getresponse()
         except OSError as error:
             connection.close()
-            return self._say(502, f"{to} does not answer: {error}")
+            return self._respond(502, f"{to} does not answer: {error}")
         with contextlib.closing(connection), contextlib.suppress(OSError, http.client.HTTPException):
             if path == "/":
                 host = self.headers["Host"]
                 text = _FOREIGN.sub("", answer.read().decode())
-                return self._say(answer.status, text, kind="text/html; charset=utf-8", within=f"http://{_aside(host)}")
+                return self._respond(
+                    answer.status, text, kind="text/html; charset=utf-8", within=f"http://{_other_name(host)}"
+                )
             self.send_response(answer.status)
             for name, value in answer.getheaders():
                 if name.lower() not in _DROPPED:
@@ -182,15 +186,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return None
 
 
-def _aside(host: str) -> str:
-    """The other name of this machine, with the port."""
+def _other_name(host: str) -> str:
+    """The host with this machine's other name, `localhost` or 127.0.0.1."""
     name, _, port = host.rpartition(":")
     other = {"127.0.0.1": "localhost", "localhost": "127.0.0.1"}.get(name)
     return f"{other}:{port}" if other else host
 
 
 class LivePage:
-    """The page's server; `address` says where it listens. Raises OSError where that cannot be."""
+    """The page's server, which listens at `address`. Raises OSError where it cannot."""
 
     def __init__(
         self, listen: Address, *, client: Client, latest: Latest, cell: str, stream: Address, viewer: Address
@@ -205,15 +209,15 @@ class LivePage:
     def html(self, host: str) -> str:
         """The page, for a browser that reaches it by this host and port.
 
-        The viewer is fetched by this machine's other name where it has one: from another site, so
-        that browsers run it in a process of its own, and the buttons answer however busy it is.
+        The viewer is loaded under this machine's other name if it has one. For the browser that is
+        another site, which runs in a process of its own, so that the buttons always respond.
         """
-        aside = _aside(host)
-        url = quote(f"rerun+http://{aside}/proxy", safe="")
+        viewer_host = _other_name(host)
+        url = quote(f"rerun+http://{viewer_host}/proxy", safe="")
         fields = {
             "__CELL__": html.escape(self._cell),
             "__TOKEN__": self.token,
-            "__VIEWER__": f"http://{aside}/viewer/?url={url}&amp;hide_welcome_screen=1&amp;persist=false&amp;theme=dark",
+            "__VIEWER__": f"http://{viewer_host}/viewer/?url={url}&amp;hide_welcome_screen=1&amp;persist=false&amp;theme=dark",
         }
         text = self._template
         for name, value in fields.items():
@@ -221,12 +225,12 @@ class LivePage:
         return text
 
     def order(self, name: str) -> str:
-        """Has the daemon hold, resume or reset; what came of it. Raises ExplainedError."""
+        """The result of hold, resume or reset, in words. Raises ExplainedError."""
         reply = self._client.ask(name)
         return f"{name} in force since tick {reply['tick']}"
 
     def serve(self) -> None:
-        """Answers until `close`."""
+        """Serves until `close`."""
         self._server.serve_forever(poll_interval=0.1)
 
     def close(self) -> None:
@@ -237,8 +241,8 @@ class LivePage:
 
 @contextlib.contextmanager
 def web_viewer(program: Path, stream: str, port: int) -> Iterator[Address]:
-    """Rerun's web viewer, served by its own program on a port of this machine, while the context
-    lasts. Raises OSError where it does not start.
+    """The address of Rerun's web viewer, served by its own program on a port of this machine while
+    the context lasts. Raises OSError where it does not start.
     """
     command = [str(program), "--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), stream]
     viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

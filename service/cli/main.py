@@ -1,9 +1,7 @@
-"""The command line: what each command takes, and which module carries it out.
+"""The command line: the options of each command, and the module that runs it.
 
-Errors go to standard error.
-
-Exit 1 is a failure, 2 bad usage. A command's module is imported only when that command runs: they
-are heavy.
+Errors go to standard error. Exit code 1 is a failure, 2 bad usage. A command's module is imported
+only when that command runs, because imports are slow.
 """
 
 from __future__ import annotations
@@ -39,17 +37,17 @@ RUN_BY = {
     "reset": "cli.clients",
     "cells": "cli.cells",
     "view": "cli.view",
-    "report": "cli.report",
+    "report": "cli.report_command",
     "certificates": "cli.certificates",
-    "bench": "timing.bench",
+    "bench": "timing.benchmark",
 }
 SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
-PUT_AWAY_FIRST = ("demo", "bench", "view", "record")  # what they started or wrote for a while, before Ctrl-C ends them
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """The parser of the command line."""
     top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
@@ -146,7 +144,7 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "replay",
         "Runs the core on a recording, or on several that follow each other, and compares every frame. What is missing "
-        "or damaged is said; only --exact fails for it.",
+        "or damaged is listed; only --exact fails for it.",
         "thirdhand replay recordings/golden.mcap --exact",
     )
     c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording, and those that follow it")
@@ -163,7 +161,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "report",
-        "What recordings tell: what they lack, modes and reasons, faults and what led to them, promptness, closest "
+        "A report of recordings: what they lack, modes and reasons, faults and what led to them, promptness, closest "
         "approach, places, limits, rejections. Several are set side by side.",
         "thirdhand report thirdhand-demo/*.mcap --html report.html",
     )
@@ -203,7 +201,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         type=Path,
         help="where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
-        "do not tell: then it is learned between them, and holds wherever they are",
+        "do not hold it: then the skill is learned between them, and holds wherever they are",
     )
     c.add_argument("--points", metavar="N", type=_count, default=200, help="of the reference (default: %(default)s)")
     c.add_argument("--ell", metavar="L", type=_positive, help="of the kernel [1/m²] (default: chosen; mixture: 5)")
@@ -271,7 +269,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--name", metavar="ROLE-N", help="of that one, like tracker-2 (default: the first that is free)")
     c.add_argument("--days", metavar="N", type=int, default=3650, help="that they are valid (default: %(default)s)")
 
-    # whatever follows is for `python -m sim`, so none of it is an option here, --help neither
+    # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
     c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
     c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
@@ -300,7 +298,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Version(argparse.Action):
-    """Prints the version: of the installed distribution, whose metadata only this reads."""
+    """Prints the version of the installed distribution."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         print(f"thirdhand {metadata.version('thirdhand')}")
@@ -362,15 +360,15 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     module, function = args.run.rsplit(".", 1)
     try:
-        if "cell" in args and args.cell is not None:  # a wildcard would reach every cell
+        if "cell" in args and args.cell is not None:  # also rejects a wildcard, which would reach every cell
             check_cell(args.cell)
         run = getattr(importlib.import_module(f"service.{module}"), function)
-        with interrupt.put_away_first() if args.command in PUT_AWAY_FIRST else contextlib.nullcontext():
+        with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
     except UsageError as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # whoever read has seen enough
+    except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:

@@ -1,5 +1,5 @@
-"""How far a command is, on standard error, once it takes longer than two seconds: a bar or a
-spinner on a terminal, a line now and then elsewhere.
+"""Shows a command's progress on standard error, once it takes longer than two seconds: a bar or a
+spinner on a terminal, else a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ AFTER_S, EVERY_S = 2.0, 10.0
 def progress(
     what: str, *, total: int | None = None, unit: str = "ticks", after_s: float = AFTER_S, every_s: float = EVERY_S
 ) -> Iterator[Callable[[int], None]]:
-    """Takes how many are done, of `total` where that is known."""
+    """A function to call with the number of units done; `total` is known or None. A context."""
     shown = _Shown(what, total, unit, after_s, every_s)
     try:
         yield shown.done
@@ -27,7 +27,7 @@ def progress(
 
 @contextlib.contextmanager
 def steps(what: str, *, after_s: float = AFTER_S, every_s: float = EVERY_S) -> Iterator[Callable[[str], None]]:
-    """Takes the name of each step as it begins, and prints it; one that lasts is told of again."""
+    """A function to call with the name of each step as it begins; a context."""
     shown = _Shown(what, None, "", after_s, every_s)
     try:
         yield shown.doing
@@ -36,15 +36,15 @@ def steps(what: str, *, after_s: float = AFTER_S, every_s: float = EVERY_S) -> I
 
 
 class _Shown:
-    """What is shown, from a thread of its own; so it goes on while the command computes."""
+    """Shows the progress from a thread of its own, also while the command computes."""
 
     def __init__(self, what: str, total: int | None, unit: str, after_s: float, every_s: float) -> None:
         self._what, self._total, self._unit = what, total, unit
         self._after_s, self._every_s = after_s, every_s
         self._count, self._begun = 0, time.monotonic()
         self._ended = threading.Event()
-        tell = self._draw if sys.stderr.isatty() else self._print
-        self._thread = threading.Thread(target=tell, name="progress", daemon=True)
+        show = self._draw if sys.stderr.isatty() else self._print
+        self._thread = threading.Thread(target=show, name="progress", daemon=True)
         self._thread.start()
 
     def done(self, count: int) -> None:
@@ -62,11 +62,11 @@ class _Shown:
     def _draw(self) -> None:
         if self._ended.wait(self._after_s):
             return
-        from rich.console import Console  # takes a while, and most commands are quicker
+        from rich.console import Console  # slow to import, and most commands are quicker
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         class Cursor(Console):
-            """Leaves the cursor: Ctrl-C ends at once, and nobody would show it again."""
+            """Never hides the cursor: after Ctrl-C it would stay hidden."""
 
             def show_cursor(self, show: bool = True) -> bool:
                 return False

@@ -1,4 +1,4 @@
-"""`thirdhand record`: takes demonstrations from a running cell; shows, trims and deletes them."""
+"""`thirdhand record`: captures demonstrations of a running cell; shows, trims and deletes them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, pla
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
 from service.contract.channels import ENDPOINT
-from service.demonstrations.capture import take
-from service.demonstrations.takes import (
+from service.demonstrations.capture import capture
+from service.demonstrations.demonstration_files import (
+    DemonstrationNameError,
     Summary,
-    TakeNameError,
+    demonstration_paths,
     draw,
+    existing_path,
     path_of,
     summary,
     table,
-    takes,
-    there,
     trim,
     uncut,
 )
@@ -29,7 +29,7 @@ from service.recording.mcap_file import RecordingError
 
 
 def record(args: argparse.Namespace) -> int:
-    """Exit code 0 once a demonstration is written, or what was asked is done with those there."""
+    """Exit code 0 once a demonstration is written, or an existing one shown, trimmed or deleted."""
     if args.list == (args.name is not None):
         raise UsageError("a take's name needed, or --list")
     settings = load(args.config) if args.config else None
@@ -40,11 +40,11 @@ def record(args: argparse.Namespace) -> int:
     if args.list:
         return _list(args.folder, settings)
     if args.delete:
-        path = there(args.folder, args.name)
-        gone = [path, *([uncut(path)] if uncut(path).exists() else [])]
-        for one in gone:
+        path = existing_path(args.folder, args.name)
+        deleted = [path, *([uncut(path)] if uncut(path).exists() else [])]
+        for one in deleted:
             one.unlink()
-        print(f"{', '.join(map(str, gone))} deleted")
+        print(f"{', '.join(map(str, deleted))} deleted")
         return 0
     if args.trim is not None:
         start_s, end_s = args.trim
@@ -52,17 +52,17 @@ def record(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"--trim {start_s:g} {end_s:g}: seconds from the start, the first below the second, needed"
             )
-        print(trim(there(args.folder, args.name), start_s, end_s), file=sys.stderr)
+        print(trim(existing_path(args.folder, args.name), start_s, end_s), file=sys.stderr)
     elif not args.show:
-        _take(args, settings or Settings())
-    found = summary(there(args.folder, args.name), settings=settings)
+        _capture(args, settings or Settings())
+    found = summary(existing_path(args.folder, args.name), settings=settings)
     _show(found, args.plot)
     return 0
 
 
 def _list(folder: Path, settings: Settings | None) -> int:
     """Exit code 1 where one of the takes cannot be learned from."""
-    paths, unusable = takes(folder), 0
+    paths, unusable = demonstration_paths(folder), 0
     for path in paths:
         try:
             found = summary(path, settings=settings)
@@ -84,13 +84,13 @@ def _show(found: Summary, plot: Path | None) -> None:
         print(f"{plot} drawn", file=sys.stderr)
 
 
-def _take(args: argparse.Namespace, settings: Settings) -> None:
+def _capture(args: argparse.Namespace, settings: Settings) -> None:
     for name, low, high in (("seconds", 1, 3600), ("wait", 0, 3600), ("rest", 0.2, 60)):
         if not low <= getattr(args, name) <= high:
             raise UsageError(f"--{name} {getattr(args, name):g}: {low:g} to {high:g} s accepted")
     path = path_of(args.folder, args.name)
     if path.exists():
-        raise TakeNameError(f"{path} is there already: another name needed, or --delete it first")
+        raise DemonstrationNameError(f"{path} is there already: another name needed, or --delete it first")
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
     places = places_in(args.places) if args.places else ()
@@ -110,7 +110,7 @@ def _take(args: argparse.Namespace, settings: Settings) -> None:
     with session:
         if args.until == "key":
             print("Enter or Ctrl-C ends it", file=sys.stderr, flush=True)
-        taken = take(
+        captured = capture(
             session,
             cell,
             settings,
@@ -124,8 +124,8 @@ def _take(args: argparse.Namespace, settings: Settings) -> None:
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    taken.write(path, places)
-    for key, count in taken.malformed.items():
+    captured.write(path, places)
+    for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
 
 
@@ -134,7 +134,7 @@ def _progress(line: str) -> None:
 
 
 class _Ended:
-    """Whether Enter was pressed; standard input that ends, or is another's, says nothing."""
+    """Whether Enter was pressed; standard input that ends, or is another's, is ignored."""
 
     def __init__(self) -> None:
         self._listens = True

@@ -1,4 +1,4 @@
-"""What `thirdhand record` takes on the command line."""
+"""The options of `thirdhand record`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXAMPLE = """thirdhand record take-1
 
 
 def add_options(c: argparse.ArgumentParser) -> None:
-    """Those that are the command's own."""
+    """Adds the command's own options."""
     c.add_argument("name", metavar="NAME", nargs="?", help="of the take")
     c.add_argument(
         "--folder",

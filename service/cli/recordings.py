@@ -1,4 +1,4 @@
-"""`thirdhand play`, `replay` and `learn`: what is done with recordings and demonstrations."""
+"""`thirdhand play`, `replay` and `learn`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.requests import Status
-from service.demonstrations.files import iter_hands, read_demonstration
-from service.demonstrations.pose_streams import SIDES, Source
+from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
+from service.demonstrations.pose_streams import SIDES, PoseTopic
 from service.learning.judgement import table
 from service.learning.learn import Evidence
 from service.learning.learn import learn as learned
@@ -61,9 +61,9 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
-    """What of the hands played came to the daemon's loop, by its own count.
+    """How many of the poses played reached the daemon's loop, by its own count, in words.
 
-    Raises ExplainedError where of a hand none did.
+    Raises ExplainedError where none of a hand did.
     """
     until = time.monotonic() + COUNTED_WITHIN_S
     while True:
@@ -81,12 +81,9 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Exit code 0 if every frame that is there is close enough; with `--exact`, if every frame is
-    there and identical.
-    """
-
-    held = [Recording.open(path).ticks() for path in args.files]
-    total = None if None in held or args.after is not None else sum(filter(None, held))
+    """Exit code 0 if all frames are close enough; with `--exact`, complete and identical."""
+    counts = [Recording.open(path).ticks() for path in args.files]
+    total = None if None in counts or args.after is not None else sum(filter(None, counts))
     with progress("replaying", total=total) as done:
         result = replayed(*args.files, after=args.after, progress=done)
     print(result.text())
@@ -101,12 +98,12 @@ def learn(args: argparse.Namespace) -> int:
                 raise UsageError(f"{path}: {what} is written as {suffix}: {path.with_suffix(suffix).name}, say")
             check_writable(path)
     settings = load(args.config) if args.config else None
-    sources = {name: Source.parsed(text) for name in SIDES if (text := getattr(args, name))}
+    topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(
-            path, sources=sources, settings=settings, say=lambda line: print(line, file=sys.stderr, flush=True)
+            path, topics=topics, settings=settings, say=lambda line: print(line, file=sys.stderr, flush=True)
         )
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count

@@ -1,4 +1,4 @@
-"""`thirdhand serve`: the daemon, with what the command line says over the configuration."""
+"""`thirdhand serve`: the daemon; options of the command line override the configuration."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ from service.cli.usage import UsageError
 from service.config import Settings, converted, load
 from service.daemon import daemon
 from service.described_arm import SettingsError
-from service.recording.client import Scribe
 from service.recording.paths import skills_folder
+from service.recording.scribe import Scribe
 from service.shipped import SHIPPED_SKILL
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Exit code 0 once it was asked to stop and has closed everything, 1 where its recordings lack
-    ticks.
-    """
-    os.umask(0o077)  # what it writes is its user's
+    """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
+    os.umask(0o077)  # its files are private to its user
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(load(args.config) if args.config else Settings(), args)
     skills = skills_folder(settings)
@@ -39,13 +37,11 @@ def serve(args: argparse.Namespace) -> int:
     missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, announce=announce)
     sys.stdout.flush()
     logging.shutdown()
-    os._exit(
-        1 if missing else 0
-    )  # all is closed; libraries that complain of what their own threads still hold are not waited for
+    os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
-    """The settings with what the command line says in their place."""
+    """The settings, with the options of the command line instead."""
     given: dict[str, Any] = msgspec.to_builtins(settings)
     for section, field, value in (
         (given, "cell", args.cell),

@@ -1,4 +1,4 @@
-"""`thirdhand sim`: the bench, for those who installed it without knowing its modules."""
+"""`thirdhand sim`: the simulated bench, the same as `python -m sim`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.launch import check_bench
 
 
 def sim(args: argparse.Namespace) -> NoReturn:
-    """Becomes `python -m sim` with the same options: signals and exit code are its own."""
+    """Replaces this process by `python -m sim` with the same options."""
     if not {"-h", "--help", "--via-points"} & set(args.options):
         check_bench()
     command, environment = python("-m", "sim", *args.options)

@@ -78,7 +78,7 @@ def _draw(told: Iterator[Status]) -> None:
     from rich.text import Text
 
     colours = {"follow": "green", "hold": "yellow", "fault": "bold red"}
-    with interrupt.put_away_first(), Live(refresh_per_second=10) as live:  # which hides the cursor
+    with interrupt.clean_up_first(), Live(refresh_per_second=10) as live:  # which hides the cursor
         for now in told:
             table = Table.grid(padding=(0, 2))
             for name, text in rows(now).items():

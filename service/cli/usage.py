@@ -1,4 +1,4 @@
-"""What the commands share: the error of a command line that cannot be meant."""
+"""Usage errors and checks of arguments that the commands share."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ CONNECT_TIMEOUT_S = 3.0
 
 
 class UsageError(ValueError):
-    """A command line that cannot be meant."""
+    """The command line is not valid."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest word where one is not known."""
+    """A parser that suggests the nearest choice for an unknown one."""
 
     def error(self, message: str) -> NoReturn:
         """Prints usage and message, and exits with code 2."""
@@ -32,7 +32,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def check_cell(name: str) -> None:
-    """Raises UsageError where a cell cannot be named so."""
+    """Raises UsageError where a cell cannot have this name."""
     from service.config import converted  # heavy
     from service.described_arm import SettingsError
 
@@ -43,7 +43,7 @@ def check_cell(name: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raises UsageError where no file can be written under this name: asked before long work."""
+    """Raises UsageError where no file can be written at this path; for a check before long work."""
     folder = path.parent
     if path.is_dir():
         raise UsageError(f"{path} is a folder, the name of a file needed")
@@ -54,15 +54,15 @@ def check_writable(path: Path) -> None:
 
 
 def added_in(path: Path) -> Add:
-    """What a file asks to add; - is standard input. Raises RequestError, OSError."""
+    """The request to add via-points in a file (-: standard input). Raises RequestError, OSError."""
     from service.contract.requests import Add, decode_request  # heavy
 
-    told: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
-    return told
+    request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+    return request
 
 
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
-    """The places in such a file. Raises RequestError, which names the file, and OSError."""
+    """The via-points in such a file. Raises RequestError, which names the file, and OSError."""
     from service.contract.requests import RequestError  # heavy
 
     try:

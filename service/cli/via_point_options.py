@@ -1,4 +1,4 @@
-"""What `thirdhand via-points add` takes on the command line, besides a name."""
+"""The options of `thirdhand via-points add`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from service.contract.requests import TOLERANCE_M, ViaPoint
 
 
 def add_options(c: argparse.ArgumentParser) -> None:
-    """Those that say what the via-point is."""
+    """Adds the options that define the via-point."""
     for hand in ("left", "right", "tool"):
         c.add_argument(f"--{hand}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
     c.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")

@@ -31,18 +31,20 @@ from service.contract.channels import ENDPOINT
 from service.contract.explain import ExplainedError
 from service.launch import free_port
 from service.network_settings import is_local
-from service.recording.recording import THINGS, Recording
+from service.recording.recording import OBJECTS, Recording
 from service.recording.steps import Gap
 from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
-TITLE_BAR, TINT = 30, 40  # pixels that a window's bar has at least; differences of colour that are none
-FRESH_S, FRESH_TIMEOUT_S = 1.0, 10.0  # a picture of a live view that is older says so
+TITLE_BAR = 30  # pixels that a window's bar has at least
+TINT = 40  # difference of colour channels in a grey bar
+FRESH_S = 1.0  # age of a live view's picture above which the age is printed
+FRESH_TIMEOUT_S = 10.0
 
 
 def view(args: argparse.Namespace) -> int:
-    """The viewer's exit code once it is closed; 0 once a picture is written."""
+    """The viewer's exit code once its window is closed; 0 once a picture is written."""
     check_usage(args)
     if args.file == "live":
         now = ask(args, "status")
@@ -71,7 +73,7 @@ def view(args: argparse.Namespace) -> int:
 
 
 def check_usage(args: argparse.Namespace) -> None:
-    """Raises UsageError for what cannot be meant, before anything is drawn."""
+    """Raises UsageError for arguments that are not valid, before anything is drawn."""
     if args.screenshot:
         check_writable(args.screenshot)
         if args.screenshot.suffix.lower() != ".png":
@@ -83,7 +85,7 @@ def check_usage(args: argparse.Namespace) -> None:
 
 
 def _line(status: dict[str, Any]) -> str:
-    """Mode and reason, at once."""
+    """Cell, mode and reason in one line."""
     reason = f": {status['reason'].replace('_', ' ')}" if status["reason"] else ""
     return f"{status['cell']}: {status['mode']}{reason}"
 
@@ -142,19 +144,19 @@ def convert(
 ) -> int:
     """The number of ticks of a recording drawn into a Rerun file.
 
-    What the recording lacks is told to `say`, and shown in the log where it is missing; all else is
-    drawn. Raises RecordingError and ViewerError.
+    `say` is called with what the recording lacks, which the drawing's log shows too. Raises
+    RecordingError and ViewerError.
     """
     recording = Recording.open(recording_path)
     with tempfile.TemporaryDirectory() as folder:
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
-        notes = recording.notes("requests", "log", THINGS)
+        notes = recording.notes("requests", "log", OBJECTS)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
-        unshown = 0
+        shown = 0
         for step in recording.steps():
             if step.lost or step.damage:
                 gaps.append(Gap(last, step.tick, step.lost, step.damage))
@@ -162,9 +164,9 @@ def convert(
             if step.frame is None:
                 continue
             time_ns = step.time_ns
-            for gap in gaps[unshown:]:
+            for gap in gaps[shown:]:
                 viewer.log(str(gap), "WARN", time_ns)
-            unshown = len(gaps)
+            shown = len(gaps)
             while note is not None and note[2] <= time_ns:
                 viewer.note(*note)
                 note = next(notes, None)
@@ -173,8 +175,8 @@ def convert(
             viewer.add(step.frame, time_ns, step.timing, step.events)
             count += 1
             progress(count)
-        missing = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
-        for text in missing[unshown:]:
+        missing = [*map(str, gaps), *recording.unreported(gaps, last=last)]
+        for text in missing[shown:]:
             viewer.log(text, "WARN", time_ns)
         viewer.close()
     for text in missing:
@@ -187,9 +189,10 @@ def convert(
 
 
 def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
-    """Saves a picture of one tab of a Rerun file or live view, `time` [s] after its start or at its
-    end. How old the newest in it is [s], for a live view. Raises ViewerError, and UsageError for a
-    time that is not there.
+    """The age of the newest data in a picture of a live view [s]; None for a Rerun file.
+
+    The picture shows one tab, `time` [s] after the start or at the end. Raises ViewerError, and
+    UsageError for a time behind the end.
     """
     from rerun.experimental import ViewerClient
 
@@ -200,8 +203,8 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
         with Path(source).open("rb") as file:
             if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
                 raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
-    os.environ.setdefault("RUST_LOG", "error")  # or its remarks cover the picture
-    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # or its graphics library complains
+    os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
+    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # else its graphics library logs errors
     try:
         with ViewerClient.spawn(
             headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(rerun_program())
@@ -211,7 +214,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             extent = _extent(client)
             if extent is None:
                 raise ViewerError(f"no picture of {source}: it holds nothing yet")
-            _arrange(client, tab)
+            _select_tab(client, tab)
             at = moment(extent, time)
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
@@ -229,7 +232,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:
-    """When `time` [s] after the start is, or the end [ns]. Raises UsageError if later."""
+    """The time [ns] that is `time` [s] after the start, or the end. Raises UsageError if later."""
     start, end = extent
     at = end if time is None else start + round(time * 1e9)
     if at > end:
@@ -237,26 +240,26 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
     return at
 
 
-def _arrange(client: Any, tab: str) -> None:
+def _select_tab(client: Any, tab: str) -> None:
     """Brings one of the three tabs to the front."""
 
-    def arranged() -> bool:
-        told = client.get_blueprint().blueprint
-        root = told.get("/viewport", {}).get("ViewportBlueprint", {}).get("root_container", "")
-        for path, parts in told.items():
+    def is_selected() -> bool:
+        blueprint = client.get_blueprint().blueprint
+        root = blueprint.get("/viewport", {}).get("ViewportBlueprint", {}).get("root_container", "")
+        for path, parts in blueprint.items():
             container = parts.get("ContainerBlueprint", {})
             if container.get("container_kind") == "Tabs" and (path == root or path.endswith(f"/{root}")):
                 container["active_tab"] = container["contents"][TABS.index(tab)]
-                client.set_blueprint(told, of="recording")
+                client.set_blueprint(blueprint, of="recording")
                 return True
         return False
 
     if tab != TABS[0]:
-        _wait(arranged)
+        _wait(is_selected)
 
 
 def _picture(client: Any, png: Path) -> None:
-    """Saves what the viewer shows, without the empty bar above it."""
+    """Saves a picture of the viewer, without the empty bar at its top."""
     with Image.open(io.BytesIO(client.take_screenshot())) as image:
         pixels = np.asarray(image.convert("RGB"))
         bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
@@ -264,7 +267,7 @@ def _picture(client: Any, png: Path) -> None:
 
 
 def _fresh(client: Any, png: Path) -> float:
-    """Saves a picture of a live view, again until what it shows is recent; how old that is [s]."""
+    """The age of the data [s] in a picture of a live view, taken again until it is recent."""
     until, age_s = clock.monotonic() + FRESH_TIMEOUT_S, 0.0
     while True:
         newest = _extent(client, "time")
@@ -276,9 +279,7 @@ def _fresh(client: Any, png: Path) -> float:
 
 
 def show(source: str | Path) -> int:
-    """The exit code of the Rerun viewer, opened on a file or a live view, once its window is
-    closed.
-    """
+    """The exit code of the Rerun viewer on a file or a live view, once its window is closed."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
     return subprocess.run([rerun_program(), "--bind", "127.0.0.1", str(source)], check=False).returncode
@@ -293,7 +294,7 @@ def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
 
 
 def _settled(client: Any, png: Path) -> None:
-    """Saves the picture once two in a row are the same: data are loaded and remarks gone."""
+    """Saves the picture once three in a row are the same: all is loaded, notifications are gone."""
     seen: list[bytes] = []
 
     def same() -> bool:

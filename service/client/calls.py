@@ -1,4 +1,4 @@
-"""A running daemon's requests as calls, and their answers as the contract's types."""
+"""Requests to a running daemon as calls, and their replies as the contract's types."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from service.client.session import RefusedError, UnreachableError
 from service.contract import channels, requests
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
-ASKED_AGAIN_S, TIMES_ASKED = 0.05, 5
+RETRY_S, RETRIES = 0.05, 5
 Answer = TypeVar("Answer")
 
 
 class Client:
-    """A running daemon's requests as calls.
+    """Requests to a running daemon as calls.
 
-    Each raises RefusedError with the daemon's words, or UnreachableError where nobody answers: only
-    the answer of a daemon that is alive counts, not what a Zenoh storage kept of one.
+    Each raises RefusedError with the daemon's message, or UnreachableError where nobody answers.
+    Only the reply of a live daemon counts, not one that a Zenoh storage kept.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
@@ -54,16 +54,16 @@ class Client:
     def add(self, points: Iterable[ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> Reply:
         """Teaches via-points, all or nothing; returns once they are in force.
 
-        Points that were learned nearer than `tolerance` [m] give way.
+        Learned points nearer than `tolerance` [m] to one are replaced.
         """
         return self._typed("via_points", requests.Add(tuple(points), tolerance), Reply)
 
     def remove(self, *names: str) -> Reply:
-        """Forgets via-points by name, all or nothing; returns once that is in force."""
+        """Removes via-points by name, all or nothing; returns once that is in force."""
         return self._typed("via_points", requests.Remove(names), Reply)
 
     def clear(self) -> Reply:
-        """Forgets all via-points; returns once that is in force."""
+        """Removes all via-points; returns once that is in force."""
         return self._typed("via_points", requests.Clear(), Reply)
 
     def load_skill(self, name: str) -> Reply:
@@ -71,7 +71,7 @@ class Client:
         return self._typed("skill", requests.SkillRequest(name), Reply)
 
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
-        """The reply to one request as it came; `request` is anything that becomes JSON."""
+        """The reply to one request as received; `request` is anything that JSON can encode."""
         answer: dict[str, Any] = json.loads(self._answer(suffix, request))
         return answer
 
@@ -84,7 +84,7 @@ class Client:
             except UnreachableError:
                 if time.monotonic() > end:
                     raise
-                time.sleep(ASKED_AGAIN_S)
+                time.sleep(RETRY_S)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
         try:
@@ -103,8 +103,9 @@ class Client:
             self._key(suffix),
             payload=payload,
             encoding=zenoh.Encoding.APPLICATION_JSON,
-            target=zenoh.QueryTarget.ALL,  # a storage that calls itself complete would else be asked alone,
-            consolidation=zenoh.ConsolidationMode.NONE,  # and its answer be taken for the daemon's
+            # else only a storage that declares itself complete may be queried, and its reply used
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
             timeout=self._timeout_s,
         ):
             text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")
@@ -118,18 +119,18 @@ class Client:
             return reply.ok.payload.to_bytes()
         raise UnreachableError(
             f"nobody answers on {self._key(suffix)}: is the daemon running there, and is the cell's name right?"
-            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps what one said." * kept
+            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps an old reply." * kept
         )
 
     def _is_alive(self, own: str) -> bool:
         """Whether a daemon of the cell has this Zenoh session.
 
-        Tokens are missing for a moment while others join or leave: so it is asked more than once.
+        Tokens may be missing for a moment while others join or leave, so it queries RETRIES times.
         """
-        for _ in range(TIMES_ASKED):
+        for _ in range(RETRIES):
             if own in living(self._session, self._cell, timeout_s=self._timeout_s):
                 return True
-            time.sleep(ASKED_AGAIN_S)
+            time.sleep(RETRY_S)
         return False
 
     def _key(self, suffix: str) -> str:

@@ -1,5 +1,5 @@
-"""Which daemons are there, by the liveliness token that each holds, and what each says; and what is
-published, under whatever key.
+"""The daemons on a network, by their liveliness tokens, with their statuses; and the keys on which
+anything is published.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from service.contract import channels
 from service.contract.requests import Status
 
 TIMEOUT_S = 5.0
-MOST_KEYS = 1000  # that are remembered
+MOST_KEYS = 1000  # that Overheard remembers
 
 
 class Cell(NamedTuple):
-    """A cell that a daemon serves: its name, that daemon's Zenoh session, and its status.
-
-    The status is None where the daemon does not answer in time, or may not be asked.
+    """A cell that a daemon serves: its name, the daemon's Zenoh session, and its status, which is
+    None where the daemon does not answer in time, or access to it is denied.
     """
 
     name: str
@@ -28,14 +27,14 @@ class Cell(NamedTuple):
 
 
 def living(session: zenoh.Session, cell: str, *, timeout_s: float = TIMEOUT_S) -> frozenset[str]:
-    """The Zenoh sessions of the daemons that serve a cell."""
+    """The ids of the Zenoh sessions of the daemons that serve a cell."""
     return frozenset(own for _, own in _tokens(session, channels.presence(cell), timeout_s))
 
 
 def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell, ...]:
-    """All cells that are served on a network, by name; their daemons are asked at the same time."""
+    """All cells that are served on a network, by name; their daemons are queried in parallel."""
     found = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))
-    asked = [
+    queries = [
         session.get(
             channels.key(name, "status"),
             payload=b"{}",
@@ -45,16 +44,16 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
         )
         for name in dict(found)
     ]
-    told: dict[str, Status] = {}
-    for replies in asked:
+    statuses: dict[str, Status] = {}
+    for replies in queries:
         for reply in replies:
             if reply.ok is not None and reply.replier_id is not None:
-                told[str(reply.replier_id.zid)] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
-    return tuple(Cell(name, own, told.get(own)) for name, own in found)
+                statuses[str(reply.replier_id.zid)] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
+    return tuple(Cell(name, own, statuses.get(own)) for name, own in found)
 
 
 class Overheard:
-    """The keys under some expressions on which something is published, while its context lasts."""
+    """Collects the keys, matching some expressions, on which something is published; a context."""
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
@@ -68,11 +67,11 @@ class Overheard:
 
     @property
     def keys(self) -> list[str]:
-        """Those heard so far, in order."""
+        """The keys so far, sorted."""
         return sorted(self._keys.copy())
 
     def close(self) -> None:
-        """Hears no more."""
+        """Ends the subscriptions."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._subscribers = []

@@ -1,4 +1,4 @@
-"""Zenoh sessions between named endpoints, which announce nothing."""
+"""Zenoh sessions between named endpoints, without scouting."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import zenoh
 from service.contract.explain import ExplainedError
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
-ENDPOINTS_TIMEOUT_S = 30.0  # a machine that is busy answers late
+ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
 
 
 class UnreachableError(ExplainedError, OSError):
-    """No Zenoh session, or nobody answers."""
+    """There is no Zenoh session, or nobody answers."""
 
 
 class RefusedError(ExplainedError, ValueError):
-    """The daemon's answer to a request that it did not carry out."""
+    """The daemon refused a request; the message is its answer."""
 
 
 def open_session(
@@ -38,15 +38,14 @@ def open_session(
 ) -> zenoh.Session:
     """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
 
-    One that only connects is a Zenoh client, of the first endpoint that answers: peers do not meet
-    through a router. One that listens is a peer, or where it connects too a router, unless
-    `zenoh_config`, a file of Zenoh's own, says a `mode`. All else that is set here goes before what
-    that file says. Only a client that is given no `connect` takes the file's endpoints, or else
-    those in `otherwise`.
+    A session that only connects is a client of the first endpoint that answers. (Peers do not meet
+    through a router.) One that listens is a peer, or a router if it connects too. A `mode` in
+    `zenoh_config`, a file of Zenoh's own, overrides that; all else set here overrides the file. A
+    client without `connect` takes the file's endpoints, or else those in `otherwise`.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
-    begin with `tls/`. Where one of the two is None, the one that $THIRDHAND_CERTIFICATE or
-    $THIRDHAND_ZENOH_CONFIG names is taken. Close the session. Raises UnreachableError.
+    begin with `tls/`. Where one of the two is None, $THIRDHAND_CERTIFICATE or
+    $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError.
     """
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
     if otherwise and not connect and not listen:
@@ -64,8 +63,8 @@ def open_session(
         "listen/exit_on_failure": True,
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
         "plugins_loading/enabled": False,
-        "namespace": None,  # the contract's keys are whole
-        "transport/shared_memory/enabled": False,  # it does not pay, and passes by all bounds on what comes in
+        "namespace": None,  # the contract's keys are absolute
+        "transport/shared_memory/enabled": False,  # no faster here, and it bypasses all bounds on messages
         **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
         **(more or {}),
     }
@@ -78,7 +77,7 @@ def open_session(
 
 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
-    """In words, why there is no session between these endpoints."""
+    """The reason why there is no session between these endpoints, in words."""
     form = r"[a-z]+/.+:.+|unixsock-stream/.+"
     wrong = next((endpoint for endpoint in (*connect, *listen) if not re.match(form, endpoint)), None)
     if wrong is not None:
@@ -96,7 +95,7 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
 
 
 def _zenoh_config(path: str | Path | None) -> zenoh.Config:
-    """What a file of Zenoh's own says, or Zenoh's defaults. Raises UnreachableError."""
+    """The configuration in a file of Zenoh's own, or Zenoh's defaults. Raises UnreachableError."""
     if not path:
         return zenoh.Config()
     try:
@@ -109,15 +108,15 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
 
 
 def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
-    """The endpoints to connect to that a configuration says for every mode or for clients."""
-    said = json.loads(config.get_json("connect/endpoints"))
-    return tuple(said.get("client") or () if isinstance(said, dict) else said or ())
+    """The endpoints to connect to in a configuration, for every mode or for clients."""
+    found = json.loads(config.get_json("connect/endpoints"))
+    return tuple(found.get("client") or () if isinstance(found, dict) else found or ())
 
 
 def _tls(folder: str | Path | None) -> dict[str, Any]:
-    """Zenoh's settings for mutual TLS by the certificate in a folder, if there is one.
+    """Zenoh's settings for mutual TLS with the certificate in a folder; empty without a folder.
 
-    Raises UnreachableError where it is incomplete.
+    Raises UnreachableError where the folder is incomplete.
     """
     if not folder:
         return {}
@@ -134,13 +133,11 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
     settings |= {"verify_name_on_connect": True, "close_link_on_expiration": True}
-    return {"transport/link/tls": settings}  # whole: nothing of another's stays beside it
+    return {"transport/link/tls": settings}  # replaces any other TLS settings
 
 
 def _check_dates(path: Path) -> None:
-    """Raises UnreachableError where a certificate is not valid now: Zenoh says nothing of why a
-    connection fails.
-    """
+    """Raises UnreachableError for a certificate that is not valid now, as Zenoh gives no reason."""
     from cryptography import x509  # most sessions need no certificate
 
     try:
@@ -161,7 +158,7 @@ def _check_dates(path: Path) -> None:
 
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:
-    """The endpoints at which a session really listens, with the ports that it was given."""
+    """The endpoints at which a session listens, with the ports that the system assigned."""
     for reply in session.get(f"@/{session.zid()}/*", timeout=ENDPOINTS_TIMEOUT_S):
         if reply.ok is not None:
             return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])

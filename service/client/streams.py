@@ -1,4 +1,4 @@
-"""The streams of a cell from a client's side: a tracker's hands in, a follower's commands out."""
+"""A cell's streams for clients: a Tracker publishes hands, a Follower receives joint commands."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from service.client.session import UnreachableError
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 
-BRAKE_AFTER_S = 0.02  # without a command: then whoever follows brakes
+BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
-ASKED_AGAIN_S = 0.02
+POLL_S = 0.02
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SIDES = ("left", "right")
 
 
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
-    """A publisher on one channel of a cell, of the encoding that the contract says; it drops what
-    cannot be sent rather than wait.
-    """
+    """A publisher on one channel of a cell, which drops what cannot be sent at once."""
     return session.declare_publisher(
         channels.key(cell, suffix),
         encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
@@ -34,9 +32,9 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
 
 
 class Tracker:
-    """Publishes hand poses of a cell, as long as its context lasts.
+    """Publishes hand poses of a cell; a context.
 
-    Up to `timeout_s` [s] it waits for a living daemon. Raises UnreachableError where there is none.
+    It waits up to `timeout_s` [s] for a live daemon. Raises UnreachableError where there is none.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 5.0) -> None:
@@ -49,7 +47,7 @@ class Tracker:
                 raise UnreachableError(
                     f"no daemon listens to {channels.key(cell, 'hands/left')}: is one running in this cell?"
                 )
-            time.sleep(ASKED_AGAIN_S)
+            time.sleep(POLL_S)
 
     def publish(
         self,
@@ -71,15 +69,15 @@ class Tracker:
         self._publishers[side].put(cdr.encode_pose(pose))
 
     def heard(self) -> bool:
-        """Whether a daemon of the cell is alive, and both hands are listened to."""
-        listened = all(
+        """Whether a daemon of the cell is alive, and both hands have a subscriber."""
+        subscribed = all(
             publisher.matching_status.matching  # type: ignore[attr-defined]
             for publisher in self._publishers.values()
         )
-        return listened and bool(living(self._session, self._cell))
+        return subscribed and bool(living(self._session, self._cell))
 
     def close(self) -> None:
-        """Publishes no more."""
+        """Ends the publishers."""
         for one in self._publishers.values():
             one.undeclare()  # type: ignore[no-untyped-call]
 
@@ -91,10 +89,10 @@ class Tracker:
 
 
 class Command(NamedTuple):
-    """What the arm is to do: position [rad] and velocity [rad/s] of the joints that were asked for.
+    """A joint command: position [rad] and velocity [rad/s] of the follower's joints.
 
-    Beside it the tick that decided it, when it was published and the stamp of the newest hand
-    sample that it answers [ns]; -1, 0 and 0 where its sender did not say.
+    `tick` decided it; `published_ns` is when it was sent, `hand_stamp_ns` the stamp of the newest
+    hand sample that it answers. These are -1, 0 and 0 where the sender did not attach them.
     """
 
     stamp_ns: int
@@ -106,10 +104,10 @@ class Command(NamedTuple):
 
 
 class Follower:
-    """Takes joint commands of a cell and tells the joints' state, as long as its context lasts.
+    """Receives joint commands of a cell and publishes the joints' state; a context.
 
-    `names` are the arm's joints, in the order of all that is given and taken here. A command that
-    is no command of these joints is not taken; `rejected` counts them, `reason` is the last one's.
+    `names` are the arm's joints, in the order of all values here. Commands that do not fit these
+    joints are ignored: `rejected` counts them, `reason` is the last one's.
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
@@ -121,9 +119,8 @@ class Follower:
         self._subscriber = session.declare_subscriber(channels.key(cell, "joints/command"), self._take)
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
-        """The newest command that was not taken yet, once there is one.
-
-        None after `timeout_s` [s] without: whoever follows brakes then.
+        """The newest command that was not returned before; None after `timeout_s` [s] without one,
+        on which the arm has to brake.
         """
         with self._came:
             self._came.wait_for(lambda: self._newest is not None, timeout_s)
@@ -136,7 +133,7 @@ class Follower:
         self._state.put(cdr.encode_joints(JointState(now_ns, self._names, tuple(position), tuple(velocity))))
 
     def close(self) -> None:
-        """Takes and tells no more."""
+        """Ends the subscription and the publisher."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._state.undeclare()  # type: ignore[no-untyped-call]
 
@@ -146,12 +143,12 @@ class Follower:
             position, velocity = in_order(message, self._names)
             if not finite(position + velocity):
                 raise WireError("a joint that is not finite")
-            rides = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
+            attached = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
         except WireError as error:
             self.rejected, self.reason = self.rejected + 1, str(error)
             return
         with self._came:
-            self._newest = Command(message.stamp_ns, position, velocity, *rides)
+            self._newest = Command(message.stamp_ns, position, velocity, *attached)
             self._came.notify()
 
     def __enter__(self) -> Self:

@@ -45,7 +45,7 @@ POSE_WITH_COVARIANCE = Codec(
 JOINTS = Codec("sensor_msgs/msg/JointState", "cdr", cdr.encode_joints, cdr.decode_joints)
 STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_string)
 TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
-THINGS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_things, markers.decode_things)
+OBJECTS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects)
 TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
 SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
 FRAME, TIMING, STATE = (
@@ -99,7 +99,7 @@ CHANNELS = (
     Channel("gripper/state", JOINTS, "in", "how far the gripper is closed, 0 to 1, in demonstrations",
             rate="teaching", recorded=False),
     Channel("tool/pose", POSE, "in", "the tool as measured, in demonstrations", rate="teaching", recorded=False),
-    Channel("objects", THINGS, "in", "things on the bench, for viewers: boxes, balls, cylinders",
+    Channel("objects", OBJECTS, "in", "objects on the bench, for viewers: boxes, ellipsoids, cylinders",
             rate="1 - 30 Hz"),
     Channel("status", _request(requests.Nothing), "out", "mode, reason, flags, rates, latency percentiles, counters",
             rate="10 Hz, and on request", queryable=True),

@@ -1,5 +1,5 @@
-"""Things on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
-Foxglove draw as it is. Of a marker, what a thing needs is kept: boxes, balls and cylinders.
+"""Objects on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
+Foxglove draw as it is. Only what an object needs is kept: boxes, ellipsoids and cylinders.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import struct
 from collections.abc import Sequence
 
 from service.contract import cdr
-from service.contract.messages import Thing, WireError
+from service.contract.messages import SceneObject, WireError
 
 SHAPES = {1: "box", 2: "ball", 3: "cylinder"}  # and the numbers of a Marker's type
 NUMBERS = {shape: number for number, shape in SHAPES.items()}
 LARGEST = 16_384  # bytes
-MOST_THINGS = 32
+MOST_OBJECTS = 32
 LARGEST_M, LONGEST_NAME = 10.0, 64
 _ADD = 0  # or change; other actions take away
 _KIND, _COLOUR = struct.Struct("<iii"), struct.Struct("<4f")
@@ -23,16 +23,16 @@ _UV, _COUNT, _BYTE = struct.Struct("<2f"), struct.Struct("<I"), struct.Struct("<
 _LIFETIME = struct.Struct("<II")
 
 
-def encode_things(stamp_ns: int, things: Sequence[Thing]) -> bytes:
+def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
     """CDR bytes of a MarkerArray, one marker for each thing."""
     out = cdr.Writer()
-    out.pack(_COUNT, len(things), align=4)
-    for thing in things:
-        out.header(stamp_ns, thing.frame_id)
-        out.string(thing.name)
-        out.pack(_KIND, 0, NUMBERS[thing.shape], _ADD, align=4)
-        out.pack(_PLACED, *thing.position, *thing.orientation, *thing.size, align=8)
-        out.pack(_COLOUR, *thing.colour, align=4)
+    out.pack(_COUNT, len(objects), align=4)
+    for one in objects:
+        out.header(stamp_ns, one.frame_id)
+        out.string(one.name)
+        out.pack(_KIND, 0, NUMBERS[one.shape], _ADD, align=4)
+        out.pack(_PLACED, *one.position, *one.orientation, *one.size, align=8)
+        out.pack(_COLOUR, *one.colour, align=4)
         out.pack(_LIFETIME, 0, 0, align=4)  # for good
         out.pack(_BYTE, 0, align=1)  # placed anew only when said so
         out.pack(_COUNT, 0, align=4)  # points
@@ -50,8 +50,8 @@ def encode_things(stamp_ns: int, things: Sequence[Thing]) -> bytes:
     return out.bytes()
 
 
-def decode_things(data: bytes) -> tuple[Thing, ...]:
-    """The things in the CDR bytes of a MarkerArray; markers of other kinds are passed over.
+def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
+    """The objects in the CDR bytes of a MarkerArray; markers of other kinds are passed over.
 
     Raises WireError.
     """
@@ -75,21 +75,21 @@ def decode_things(data: bytes) -> tuple[Thing, ...]:
         reader.skip(_BYTE, 1)
         reader.unpack(_BYTE, 1)
         if action == _ADD and kind in SHAPES:
-            found.append(_checked(Thing(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
+            found.append(_checked(SceneObject(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
     reader.end()
-    if len(found) > MOST_THINGS or len({thing.name for thing in found}) < len(found):
-        raise WireError(f"{len(found)} things; up to {MOST_THINGS}, each with a name of its own, accepted")
+    if len(found) > MOST_OBJECTS or len({one.name for one in found}) < len(found):
+        raise WireError(f"{len(found)} objects; up to {MOST_OBJECTS}, each with a name of its own, accepted")
     return tuple(found)
 
 
-def _checked(thing: Thing) -> Thing:
-    numbers = (*thing.position, *thing.size)
-    if not all(math.isfinite(value) and abs(value) <= LARGEST_M for value in numbers) or min(thing.size) <= 0:
-        raise WireError(f"thing {thing.name[:LONGEST_NAME]!r}: a position or size beyond {LARGEST_M:g} m, or no size")
-    if not abs(math.hypot(*thing.orientation) - 1.0) < 1e-2:
-        raise WireError(f"thing {thing.name[:LONGEST_NAME]!r}: a quaternion of norm 1 needed")
-    if not 0 < len(thing.name) <= LONGEST_NAME:
-        raise WireError(f"a thing with a name of {len(thing.name)} letters, 1 to {LONGEST_NAME} accepted")
-    if not all(0.0 <= value <= 1.0 for value in thing.colour):
-        raise WireError(f"thing {thing.name!r}: a colour of red, green, blue and opacity, 0 to 1 each, needed")
-    return thing
+def _checked(one: SceneObject) -> SceneObject:
+    numbers = (*one.position, *one.size)
+    if not all(math.isfinite(value) and abs(value) <= LARGEST_M for value in numbers) or min(one.size) <= 0:
+        raise WireError(f"object {one.name[:LONGEST_NAME]!r}: a position or size beyond {LARGEST_M:g} m, or no size")
+    if not abs(math.hypot(*one.orientation) - 1.0) < 1e-2:
+        raise WireError(f"object {one.name[:LONGEST_NAME]!r}: a quaternion of norm 1 needed")
+    if not 0 < len(one.name) <= LONGEST_NAME:
+        raise WireError(f"an object with a name of {len(one.name)} letters, 1 to {LONGEST_NAME} accepted")
+    if not all(0.0 <= value <= 1.0 for value in one.colour):
+        raise WireError(f"object {one.name!r}: a colour of red, green, blue and opacity, 0 to 1 each, needed")
+    return one

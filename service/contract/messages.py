@@ -61,7 +61,7 @@ class Transform(NamedTuple):
     rotation: Quaternion
 
 
-class Thing(NamedTuple):
+class SceneObject(NamedTuple):
     """Something on the bench, as viewers draw it: a `box`, `ball` or `cylinder` (along z) of a size
     x y z [m], where it is in a frame, and its colour: red, green, blue and opacity, 0 to 1.
     """

@@ -13,7 +13,7 @@ DAEMON, ROUTER = "daemon", "router"
 SERVERS = (DAEMON, ROUTER)  # others connect to them
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state", "gripper/state")
-TOOL, THINGS = ("tool/pose",), ("objects",)
+TOOL, OBJECTS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
 MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
 
@@ -29,15 +29,15 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "tracker": Role("may publish hands, things, and the tool in demonstrations", (*HANDS, *TOOL, *THINGS)),
+    "tracker": Role("may publish hands, objects, and the tool in demonstrations", (*HANDS, *TOOL, *OBJECTS)),
     "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL, *THINGS), hears=True),
+    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL, *OBJECTS), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
     "observer": Role("hears all that the daemon publishes", hears=True),
     "recorder": Role("hears what trackers and the arm publish, for demonstrations", hears_inputs=True),
     ROUTER: Role(
         "passes on what all others may do, and has to keep them apart",
-        (*HANDS, *ARM, *TOOL, *THINGS),
+        (*HANDS, *ARM, *TOOL, *OBJECTS),
         hears=True,
         asks=True,
         hears_inputs=True,

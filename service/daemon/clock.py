@@ -1,5 +1,5 @@
-"""The shell's clock: phase-locked deadlines, real-time scheduling where it is granted, and the
-figures that tell how well they are kept.
+"""The daemon's clock: phase-locked deadlines, real-time scheduling where it is granted, and
+statistics of how well the deadlines are kept.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 from service.contract.requests import Percentiles
 from service.core.record import Vector
 
-SPIN_NS = 100_000  # before a deadline, where the scheduler lets nobody else in
+SPIN_NS = 100_000  # of busy waiting before a deadline, under real-time scheduling only
 PREPARE_NS = 450_000  # before a deadline the next tick is prepared
-STEP_NS = 20_000_000  # by so much the system clock is not off unless it was set
-DRAW = 256  # deadlines in which a smaller difference goes down to a third
+STEP_NS = 20_000_000  # a larger difference to the system clock means that it was set
+DRAW = 256  # time constant of following a smaller difference, in deadlines
 CREEP_NS = 1_000  # from stamp to stamp while time catches up
 _LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
-NETWORK_NICE = -15  # of -20 to 19: counts 28 times as much as an ordinary thread
+NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
 
 
 class Deadlines:
     """Deadlines at a fixed rate since start.
 
-    Those that have passed are skipped and counted, never made up for in a burst. `stamp_ns` is the
-    newest one's time on the system clock [ns], and always grows: from one deadline to the next by
-    what lies between them, drawn slowly to the system clock; where that was set ahead it follows at
-    once, where it was set back it all but stands until time has caught up.
+    Deadlines that have passed are skipped and counted, never made up for in a burst. `stamp_ns` is
+    the newest one's time on the system clock [ns], and always grows. It advances by whole periods
+    and follows the system clock slowly. If that was set ahead it follows at once; if it was set
+    back it grows by CREEP_NS a deadline until time has caught up.
     """
 
     def __init__(
@@ -57,9 +57,9 @@ class Deadlines:
         self._index = -1
 
     def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
-        """The number of the next deadline, once it has come, and how late it is [ns].
+        """The number of the next deadline, once it has come, and its lateness [ns].
 
-        `prepare` is called shortly before it, where there is time.
+        `prepare` is called PREPARE_NS before it, if there is time.
         """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
         passed = index - self._index
@@ -93,17 +93,17 @@ class Deadlines:
 
 
 class Granted(NamedTuple):
-    """What the operating system granted of what a loop asks for."""
+    """What the operating system granted of the loop's requests."""
 
     realtime: bool
-    """The thread runs before all that have no real-time scheduling."""
+    """The thread has real-time scheduling."""
     locked: bool
-    """The process's memory stays where it is once it was touched."""
+    """The process's memory is not paged out once it was touched."""
 
 
 def ask_for_real_time() -> Granted:
-    """What was granted of real-time scheduling for this thread and of memory that is not paged out;
-    the garbage collector leaves what is there alone in any case.
+    """What was granted of real-time scheduling for this thread and of locked memory; existing
+    objects are exempt from garbage collection in any case.
     """
     gc.collect()
     gc.freeze()
@@ -127,8 +127,8 @@ def _locked() -> bool:
 
 
 def run_beside_real_time() -> None:
-    """Lets this thread run before other processes, if that is granted: put aside while it holds the
-    interpreter, it would hold up the loop.
+    """Lets this thread run before other processes, if that is granted: preempted while it holds the
+    interpreter lock, it would delay the loop.
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
@@ -136,11 +136,10 @@ def run_beside_real_time() -> None:
 
 @contextlib.contextmanager
 def ahead_of_others() -> Iterator[None]:
-    """Threads that are started within it run before those of other processes, if that is granted:
-    the network's, which a machine with more to do than cores else lets wait for 100 ms.
+    """Threads started within it run before those of other processes, if that is granted.
 
-    They have no real-time scheduling, with which a flood of messages could use up what the system
-    grants to all that has.
+    It is for the network's threads, which else wait up to 100 ms on a busy machine. They get no
+    real-time scheduling, or a flood of messages could use up the real-time share.
     """
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
@@ -152,7 +151,7 @@ def ahead_of_others() -> Iterator[None]:
 
 
 class Window:
-    """The last values of a figure, written by one thread and read by another."""
+    """The last values of a quantity, written by one thread and read by another."""
 
     def __init__(self, length: int) -> None:
         self._values: Vector = np.zeros(length)

@@ -1,6 +1,4 @@
-"""The daemon: a thin shell that fills the controller's inbox from Zenoh and hands each frame to
-whoever cares.
-"""
+"""The daemon: fills the controller's inbox from Zenoh, publishes each frame, and records it."""
 
 from __future__ import annotations
 
@@ -33,6 +31,7 @@ from service.core.separation.separation import FARTHEST
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
+from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
@@ -45,31 +44,30 @@ from service.daemon.clock import (
 )
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.measured_tool import MeasuredTool
-from service.daemon.requests import Requests
+from service.daemon.object_listener import ObjectListener
+from service.daemon.queryables import Queryables
 from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import CellStatus
-from service.daemon.streams import Streams
-from service.daemon.things import Things
 from service.learning.skill_file import SkillError
-from service.recording.client import Scribe
+from service.recording.scribe import Scribe
 
 log = logging.getLogger("thirdhand")
 STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-SLOWEST_START_S = 120.0  # of the skill worker, on a machine that is busy
+SLOWEST_START_S = 120.0  # of the skill worker, on a busy machine
 LONG_START_S = 3.0
 MOST_NOTES = 100  # a second
-LONGEST_LATENCY_MS = 1000.0  # beyond it, stamps tell of clocks
+LONGEST_LATENCY_MS = 1000.0  # a longer one means that the clocks differ
 
 
 class LoopError(ExplainedError, RuntimeError):
-    """A control loop that cannot go on, not even to stop the arm."""
+    """The control loop cannot continue, not even to stop the arm."""
 
 
 class Daemon:
-    """One cell's loop and all around it.
+    """One cell's loop, and the threads and processes around it.
 
     `serve` runs until it is asked to stop, then stops the arm and closes everything.
     """
@@ -110,22 +108,22 @@ class Daemon:
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
         self._sources = InputMonitor(settings)
-        self._failure = ""  # of the service, the last one
+        self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._faults: deque[Event] = deque()
-        self._notes = (0, 0)  # second, and how many in it
+        self._notes = (0, 0)  # a second, and the number of notes in it
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
         self._newest = -1  # tick
         self._laps: list[tuple[str, int]] = []
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
-        lock.tell(self.endpoints)
-        self._streams = Streams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
-        self._things = Things(self._session, settings.cell, note=scribe.note, say=self.note)
+        lock.announce(self.endpoints)
+        self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
+        self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._status_now())
-        self._requests = Requests(
+        self._queryables = Queryables(
             self._session,
             settings,
             skill,
@@ -143,9 +141,7 @@ class Daemon:
         self._stop.set()
 
     def note(self, text: str) -> None:
-        """A line for the log and for the recording; of more than MOST_NOTES a second only the
-        number is told.
-        """
+        """Writes a line to log and recording; beyond MOST_NOTES a second only their number."""
         second = int(time.monotonic())
         if second != self._notes[0]:
             left_out = self._notes[1] - MOST_NOTES
@@ -161,8 +157,8 @@ class Daemon:
         self._scribe.note("requests", text, time.time_ns())
 
     def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
-        """Runs the loop until `stop`, `announce`d once requests are answered; then everything is
-        flushed and closed. What the recordings lack, in words; empty: nothing.
+        """What the recordings lack, in words (empty: nothing), once `stop` was called and
+        everything is flushed and closed. `announce` is called once requests are answered.
         """
         reporter: threading.Thread | None = None
         try:
@@ -174,10 +170,10 @@ class Daemon:
             supervised_thread.supervised("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
             self._ended.set()
-            gc.unfreeze()  # what was kept from the collector may go
+            gc.unfreeze()
             if reporter is not None:
                 reporter.join(2)
-            self._requests.close()
+            self._queryables.close()
             self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
             if missing := self._scribe.close(timeout_s=20):
@@ -185,13 +181,13 @@ class Daemon:
         return missing
 
     def _fail(self, what: str) -> None:
-        """Says what of the service failed; the next tick is at fault for it."""
+        """Reports a failure of the service; the next tick enters the mode `fault` for it."""
         self._failure = what
         self._faults.append(order("fault", what))
         self._say(what)
 
     def _fail_in_the_loop(self, what: str) -> None:
-        """Lets the loop stop the arm. Raises LoopError where no tick came since it failed last."""
+        """Has the loop stop the arm. Raises LoopError where no tick came since it failed last."""
         self._scribe.skip()
         tick = int(self._frame["tick"])
         if tick == self._failed_at:
@@ -207,7 +203,7 @@ class Daemon:
     def _ticks(self) -> Iterator[Tick]:
         inbox: list[Event] = []
         stop_by: float | None = None
-        # a period of 1 ms has no room for it
+        # a period of 1 ms has no time for it
         prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
         while True:
             index, self._late_ns = self._clock.wait(prepare)
@@ -215,8 +211,8 @@ class Daemon:
             self._began_ns = time.perf_counter_ns()
             self._laps = []
             inbox = self._streams.receive()
-            while self._requests.inbox:
-                if (event := self._requests.inbox.popleft().claimed(index)) is not None:
+            while self._queryables.inbox:
+                if (event := self._queryables.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
             while self._faults:
                 inbox.append(self._faults.popleft())
@@ -228,11 +224,11 @@ class Daemon:
                 elif time.monotonic() > stop_by:
                     log.error("the arm has not come to rest in %g s; it is commanded no more", STOP_TIMEOUT_S)
                     return
-                inbox.append(order("hold"))  # behind whatever else is asked meanwhile
+                inbox.append(order("hold"))  # last, so that no other request overrides it
             yield Tick(index, tuple(inbox))
 
     def _warm_up(self) -> None:
-        """Steps a twin through what the next tick may be: so it finds code and numbers near."""
+        """Steps a copy through a likely next tick, so that code and data are in the caches."""
         self._twin.copy_from(self._controller)
         self._twin.step(Tick(self._newest + 1, tuple(self._streams.newest.values())))
 
@@ -269,28 +265,28 @@ class Daemon:
     def _report(self) -> None:
         """Publishes the status, logs what changed, keeps the scribe alive: ten times a second."""
         run_beside_real_time()
-        said: tuple[str, str] | None = None
-        told: deque[str] = deque(maxlen=50)
+        logged_mode: tuple[str, str] | None = None
+        logged_errors: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
             status = self._status_now()
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
             self._scribe.note("status", payload.decode(), time.time_ns())
-            self._things.look()
+            self._objects.poll()
             try:
                 self._scribe.supervise()
-            except OSError as error:  # a want of descriptors or memory passes
-                errors.append(f"the scribe cannot be seen to: {error}")
+            except OSError as error:  # a lack of descriptors or memory may pass
+                errors.append(f"the scribe cannot be supervised: {error}")
             for error_text in errors:
-                if error_text not in told:
-                    told.append(error_text)
+                if error_text not in logged_errors:
+                    logged_errors.append(error_text)
                     log.warning("%s", error_text)
             for line in self._sources.news(status.sources, time.monotonic()):
                 log.warning("%s", line)
-            if status.tick >= 0 and (status.mode, status.reason) != said:
-                said = (status.mode, status.reason)
-                log.info("%s at tick %d%s", in_brief(*said), status.tick, in_full(status.because, status.remedy))
+            if status.tick >= 0 and (status.mode, status.reason) != logged_mode:
+                logged_mode = (status.mode, status.reason)
+                log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
 
     def _status_now(self) -> Status:
         """The status at this moment."""
@@ -310,12 +306,12 @@ class Daemon:
             command_heard=self._streams.is_followed,
             endpoints=self.endpoints,
             version=self._version,
-            tool_measured_m=self._measured_tool.told(state),
+            tool_measured_m=self._measured_tool.position(state),
         )
 
 
 def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> Skill:
-    """The skill in a file, with the via-points that were taught to it before. Raises SkillError."""
+    """The skill in a file, with the via-points taught to it before. Raises SkillError."""
     skill, saved = skill_worker.load(path, timeout_s=SLOWEST_START_S), SavedViaPoints(settings)
     try:
         found = saved.read(skill)
@@ -334,10 +330,10 @@ def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> Ski
 def serve(
     settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]
 ) -> str:
-    """The daemon from start to end; what the recordings lack, in words.
+    """Runs a daemon from start to end; returns what the recordings lack, in words.
 
-    From the moment that it is ready SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError,
-    OccupiedError and UnreachableError before it starts, LoopError where it ends by itself.
+    Once it is ready, SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError, OccupiedError
+    and UnreachableError before it starts, LoopError where it ends by itself.
     """
     lock = Lock(state_folder(settings), settings.cell)
     skill_worker = SkillWorker()

@@ -1,6 +1,4 @@
-"""Via-points that survive a restart: a small file in the configured folder for each skill to which
-some were taught.
-"""
+"""Via-points that survive a restart: a file for each skill that was taught."""
 
 from __future__ import annotations
 
@@ -20,25 +18,25 @@ from service.learning.skill_file import SkillError
 
 
 def state_folder(settings: Settings) -> Path:
-    """Where a cell keeps what survives a restart."""
+    """The folder of what a cell keeps over a restart."""
     return Path(settings.files.state).expanduser() / settings.cell
 
 
 def _checksum(saved: dict[str, Any]) -> str:
-    """Of all that is saved, however it is laid out."""
+    """The checksum of all that is saved, independent of its layout."""
     return hashlib.blake2b(json.dumps(saved, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 class SavedViaPoints:
-    """What was taught to each skill, on disk, so that it survives a restart; written atomically."""
+    """The via-points taught to each skill, on disk; written atomically."""
 
     def __init__(self, settings: Settings) -> None:
         self._folder = state_folder(settings)
 
     def path(self, skill: Skill) -> Path:
-        """The file for this skill, known by what it was learned from."""
-        which = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
-        return self._folder / f"places-{which}.json"
+        """The file for this skill, named by the hash of what it was learned from."""
+        digest = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
+        return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """Via-points and tolerance taught to this skill, or None.
@@ -55,7 +53,7 @@ class SavedViaPoints:
         try:
             saved = json.loads(content)
             if saved.pop("checksum") != _checksum(saved):
-                raise ValueError("its checksum is another: it was changed since; remove it, and teach them again")
+                raise ValueError("its checksum is wrong: it was changed since; remove it, and teach them again")
             request = (
                 decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
                 if saved["request"]
@@ -68,9 +66,8 @@ class SavedViaPoints:
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def draft(self, skill: Skill) -> Path:
-        """A synced temporary file of the via-points of this skill, to be renamed over the old one.
-
-        Raises SkillError.
+        """A temporary file, flushed to disk, with this skill's via-points, to be renamed over the
+        old one. Raises SkillError.
         """
         request = (
             {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}

@@ -1,6 +1,4 @@
-"""Who and what gets in to a daemon: bounds on what may come from the network, and one daemon to a
-cell.
-"""
+"""One daemon to a cell, and bounds on what it accepts from the network."""
 
 from __future__ import annotations
 
@@ -24,9 +22,9 @@ from service.contract.explain import ExplainedError
 
 MOST_SESSIONS = 64
 MOST_DESCRIPTORS = 65536
-MOST_HANDSHAKES = 16  # at once: those given up are closed together, and that holds up the others
+MOST_HANDSHAKES = 16  # at once: those that time out are closed together, which delays the others
 HANDSHAKE_TIMEOUT_MS = 2000
-ENVELOPE = 1024  # bytes of key, attachment and Zenoh's own around the largest request
+ENVELOPE = 1024  # bytes of key, attachment and Zenoh's headers around the largest request
 NEIGHBOURS_TIMEOUT_S = 5.0
 
 BOUNDS: dict[str, Any] = {
@@ -35,25 +33,19 @@ BOUNDS: dict[str, Any] = {
     "transport/unicast/accept_timeout": HANDSHAKE_TIMEOUT_MS,
     "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE,
 }
-
-
+MOST_READ = 4096  # bytes of what a lock's holder wrote
 log = logging.getLogger("thirdhand")
 
 
-MOST_TOLD = 4096  # bytes that are read of what a lock's holder says
-
-
 class OccupiedError(ExplainedError, RuntimeError):
-    """A cell that another daemon serves already."""
+    """Another daemon serves the cell already."""
 
 
 class Lock:
-    """The right to serve a cell with a folder of its own state.
+    """The lock of a cell's state folder, held by one daemon at a time, also of two that do not see
+    each other by Zenoh. The operating system releases it however the process ends.
 
-    One daemon at a time has it, also of two that do not see each other by Zenoh. The system takes
-    it back however the process ends.
-
-    Raises OccupiedError where another has it, with what that one told of itself.
+    Raises OccupiedError where another process holds it, with what that one wrote of itself.
     """
 
     def __init__(self, folder: Path, cell: str) -> None:
@@ -67,46 +59,44 @@ class Lock:
                 raise OSError(errno.EINVAL, "no regular file")
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            which = _told(self._descriptor)
+            holder = _holder(self._descriptor)
             self.close()
             raise OccupiedError(
-                f"cell {cell} is served already on this machine ({which}; {path} is locked): stop that daemon, or give "
-                "this one another --cell, or [files] state"
+                f"cell {cell} is served already on this machine ({holder}; {path} is locked): stop that daemon, or "
+                "give this one another --cell, or [files] state"
             ) from None
         except OSError as error:
             log.warning("%s: %s; a second daemon of this cell is only noticed by Zenoh", path, error.strerror)
             self.close()
         else:
-            self.tell(())
+            self.announce(())
 
-    def tell(self, endpoints: Iterable[str]) -> None:
-        """Where this process listens, for those who are refused."""
+    def announce(self, endpoints: Iterable[str]) -> None:
+        """Writes where this process listens, for the error of a second daemon."""
         if self._descriptor is not None:
-            said = json.dumps({"pid": os.getpid(), "endpoints": list(endpoints)}).encode()
+            content = json.dumps({"pid": os.getpid(), "endpoints": list(endpoints)}).encode()
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, 0)
-                os.pwrite(self._descriptor, said, 0)
+                os.pwrite(self._descriptor, content, 0)
 
     def close(self) -> None:
-        """Gives it back."""
+        """Releases it."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
 
 
-def _told(descriptor: int | None) -> str:
-    """What the holder of a lock says of itself."""
+def _holder(descriptor: int | None) -> str:
+    """The holder of a lock, by what it wrote of itself."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        said = json.loads(os.pread(descriptor, MOST_TOLD, 0))  # type: ignore[arg-type]
-        where = f"listening on {', '.join(said['endpoints'])}" if said["endpoints"] else "not listening, or not yet"
-        return f"process {said['pid']}, {where}"
-    return "a process that did not say which"
+        found = json.loads(os.pread(descriptor, MOST_READ, 0))  # type: ignore[arg-type]
+        where = f"listening on {', '.join(found['endpoints'])}" if found["endpoints"] else "not listening, or not yet"
+        return f"process {found['pid']}, {where}"
+    return "a process that did not write its number"
 
 
 def allow_descriptors() -> None:
-    """Lets this process have as many files and connections open as the system allows, so that a
-    burst of connections does not use them up.
-    """
+    """Raises the limit of open files, so that a burst of connections does not reach it."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):
@@ -114,10 +104,10 @@ def allow_descriptors() -> None:
 
 
 def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
-    """The token that says that this session's daemon serves the cell, while it is held.
+    """The liveliness token by which this session's daemon serves the cell.
 
-    Raises OccupiedError where another one on this network does; of two that start at once, both may
-    be refused.
+    Raises OccupiedError where another daemon on this network does. Of two that start at once, both
+    may be refused.
     """
     own = channels.presence(cell, str(session.zid()))
     token = session.liveliness().declare_token(own)
@@ -129,8 +119,8 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     if not others:
         return token
     token.undeclare()  # type: ignore[no-untyped-call]
-    which = f"Zenoh session {others[0].rsplit('/', 1)[1]}"
+    holder = f"Zenoh session {others[0].rsplit('/', 1)[1]}"
     with contextlib.suppress(UnreachableError, RefusedError):
         found = Client(session, cell, timeout_s=2.0).status()
-        which += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"
-    raise OccupiedError(f"cell {cell} is served already ({which}): stop that daemon, or give this one another --cell")
+        holder += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"
+    raise OccupiedError(f"cell {cell} is served already ({holder}): stop that daemon, or give this one another --cell")

@@ -1,7 +1,8 @@
-"""The skill worker: whatever computes for a request, so that the control process never does.
+"""The skill worker: another process that computes for requests, so that the control process need
+not.
 
-A skill comes back as a small pickle and its arrays in shared memory: taking it over costs the
-control process no copying and no solving.
+A skill is returned as a small pickle with its arrays in shared memory, so that the control process
+copies and solves nothing.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ TIMEOUT_S = 8.0  # shorter than a client waits
 
 
 class SkillWorker:
-    """Another process that makes skills.
+    """Another process that loads and adapts skills.
 
-    Methods may be called from any thread; one request is worked on at a time.
+    Methods may be called from any thread; it works on one request at a time.
     """
 
     def __init__(self) -> None:
@@ -88,7 +89,7 @@ class SkillWorker:
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:
-    """One message: its parts go into shared memory, only the descriptor through the socket."""
+    """Sends one message: its parts in shared memory, only the descriptor through the socket."""
     fd = child.in_memory(*parts)
     try:
         socket.send_fds(channel, [b"\0"], [fd])
@@ -116,8 +117,8 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
         skill = decoded(source, origin="the skill in force")
     if via_points is not None:
         skill = adapted(skill, via_points, tolerance=tolerance)
-    place = skill.hands[0].reshape(2, 3)
-    skill.predict(place, 0 * place, 0 * place)  # what is computed once is computed here
+    hands = skill.hands[0].reshape(2, 3)
+    skill.predict(hands, 0 * hands, 0 * hands)  # fills what is computed once
     skill.digest  # noqa: B018
     return skill
 
@@ -136,7 +137,7 @@ def _main(descriptor: int) -> None:
             buffers: list[pickle.PickleBuffer] = []
             try:
                 answer: Skill | str = _work(*request)
-            except Exception as error:  # the asker is told, whatever it was
+            except Exception as error:  # any failure is an answer to the client
                 answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
             skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
             try:

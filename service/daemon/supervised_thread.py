@@ -1,6 +1,4 @@
-"""The one place that keeps the service's threads running: work that an exception ends is told of
-and begun again.
-"""
+"""Threads of the service that are restarted, and the failure reported, after an exception."""
 
 from __future__ import annotations
 
@@ -16,8 +14,8 @@ PAUSE_S = 0.1
 def supervised(name: str, work: Callable[[], None], failed: Callable[[str], None], *, pause_s: float = PAUSE_S) -> None:
     """Runs `work` to its end.
 
-    Where an exception ends it, that is logged and told to `failed`, and after `pause_s` [s] it
-    begins anew; what `failed` raises ends it for good.
+    Where an exception ends it, that is logged, `failed` is called with it, and after `pause_s` [s]
+    it starts again. An exception that `failed` raises ends it for good.
     """
     while True:
         try:
@@ -29,7 +27,7 @@ def supervised(name: str, work: Callable[[], None], failed: Callable[[str], None
 
 
 def start(name: str, work: Callable[[], None], failed: Callable[[str], None]) -> threading.Thread:
-    """A thread of `supervised` work."""
+    """A started thread of `supervised` work."""
     thread = threading.Thread(target=supervised, args=(name, work, failed), name=name, daemon=True)
     thread.start()
     return thread

@@ -1,5 +1,5 @@
-"""Taking a demonstration: hands, tool and gripper of a cell, heard over Zenoh until somebody ends
-it or all is at rest, and written as they came.
+"""Captures a demonstration: hands, tool and gripper of a cell, received over Zenoh until somebody
+ends it or all is at rest, and written as received.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from service.contract.messages import BASE, PoseStamped, WireError, finite, in_o
 from service.contract.requests import ViaPoint, encode_json
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.core.record import Vector
-from service.demonstrations.files import far_away, from_tracker, is_by_tracker
+from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
 from service.recording.mcap_file import McapFile, machine
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
-ELSEWHERE, MOST_OTHERS = ("**/hands/*", "**/tool/pose"), 8  # what is published in other cells, or misspelt
-REST_M, REST_RAD = 0.015, 0.02  # so little moves at rest: trackers are noisy, and hands tremble
-TOLD = 0.7  # of that time samples have to cover
-MOVED = 5.0  # times that, before rest is the end
+ELSEWHERE = ("**/hands/*", "**/tool/pose")  # what is published in other cells, or misspelt
+MOST_OTHERS = 8  # of ELSEWHERE that an error lists
+REST_M, REST_RAD = 0.015, 0.02  # motion at rest: trackers are noisy, and hands tremble
+COVERED = 0.7  # share of the rest's duration that samples have to cover
+MOVED = 5.0  # times the motion at rest, which has to be seen before rest ends a capture
 KEPT_S = 0.3  # of the rest before and after the motion
-SILENT_S = 2.0  # after which nothing more is waited for
-POLL_S, TELL_S = 0.02, 0.1
+SILENT_S = 2.0  # without any message, after which a capture ends
+POLL_S, SHOW_S = 0.02, 0.1
 Until = Literal["key", "rest"]
 
 
-class TakeError(ExplainedError, RuntimeError):
-    """A demonstration that could not be taken; the message says what was not heard."""
+class CaptureError(ExplainedError, RuntimeError):
+    """A demonstration could not be captured; the message says what was not received."""
 
 
 class Sample(NamedTuple):
-    """A message as it came in: when [ns], its bytes, and what rest is told from (a hand's or the
-    tool's position [m], or joints [rad]).
+    """A message as received: when [ns], its bytes, and what rest is judged by (the position of a
+    hand or the tool [m], or joints [rad]).
     """
 
     arrived_ns: int
@@ -52,8 +53,8 @@ class Sample(NamedTuple):
     at: Vector
 
 
-class Take:
-    """What is heard of one demonstration; subscribed until closed."""
+class Capture:
+    """The samples of one demonstration; subscribed until closed."""
 
     def __init__(self, session: zenoh.Session, cell: str, settings: Settings) -> None:
         self.cell, self.settings = cell, settings
@@ -74,7 +75,7 @@ class Take:
         self.collect()
 
     def collect(self) -> None:
-        """Takes in what came since the last time; what is not readable is counted."""
+        """Decodes what came since the last call; messages that are not readable are counted."""
         for key, waiting in self._waiting.items():
             while waiting:
                 arrived_ns, payload = waiting.pop(0)
@@ -97,12 +98,12 @@ class Take:
 
     @property
     def missing(self) -> list[str]:
-        """What has not been heard yet of what a demonstration needs."""
+        """The streams that a demonstration needs and that have not been received yet."""
         tool = [] if self.samples[TOOL] or self.samples[JOINT_STATES] else [f"{TOOL} or {JOINT_STATES}"]
         return [key for key in HANDS if not self.samples[key]] + tool
 
     def check(self) -> None:
-        """Raises TakeError where a hand or the tool is too far away to be meant."""
+        """Raises CaptureError where a hand or the tool is too far away to be plausible."""
         hands = self.settings.hands
         for key in (*HANDS, TOOL):
             for sample in self.samples[key][-1:]:
@@ -112,13 +113,11 @@ class Take:
                     at = from_tracker(at, hands)
                 if np.linalg.norm(at) > FARTHEST_M:
                     why = far_away(key, pose.frame_id, pose.position, hands)
-                    raise TakeError(f"{key} is {why}. Nothing is recorded")
+                    raise CaptureError(f"{key} is {why}. Nothing is recorded")
 
     @property
     def streams(self) -> dict[str, list[Sample]]:
-        """The streams by which it is judged: both hands, and the tool as it is tracked, else the
-        arm's joints.
-        """
+        """The streams of both hands, and of the tool if it is tracked, else of the arm's joints."""
         return {key: self.samples[key] for key in (*HANDS, TOOL if self.samples[TOOL] else JOINT_STATES)}
 
     @property
@@ -127,12 +126,12 @@ class Take:
         return time.monotonic() - self._heard_s
 
     def begin(self) -> None:
-        """Forgets what came before: from here on it is kept."""
+        """Starts the demonstration: forgets all but the newest sample of each stream."""
         for samples in self.samples.values():
             del samples[:-1]
 
     def is_over(self, rest_s: float) -> bool:
-        """Whether all has been at rest for so long [s] after it moved."""
+        """Whether everything has been at rest for `rest_s` [s] after it moved."""
         now_ns = time.time_ns()
         began_ns = min(samples[0].arrived_ns for samples in self.streams.values())
         if now_ns - began_ns < 1e9 * rest_s:
@@ -140,23 +139,21 @@ class Take:
         for key, samples in self.streams.items():
             lately = _since(samples, now_ns - int(1e9 * rest_s))
             still = [sample.at for sample in lately]
-            self._moved = self._moved or (bool(still) and _apart(key, np.array([samples[0].at, still[-1]])) > MOVED)
-            told_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
-            if told_s < TOLD * rest_s or _apart(key, np.array(still)) > 1:
+            self._moved = self._moved or (bool(still) and _motion(key, np.array([samples[0].at, still[-1]])) > MOVED)
+            covered_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
+            if covered_s < COVERED * rest_s or _motion(key, np.array(still)) > 1:
                 return False
         return self._moved
 
     def keep_motion(self) -> tuple[float, float]:
-        """Keeps what came while anything moved, with KEPT_S of rest before and behind; how much was
-        left out before and behind [s].
-        """
+        """How much rest was left out before and after the motion [s]; KEPT_S of each is kept."""
         times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
         start_ns, end_ns = self.span_of_motion()
         self.keep(start_ns, end_ns)
         return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
-        """From when to when anything moves [ns], with KEPT_S of rest before and behind."""
+        """When anything moves, from and to [ns], with KEPT_S of rest before and after."""
         begins, ends = [], []
         for key, samples in self.streams.items():
             at = np.array([sample.at for sample in samples])
@@ -175,14 +172,14 @@ class Take:
             self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
 
     def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
-        """Writes the take: the messages as they came, the tool found from the joints where nobody
-        tracks it, the places of the task as far as they are told, settings and URDF attached. All
-        or nothing.
+        """Writes the demonstration, all or nothing: the messages as received and the task's places;
+        settings and URDF are attached.
 
-        Raises TakeError, OSError.
+        Where nobody tracks the tool, its poses follow from the joints. Raises CaptureError,
+        OSError.
         """
         if lacking := self.missing:
-            raise TakeError(f"nothing of {', '.join(lacking)} came in this time: no demonstration is written")
+            raise CaptureError(f"nothing of {', '.join(lacking)} came in this time: no demonstration is written")
         urdf = robot_description(self.settings)
         messages = [
             (sample.arrived_ns, key, sample.payload) for key, samples in self.samples.items() for sample in samples
@@ -190,8 +187,8 @@ class Take:
         if not self.samples[TOOL]:
             messages += self._tool_by_joints(urdf)
         if places:
-            told = cdr.encode_string(encode_json(tuple(places)).decode())
-            messages.append((min(messages)[0], PLACES, told))
+            text = cdr.encode_string(encode_json(tuple(places)).decode())
+            messages.append((min(messages)[0], PLACES, text))
         part = path.with_name(f".{path.name}.part")
         file = McapFile(part, joints=len(self.settings.joints.names))
         try:
@@ -226,19 +223,19 @@ class Take:
 
 
 def _since(samples: list[Sample], since_ns: int) -> list[Sample]:
-    """The last samples, that arrived since a time."""
+    """The samples that arrived since a time [ns]."""
     at = len(samples)
     while at and samples[at - 1].arrived_ns >= since_ns:
         at -= 1
     return samples[at:]
 
 
-def _apart(key: str, at: Vector) -> float:
-    """How far positions or joints (N, K) are apart, 1 for as far as they may be at rest."""
+def _motion(key: str, at: Vector) -> float:
+    """The largest motion in positions or joints (N, K), as a multiple of the motion at rest."""
     return float(np.ptp(at, axis=0).max()) / (REST_RAD if key == JOINT_STATES else REST_M)
 
 
-def take(
+def capture(
     session: zenoh.Session,
     cell: str,
     settings: Settings,
@@ -250,59 +247,61 @@ def take(
     longest_s: float,
     progress: Callable[[str], None] = lambda line: None,
     say: Callable[[str], None] = lambda line: None,
-) -> Take:
-    """A demonstration, taken from when hands and tool are heard until `is_ended`, until all rests
-    for `rest_s` after it moved, or until nothing came for a while.
+) -> Capture:
+    """A demonstration, captured from when hands and tool are received until `is_ended`, until all
+    rests for `rest_s` [s] after it moved, or until nothing came for SILENT_S.
 
-    Raises TakeError where they are not heard within `wait_s`.
+    Raises CaptureError where they are not received within `wait_s` [s].
     """
-    taken, others = Take(session, cell, settings), Overheard(session, *ELSEWHERE)
+    captured, others = Capture(session, cell, settings), Overheard(session, *ELSEWHERE)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()
-        say(f"waiting for {', '.join(taken.missing)} of cell {cell}")
-        while taken.missing:
+        say(f"waiting for {', '.join(captured.missing)} of cell {cell}")
+        while captured.missing:
             if time.monotonic() - begun_s > wait_s or is_ended():
-                unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in taken.malformed.items())
+                unreadable = "".join(
+                    f"; {n} messages on {key} are not readable" for key, n in captured.malformed.items()
+                )
                 meant = {channels.key(cell, key) for key in HEARD}
                 elsewhere = [key for key in others.keys if key not in meant][:MOST_OTHERS]
                 instead = f"; heard instead: {', '.join(elsewhere)}" if elsewhere else ""
-                raise TakeError(
-                    f"not heard: {', '.join(taken.missing)}{unreadable}{instead}. Are tracker and arm running, "
+                raise CaptureError(
+                    f"not heard: {', '.join(captured.missing)}{unreadable}{instead}. Are tracker and arm running, "
                     f"connected to the same place, and in cell {cell}?"
                 )
             time.sleep(POLL_S)
-            taken.collect()
+            captured.collect()
         others.close()
-        taken.check()
-        taken.begin()
-        begun_s, told_s = time.monotonic(), 0.0
+        captured.check()
+        captured.begin()
+        begun_s, shown_s = time.monotonic(), 0.0
         say(f"recording{f'; it ends once {at_rest} after they moved' if until == 'rest' else ''}")
         while not is_ended():
             time.sleep(POLL_S)
-            taken.collect()
+            captured.collect()
             lasts_s = time.monotonic() - begun_s
-            if lasts_s - told_s > TELL_S:
-                told_s = lasts_s
-                counts = ", ".join(f"{key} {len(samples)}" for key, samples in taken.streams.items())
+            if lasts_s - shown_s > SHOW_S:
+                shown_s = lasts_s
+                counts = ", ".join(f"{key} {len(samples)}" for key, samples in captured.streams.items())
                 progress(f"{lasts_s:5.1f} s   {counts}")
-            if until == "rest" and taken.is_over(rest_s):
+            if until == "rest" and captured.is_over(rest_s):
                 say(f"ended by rest: {at_rest}")
                 break
             if lasts_s > longest_s:
                 say(f"ended after {longest_s:g} s")
                 break
-            if taken.silent_s > SILENT_S:
+            if captured.silent_s > SILENT_S:
                 say(f"ended: nothing came for {SILENT_S:g} s")
                 break
     except KeyboardInterrupt:
-        if taken.missing:
+        if captured.missing:
             raise
     finally:
         others.close()
-        taken.close()
+        captured.close()
     if until == "rest":
-        before_s, behind_s = taken.keep_motion()
+        before_s, behind_s = captured.keep_motion()
         if before_s or behind_s:
             say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s behind it")
-    return taken
+    return captured

@@ -1,5 +1,5 @@
-"""Streams of poses in ROS 2 recordings of any kind, ours and others': MCAP files, bag folders,
-`.db3` and `.bag`; and which of them are the hands and the tool.
+"""Streams of poses in ROS recordings, ours and others': MCAP files, bag folders, `.db3` and `.bag`;
+and which of them are the hands and the tool.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.record import Vector
 from service.demonstrations.tool_poses import tool_poses
 from service.recording.mcap_file import RecordingError, existing
-from service.recording.mcap_reader import Fault, Messages
+from service.recording.mcap_reader import FileFault, Messages
 
 SIDES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
@@ -38,15 +38,17 @@ KINDS = (
 )
 
 
-class Source(NamedTuple):
-    """A topic, and the index in a PoseArray or the child frame in a TFMessage; empty: its only."""
+class PoseTopic(NamedTuple):
+    """A topic with poses; `part` is the index in a PoseArray or the child frame in a TFMessage,
+    empty where there is only one.
+    """
 
     topic: str
     part: str = ""
 
     @classmethod
-    def parsed(cls, text: str) -> Source:
-        """Of `TOPIC` or `TOPIC:PART`."""
+    def parsed(cls, text: str) -> PoseTopic:
+        """Given as `TOPIC` or `TOPIC:PART`."""
         topic, _, part = text.partition(":")
         return cls(topic, part)
 
@@ -55,8 +57,8 @@ class Source(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Poses (N, 7) of one stream, x y z and quaternion x y z w, in `frame`; as what they were
-    stamped (N,) [ns], and when they were recorded (N,) [ns].
+    """Poses (N, 7) of one stream, x y z and quaternion x y z w, in `frame`; their stamps (N,) [ns]
+    and the times at which they were recorded (N,) [ns].
     """
 
     name: str
@@ -75,11 +77,11 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics: dict[str, str] = {}  # types by topic, of all there are
-        self.faults: list[Fault] = []
-        self.settings: Settings | None = None  # those that were in force, where it is ours
+        self.topics: dict[str, str] = {}  # types by topic, of all topics
+        self.faults: list[FileFault] = []
+        self.settings: Settings | None = None  # those in force when it was recorded, if it is ours
         self.urdf = ""
-        self.places: tuple[ViaPoint, ...] = ()  # named, where they were told
+        self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
         self._decode: Callable[[bytes, str], Any]
@@ -91,7 +93,7 @@ class Recorded:
 
     @classmethod
     def open(cls, path: str | Path) -> Recorded:
-        """What is in an MCAP file, a bag's folder, a `.db3` or a `.bag`. Raises RecordingError."""
+        """The messages of an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
         path = Path(path)
         found = cls(path)
         if path.is_dir() or path.suffix in (".db3", ".bag"):
@@ -125,23 +127,23 @@ class Recorded:
             raise RecordingError(f"{self.path}: {PLACES}: {error}") from None
 
     def _read_bag(self) -> None:
-        from rosbags.rosbag1 import Reader as OfRos1  # heavy, and most recordings are MCAP files
-        from rosbags.rosbag2 import Reader as OfRos2
+        from rosbags.rosbag1 import Reader as Ros1Reader  # heavy, and most recordings are MCAP files
+        from rosbags.rosbag2 import Reader as Ros2Reader
 
         if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
-        of_ros_1 = self.path.suffix == ".bag"
+        is_ros_1 = self.path.suffix == ".bag"
         try:
-            with (OfRos1 if of_ros_1 else OfRos2)(self.path) as bag:
+            with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
                 self.topics = {one.topic: one.msgtype for one in bag.connections}
                 wanted = [one for one in bag.connections if one.msgtype in (*KINDS, JOINTS.type)]
                 for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
                     self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
-        except Exception as error:  # what its storages raise has no common base
+        except Exception as error:  # the exceptions of its storages have no common base
             there = "" if self.path.exists() else " It is not there."
             raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{there}") from None
         self._decode = (
-            _decoder("ROS1_NOETIC", "deserialize_ros1") if of_ros_1 else _decoder("ROS2_HUMBLE", "deserialize_cdr")
+            _decoder("ROS1_NOETIC", "deserialize_ros1") if is_ros_1 else _decoder("ROS2_HUMBLE", "deserialize_cdr")
         )
 
     def tracks(self, topic: str) -> dict[str, Parts]:
@@ -156,7 +158,7 @@ class Recorded:
         for logged_ns, data in self._raw.get(topic, ()):
             try:
                 parts = _poses(kind, self._decode(data, kind))
-            except Exception as error:  # the deserialiser says what it came upon in many ways
+            except Exception as error:  # the deserialiser raises exceptions of many kinds
                 raise RecordingError(f"{self.path}: {topic}: a {kind} that is not readable: {error}") from None
             for part, stamp_ns, frame, pose in parts:
                 if not (self.is_ours or np.isfinite(pose).all()):
@@ -166,14 +168,14 @@ class Recorded:
                 stamps, logged, poses, _ = out.setdefault(part, ([], [], [], frame))
                 if frame != out[part][3]:
                     raise RecordingError(
-                        f"{self.path}: {Source(topic, part)}: poses in frames {out[part][3]!r} and {frame!r}"
+                        f"{self.path}: {PoseTopic(topic, part)}: poses in frames {out[part][3]!r} and {frame!r}"
                     )
                 stamps.append(stamp_ns or logged_ns)
                 logged.append(logged_ns)
                 poses.append(pose)
         return out
 
-    def track(self, name: str, source: Source) -> Track:
+    def track(self, name: str, source: PoseTopic) -> Track:
         """One stream as arrays. Raises RecordingError."""
         stamps, logged, poses, frame = self.tracks(source.topic)[source.part]
         return Track(name, str(source), np.array(stamps), np.array(logged), np.array(poses), frame)
@@ -194,14 +196,15 @@ class Recorded:
         return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
 
     def closures(self, stamps: NDArray[np.int64], *, logged: bool = False) -> Vector | None:
-        """How far the gripper is closed (T,) at stamps (T,) [ns], as the first joint of the topic
-        ending in `gripper/state` tells, by the times of recording where `logged`; None where there
-        is none. Raises RecordingError.
+        """How far the gripper is closed (T,) at stamps (T,) [ns]; None where no topic ends in
+        `gripper/state`, whose first joint it is.
+
+        With `logged`, the stamps are times of recording. Raises RecordingError.
         """
         topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
         if len(topics) > 1:
             raise RecordingError(f"{self.path}: topics {', '.join(sorted(topics))}: one gripper needed")
-        told: dict[int, float] = {}
+        closure_at: dict[int, float] = {}
         for logged_ns, data in self._raw[topics[0]] if topics else ():
             try:
                 state = self._joint_state(data)
@@ -209,12 +212,12 @@ class Recorded:
                 raise RecordingError(f"{self.path}: {topics[0]}: {error}") from None
             if not np.isfinite(state.position[:1]).all() or not state.position:
                 raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {state.stamp_ns} ns")
-            told[logged_ns if logged else state.stamp_ns or logged_ns] = state.position[0]
-        if not told:
+            closure_at[logged_ns if logged else state.stamp_ns or logged_ns] = state.position[0]
+        if not closure_at:
             return None
-        at = np.array(sorted(told), np.int64)
-        ways = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
-        out: Vector = np.interp(*ways, [told[i] for i in at.tolist()])
+        at = np.array(sorted(closure_at), np.int64)
+        times = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out: Vector = np.interp(*times, [closure_at[i] for i in at.tolist()])
         out.setflags(write=False)
         return out
 
@@ -237,23 +240,23 @@ class Recorded:
         exact = [topic for topic in found if f"/{topic}".endswith(f"/{JOINT_STATES}")]
         return exact[0] if len(exact) == 1 else found[0] if len(found) == 1 else ""
 
-    def streams(self) -> Iterator[tuple[Source, int]]:
-        """Every stream of poses, and how many there are in it."""
+    def streams(self) -> Iterator[tuple[PoseTopic, int]]:
+        """Every stream of poses, and its number of poses."""
         for topic in sorted(self._raw):
             if self.topics[topic] in KINDS:
                 for part, (stamps, *_) in self.tracks(topic).items():
-                    yield Source(topic, part), len(stamps)
+                    yield PoseTopic(topic, part), len(stamps)
 
 
-def chosen(recorded: Recorded, given: Mapping[str, Source], settings: Settings) -> tuple[list[Track], list[str]]:
-    """The tracks of left hand, right hand and tool; and in words what was not said, but found.
+def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Settings) -> tuple[list[Track], list[str]]:
+    """The tracks of left hand, right hand and tool; and in words those that were guessed.
 
-    By what is `given`, else by the topics' endings, the tool else by joint states, all else by
-    words in the names. Raises RecordingError.
+    Topics are found by what is `given`, else by the ends of their names, the tool else by joint
+    states, all else by words in their names. Raises RecordingError.
     """
     urdf = recorded.urdf or robot_description(settings)
     tracks: list[Track] = []
-    said: list[str] = []
+    guessed: list[str] = []
     for name in SIDES:
         source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
         joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
@@ -261,34 +264,34 @@ def chosen(recorded: Recorded, given: Mapping[str, Source], settings: Settings) 
             joints = recorded.joint_topic(settings)
         if joints:
             tracks.append(recorded.tool_by_joints(joints, settings, urdf))
-            said.append(f"tool found from {joints} by the arm's URDF")
+            guessed.append(f"tool found from {joints} by the arm's URDF")
             continue
         if source is None:
             source = _by_words(recorded, name)
-            said.append(f"{name} is {source}")
+            guessed.append(f"{name} is {source}")
         tracks.append(recorded.track(ENDINGS[name], source))
-    return tracks, said
+    return tracks, guessed
 
 
-def _given(recorded: Recorded, name: str, wanted: Source) -> Source:
+def _given(recorded: Recorded, name: str, wanted: PoseTopic) -> PoseTopic:
     """The stream that was named, as the recording has it. Raises RecordingError."""
     topic = next((topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), "")
     if topic and recorded.topics[topic] == JOINTS.type and name == "tool":
-        return Source(topic)
+        return PoseTopic(topic)
     if not topic or recorded.topics[topic] not in KINDS:
-        what = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
-        raise RecordingError(f"{recorded.path}: --{name} {wanted}: {what}; {_what_is_there(recorded)}")
+        problem = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
+        raise RecordingError(f"{recorded.path}: --{name} {wanted}: {problem}; {_poses_in(recorded)}")
     parts = list(recorded.tracks(topic))
     if wanted.part in parts:
-        return Source(topic, wanted.part)
+        return PoseTopic(topic, wanted.part)
     if len(parts) == 1 and not wanted.part:
-        return Source(topic, parts[0])
+        return PoseTopic(topic, parts[0])
     which = "an index" if recorded.topics[topic] == MANY else "a child frame"
     needed = f"{which} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
     raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
 
 
-def _by_ending(recorded: Recorded, name: str) -> Source | None:
+def _by_ending(recorded: Recorded, name: str) -> PoseTopic | None:
     """The stream of PoseStamped under our own name, whatever the cell. Raises RecordingError."""
     found = [
         topic
@@ -299,11 +302,11 @@ def _by_ending(recorded: Recorded, name: str) -> Source | None:
         raise RecordingError(
             f"{recorded.path} has two streams of {ENDINGS[name]}: {found[0]} and {found[1]}; --{name} says which"
         )
-    return Source(found[0]) if found else None
+    return PoseTopic(found[0]) if found else None
 
 
-def _by_words(recorded: Recorded, name: str) -> Source:
-    """The one stream whose name says so. Raises RecordingError."""
+def _by_words(recorded: Recorded, name: str) -> PoseTopic:
+    """The one stream with a fitting word in its name. Raises RecordingError."""
     others = {word for other in SIDES[:2] if other != name for word in WORDS[other]}
     streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
     words = {source: _words(str(source)) for source in streams}
@@ -316,7 +319,7 @@ def _by_words(recorded: Recorded, name: str) -> Source:
     several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
     raise RecordingError(
         f"{recorded.path} has no topic ending in {ENDINGS[name]} with {POSE.type}{also}{several}; "
-        f"{_what_is_there(recorded)}; --{name} TOPIC[:PART] names another"
+        f"{_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
     )
 
 
@@ -325,7 +328,7 @@ def _words(text: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)}
 
 
-def _what_is_there(recorded: Recorded) -> str:
+def _poses_in(recorded: Recorded) -> str:
     poses = ", ".join(f"{source} ({count})" for source, count in recorded.streams())
     return f"its topics: {', '.join(sorted(recorded.topics)) or 'none'}; of these hold poses: {poses or 'none'}"
 

@@ -1,4 +1,4 @@
-"""Where the tool is, by the arm's joints: for demonstrations in which nobody tracks the tool."""
+"""Tool poses by forward kinematics, for demonstrations in which nobody tracks the tool."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from service.config import Settings
 from service.core.arm.arm import Arm
 from service.core.record import Vector
 
-MOST_HZ = 100  # arms tell their joints more often than a demonstration needs
+MOST_HZ = 100  # of poses; arms publish their joints more often than a demonstration needs
 
 
 def tool_poses(
     settings: Settings, urdf: str, stamps_ns: NDArray[np.int64], joints: Vector
 ) -> tuple[Vector, NDArray[np.int64]]:
     """The tool's poses (M, 7), x y z [m] and quaternion x y z w in frame `base`, for joints (N, J)
-    [rad] told at `stamps_ns` (N,); and which of the N these are: at most MOST_HZ of a second.
+    [rad] stamped `stamps_ns` (N,); and the indices (M,) of these, at most MOST_HZ a second.
     """
     lasts_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
     step = max(1, int(len(stamps_ns) / lasts_s / MOST_HZ + 0.01)) if lasts_s else 1
     kept = np.arange(0, len(stamps_ns), step)
     arm = Arm(settings, urdf)
-    found = [arm.at(q) for q in joints[kept]]
-    turns = Rotation.from_matrix([one.rotation for one in found]).as_quat()
-    return np.hstack([[one.position for one in found], turns]), kept
+    poses = [arm.at(q) for q in joints[kept]]
+    quaternions = Rotation.from_matrix([pose.rotation for pose in poses]).as_quat()
+    return np.hstack([[pose.position for pose in poses], quaternions]), kept

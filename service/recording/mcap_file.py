@@ -1,6 +1,4 @@
-"""MCAP files as we write them: profile `ros2`, small chunks with checksums, and whole records even
-where the disk is full.
-"""
+"""Writes MCAP files: profile `ros2`, small checked chunks, whole records also on a full disk."""
 
 from __future__ import annotations
 
@@ -19,16 +17,16 @@ from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 from service.core.frame import definitions
 
-CHUNK_BYTES = 128 * 1024  # what a kill can lose between two flushes, and what a reader must hold
+CHUNK_BYTES = 128 * 1024  # a kill loses at most this between two flushes; a reader holds at most this
 
 
 class RecordingError(ExplainedError, ValueError):
-    """A file that is not the recording it should be: says which, why, and what would do."""
+    """A file is not the recording that is needed; the message says why, and what would be."""
 
 
 @functools.cache
 def machine() -> dict[str, str]:
-    """What the result of a tick may depend on besides its input: versions, CPU, BLAS."""
+    """Versions, CPU and BLAS: what the result of a tick may depend on besides its input."""
     found = {
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -49,9 +47,9 @@ def machine() -> dict[str, str]:
 
 
 class _WholeWrites:
-    """A file in which a piece that does not fit leaves nothing behind: it ends with the one before.
+    """A file that holds whole writes only: one that does not fit is taken back.
 
-    Unbuffered, so that what was written is with the system, and an error comes where it belongs.
+    Unbuffered: written data is with the system at once, and an error is raised by its own write.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +74,7 @@ class _WholeWrites:
         return self._size
 
     def flush(self) -> None:
-        """All is written already."""
+        """Does nothing: all data is written already."""
 
     def links(self) -> tuple[int, tuple[int, int]]:
         """How many names the file has, and which file it is."""
@@ -90,18 +88,18 @@ class _WholeWrites:
 
 
 class McapFile:
-    """An MCAP file being written: profile `ros2`, zstd, small chunks, channels made as they are
-    needed.
+    """An MCAP file that is being written: profile `ros2`, zstd, small chunks.
 
-    Chunks end only where `part_ends` says that they may: what belongs together is kept or lost
-    together. Errors of the file system are raised; then the file holds what was written before.
+    Channels are made at their first message. A chunk ends only at a call of `part_ends`, so the
+    messages of one tick are kept or lost together. Errors of the file system are raised; the file
+    then holds what was written before.
     """
 
     def __init__(self, path: Path, *, joints: int, attached: bool = True) -> None:
-        """`joints` is how many the arm has: the layouts of what is recorded of it depend on it.
+        """`joints` is the arm's number of joints, on which the schemas depend.
 
-        One to which attachments and metadata are not `attached` has no index of them: the summary
-        would tell of groups that are not there.
+        Without attachments and metadata (`attached` False) the file has no index of them: its
+        summary would list groups that are empty.
         """
         self.path = path
         self._stream = _WholeWrites(path)
@@ -141,7 +139,7 @@ class McapFile:
         self._pending += len(data)
 
     def part_ends(self) -> bool:
-        """Says that a chunk may end here; whether it did, with all before it in the file."""
+        """Lets a chunk end here; whether it did, so that all before is in the file."""
         if self._pending < CHUNK_BYTES:
             return False
         self.flush()
@@ -153,13 +151,11 @@ class McapFile:
         self._pending = 0
 
     def lost_name(self) -> str:
-        """Empty while the file is where it was made; else `removed`, or `moved` if it has another
-        name.
-        """
-        links, itself = self._stream.links()
+        """Empty while the file is at its path; else `removed`, or `moved` to another name."""
+        links, own_file = self._stream.links()
         with contextlib.suppress(OSError):
-            there = os.stat(self.path)
-            if (there.st_dev, there.st_ino) == itself:
+            found = os.stat(self.path)
+            if (found.st_dev, found.st_ino) == own_file:
                 return ""
         return "moved" if links else "removed"
 
@@ -172,21 +168,21 @@ class McapFile:
                 self._stream.close()
 
     def abandon(self) -> None:
-        """Closes the file without an end: it holds what was written."""
+        """Closes the file as it is, without a summary."""
         self._stream.close()
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a recording that is there.
+    """The path of an MCAP file that exists.
 
-    Raises RecordingError with the names of those that are.
+    Raises RecordingError, which lists the recordings in its folder.
     """
     path = Path(path)
     if path.is_dir():
         raise RecordingError(f"{path} is a folder, a recording needed")
     if not path.is_file():
-        there = sorted(found.name for found in path.parent.glob("*.mcap"))
-        names = f" There are: {', '.join(there)}." if there else ""
+        found = sorted(other.name for other in path.parent.glob("*.mcap"))
+        names = f" There are: {', '.join(found)}." if found else ""
         raise RecordingError(f"no recording {path}.{names}")
     with path.open("rb") as stream:
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:

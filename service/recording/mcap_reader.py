@@ -1,6 +1,4 @@
-"""MCAP files as we read them: every checksum verified, up to where a file was cut, and on behind
-what is damaged.
-"""
+"""Reads MCAP files: verifies every checksum, reads up to a cut, continues behind damage."""
 
 from __future__ import annotations
 
@@ -44,9 +42,10 @@ _BROKEN = (
 )
 
 
-class Fault(NamedTuple):
-    """What of a file cannot be read: from which byte on, how many, why, and whether its end is
-    missing (a cut) or there is more behind (damage).
+class FileFault(NamedTuple):
+    """A part of a file that cannot be read: first byte, size, cause.
+
+    `cut`: the end of the file is missing. Else the file continues behind the damage.
     """
 
     cut: bool
@@ -63,13 +62,13 @@ class Fault(NamedTuple):
 class Messages:
     """The schema, channel and message of every message of an MCAP file in file order.
 
-    `faults` are those met so far: one that is new when a message comes lies before that message.
-    `attachments` and `metadata` are those met so far whose checksums are right.
+    `faults`, `attachments` and `metadata` are those met so far. A fault that is new when a message
+    comes lies before that message. Attachments with a wrong checksum are left out.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.faults: list[Fault] = []
+        self.faults: list[FileFault] = []
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
 
@@ -86,7 +85,7 @@ class Messages:
                     elif not unnamed:
                         unnamed = True
                         why = f"messages on channel {record.channel_id}, whose name is not there"
-                        self.faults.append(Fault(False, stream.tell(), 0, why))
+                        self.faults.append(FileFault(False, stream.tell(), 0, why))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -100,7 +99,7 @@ class Messages:
 class _Reading:
     """One pass over a file."""
 
-    def __init__(self, stream: IO[bytes], faults: list[Fault]) -> None:
+    def __init__(self, stream: IO[bytes], faults: list[FileFault]) -> None:
         self._stream, self._faults = stream, faults
         self._size = stream.seek(0, 2)
         self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None once it cannot be known
@@ -146,16 +145,16 @@ class _Reading:
             try:
                 opcode, end = self._head(at)
                 content = self._bytes(at + _HEAD.size, end - at - _HEAD.size)
-                found = self._understood(opcode, content)
+                found = self._parsed(opcode, content)
             except _BROKEN as error:
                 self._checksum = None
-                follows = self._follows(at, end)
+                resume_at = self._resume_at(at, end)
                 why = str(error) or type(error).__name__
-                if follows is None:
-                    self._faults.append(Fault(not self._closed, at, self._size - at, why))
+                if resume_at is None:
+                    self._faults.append(FileFault(not self._closed, at, self._size - at, why))
                     return
-                self._faults.append(Fault(False, at, follows - at, why))
-                at = follows
+                self._faults.append(FileFault(False, at, resume_at - at, why))
+                at = resume_at
                 continue
             if self._checksum is not None:
                 self._checksum = zlib.crc32(content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum))
@@ -176,8 +175,8 @@ class _Reading:
             raise ValueError(f"a record of {length} bytes reaches over the end of the file")
         return opcode, at + _HEAD.size + length
 
-    def _understood(self, opcode: int, content: bytes) -> list[McapRecord]:
-        """What a record holds, with its checksum verified."""
+    def _parsed(self, opcode: int, content: bytes) -> list[McapRecord]:
+        """The records in one record, its checksum verified; several for a chunk."""
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.CHUNK:
             self._chunked = True
@@ -194,18 +193,18 @@ class _Reading:
                 raise ValueError("an attachment's checksum is wrong")
             return [Attachment.read(stream)]
         if opcode == Opcode.DATA_END:
-            told = DataEnd.read(stream).data_section_crc
-            if told and self._checksum is not None and told != self._checksum:
+            recorded = DataEnd.read(stream).data_section_crc
+            if recorded and self._checksum is not None and recorded != self._checksum:
                 why = "the checksum over all data is wrong, outside of what has one of its own"
-                self._faults.append(Fault(False, 0, self._stream.tell(), why))
+                self._faults.append(FileFault(False, 0, self._stream.tell(), why))
             return []
         if opcode not in _NAMING:
             return []
         return [_NAMING[opcode].read(stream)]
 
-    def _follows(self, at: int, end: int | None) -> int | None:
-        """Where reading can go on behind a record that is broken: at its end if a record is there,
-        else at the next whole chunk, if there is one.
+    def _resume_at(self, at: int, end: int | None) -> int | None:
+        """The byte at which reading continues behind a broken record: its end if a record begins
+        there, else the next whole chunk; None where there is none.
         """
         if end is not None:
             try:
@@ -220,9 +219,9 @@ class _Reading:
         block_at = start
         while block_at < self._size:
             block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)
-            places = sorted(place for mark in _COMPRESSIONS for place in _places(block, mark))
-            for place in places:
-                at = block_at + place - _BEFORE_COMPRESSION
+            offsets = sorted(offset for mark in _COMPRESSIONS for offset in _offsets(block, mark))
+            for offset in offsets:
+                at = block_at + offset - _BEFORE_COMPRESSION
                 if at >= start and self._is_chunk(at):
                     return at
             block_at += _BLOCK
@@ -242,22 +241,22 @@ class _Reading:
         return True
 
     def _end(self, at: int) -> None:
-        """Verifies what stands behind the data."""
+        """Verifies what follows the data section."""
         if self._closed:
             _, _, start, _, checksum = _FOOTER.unpack(self._footer)
             if checksum and start and not self._summary():
-                self._faults.append(Fault(False, at, self._size - at, "the summary's checksum is wrong"))
+                self._faults.append(FileFault(False, at, self._size - at, "the summary's checksum is wrong"))
         else:
             whole = self._footer[:1] == bytes([Opcode.FOOTER])
             why = "the closing bytes are not those of MCAP" if whole else "nothing closes the file"
-            self._faults.append(Fault(not whole, at, self._size - at, why))
+            self._faults.append(FileFault(not whole, at, self._size - at, why))
 
     def _bytes(self, at: int, count: int) -> bytes:
         self._stream.seek(at)
         return self._stream.read(count)
 
 
-def _places(block: bytes, mark: bytes) -> Iterator[int]:
+def _offsets(block: bytes, mark: bytes) -> Iterator[int]:
     at = block.find(mark)
     while at >= 0:
         yield at

@@ -1,6 +1,4 @@
-"""Where a cell's recordings go: the names of the next ones, and which old ones are removed to keep
-within the limits.
-"""
+"""The paths of a cell's recordings: names for the next ones; old ones beyond the limits."""
 
 from __future__ import annotations
 
@@ -17,11 +15,11 @@ from service.shipped import recordings
 MB = 1e6
 
 
-class Places:
+class RecordingPaths:
     """The paths of one recording after another.
 
-    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, in the order of time by their names;
-    else they are `recording` and `rrd`, the later ones numbered.
+    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, which sort by time. Else they are
+    `recording` and `rrd`, the later ones numbered.
     """
 
     def __init__(
@@ -32,11 +30,11 @@ class Places:
         self._explicit = [None if path is None else Path(path) for path in (recording, rrd)]
         self._number = attempt
         self._newest = datetime.min.replace(tzinfo=UTC)
-        self._ours: dict[str, bool] = {}  # by the names of recordings
+        self._own: dict[str, bool] = {}  # whether a recording is this cell's, by its stem
         self._cell = settings.cell.replace("/", "-")
 
     def next(self) -> tuple[Path | None, Path | None]:
-        """Paths for the next recording and the drawing beside it; None: not wanted."""
+        """Paths of the next recording and of the drawing beside it; None where it is not wanted."""
         if self._folder is None:
             while True:
                 number, self._number = self._number, self._number + 1
@@ -59,16 +57,14 @@ class Places:
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
     def prune(self, writing: Path | None) -> list[Path]:
-        """Removes this cell's oldest recordings beyond the limits, never the one being written;
-        what was removed.
-        """
+        """The oldest recordings beyond the limits, now removed; never the one being written."""
         keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
         if self._folder is None or not (keep_bytes or keep_s):
             return []
-        ours = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
+        own_names = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
         found: dict[str, list[tuple[Path, int, float]]] = {}
         for path in self._folder.glob("*Z*.*"):
-            if path.suffix in (".mcap", ".rrd") and ours.fullmatch(path.stem) and self._is_ours(path):
+            if path.suffix in (".mcap", ".rrd") and own_names.fullmatch(path.stem) and self._is_own(path):
                 with contextlib.suppress(OSError):
                     about = path.stat()
                     found.setdefault(path.stem, []).append((path, about.st_size, about.st_mtime))
@@ -87,17 +83,18 @@ class Places:
                     removed.append(path)
         return removed
 
-    def _is_ours(self, path: Path) -> bool:
-        """Whether a recording, and the drawing beside it, is not another cell's, whose name with
-        its slashes replaced is the same.
+    def _is_own(self, path: Path) -> bool:
+        """Whether a recording, or the drawing beside it, is this cell's.
+
+        Another cell's name may be the same once its slashes are replaced.
         """
-        if path.stem not in self._ours:
+        if path.stem not in self._own:
             messages = Messages(path.with_suffix(".mcap"))
             with contextlib.suppress(OSError):
                 next(iter(messages), None)
             cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
-            self._ours[path.stem] = cell == self._settings.cell
-        return self._ours[path.stem]
+            self._own[path.stem] = cell == self._settings.cell
+        return self._own[path.stem]
 
 
 def skills_folder(settings: Settings) -> Path:

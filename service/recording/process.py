@@ -1,8 +1,8 @@
-"""The scribe's own process: takes messages from a socket, writes the recordings, feeds the viewer.
+"""The scribe's own process: reads messages from a socket, writes the recordings, feeds the viewer.
 
-It ends when the other side of the socket is closed or dead, with everything written that it was
-told. It cannot stay behind: the death of its daemon wakes it where it was stopped, and where it
-hangs, an alarm that it no longer puts off ends it.
+It ends when the other side of the socket is closed or dead, once everything received is written. It
+cannot outlive its daemon for long: the daemon's death continues a stopped scribe, and an alarm ends
+one that hangs.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ import numpy as np
 from service import child
 from service.config import urdf_path
 from service.core.frame import state_layout
-from service.recording.paths import Places
-from service.recording.protocol import LARGEST_MESSAGE, Report, Task, unpack, unpack_note
+from service.recording.paths import RecordingPaths
+from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, unpack, unpack_note
 from service.recording.segments import Segments
 
 if TYPE_CHECKING:
@@ -42,18 +42,17 @@ FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 2.0
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
-HUNG_S, END_S = 30, 20  # whole seconds without a turn of the main thread, and for ending; then it is killed
+HUNG_S = 30  # whole seconds without a turn of the main loop, after which it is killed
+END_S = 20  # whole seconds for ending, after which it is killed
 _PR_SET_PDEATHSIG = 1  # of Linux; Python does not name it
-# What Rerun's own program says on standard error, in plain letters: not that a viewer reads slowly,
-# which is the viewer's matter, as batches that it does not take are dropped.
-RERUN_SAYS = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
-POLL_S = 0.02  # asleep in between, so that the sender has nobody to wake: that would cost it 25 µs a tick
+# Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
+# are dropped.
+RERUN_LOG = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
+POLL_S = 0.02  # it polls, because waking a blocked reader would cost the sender 25 µs a tick
 
 
 class DrawingThread:
-    """The viewer on a thread of its own: where it falls behind or hangs, on a full disk say, the
-    recording does not.
-    """
+    """The viewer on a thread of its own: where it falls behind or hangs, the recording does not."""
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
@@ -66,11 +65,11 @@ class DrawingThread:
 
     @property
     def rrd(self) -> str | None:
-        """The file drawn into, or about to be."""
+        """The file that is drawn into, or will be next."""
         return self.viewer.rrd if self._wanted_file is None else str(self._wanted_file)
 
     def put(self, act: Callable[[], None]) -> None:
-        """Has something drawn, later; the oldest that waits too long is dropped."""
+        """Queues a drawing; beyond DRAW_QUEUED the oldest is dropped."""
         self._waiting.append(act)
         if len(self._waiting) > DRAW_QUEUED:
             oldest = self._waiting.popleft()
@@ -80,7 +79,7 @@ class DrawingThread:
             self.dropped += 1
 
     def draw_into(self, rrd: Path) -> None:
-        """Has the file end, and what is put from now on go into another."""
+        """Ends the file; what is queued from now on is drawn into another."""
         self._wanted_file = rrd
         self._waiting.append(rrd)
 
@@ -101,33 +100,33 @@ class DrawingThread:
         self.viewer.close()
 
     def close(self) -> None:
-        """Ends the file and the live view, if that is possible in time."""
+        """Ends the file and the live view, within DRAW_END_S at most."""
         self._ended.set()
         self._thread.join(DRAW_END_S)
 
 
 class ScribeProcess:
-    """What the process does with what it is told.
+    """Writes and draws the messages that the process receives.
 
-    A failure ends what it happened in, is reported, and spares the rest.
+    A failure is reported, and ends only the part that failed.
     """
 
-    def __init__(self, task: Task, skill: bytes | None, source: socket.socket) -> None:
+    def __init__(self, setup: ScribeSetup, skill: bytes | None, source: socket.socket) -> None:
         self._source = source
-        self._joints = len(task.settings.joints.names)
+        self._joints = len(setup.settings.joints.names)
         self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
-        self._said_dropped = self._said_kept = 0
-        drawn = task.rrd is not None or (task.folder is not None and task.settings.files.rerun)
-        if drawn or task.live_port is not None:
-            from service.viewer.stream import Viewer  # half a second that a scribe without viewer need not spend
+        self._reported_dropped = self._reported_kept = 0
+        is_drawn = setup.rrd is not None or (setup.folder is not None and setup.settings.files.rerun)
+        if is_drawn or setup.live_port is not None:
+            from service.viewer.stream import Viewer  # its import takes half a second
 
-            urdf = urdf_path(task.settings)
-            viewer = Viewer(urdf=urdf, live_port=task.live_port, settings=task.settings, skill=skill)
+            urdf = urdf_path(setup.settings)
+            viewer = Viewer(urdf=urdf, live_port=setup.live_port, settings=setup.settings, skill=skill)
             self._drawing = DrawingThread(viewer)
-        places = Places(task.settings, task.folder, task.recording, task.rrd, attempt=task.attempt)
-        self._segments = Segments(task.settings, places, say=self._errors.append, draw=self._draw_into)
-        state = None if task.state is None else np.frombuffer(task.state, state_layout(self._joints))[0]
+        paths = RecordingPaths(setup.settings, setup.folder, setup.recording, setup.rrd, attempt=setup.attempt)
+        self._segments = Segments(setup.settings, paths, say=self._errors.append, draw=self._draw_into)
+        state = None if setup.state is None else np.frombuffer(setup.state, state_layout(self._joints))[0]
         self._segments.begin(skill, state)
         self.report()
 
@@ -136,16 +135,16 @@ class ScribeProcess:
         self._drawing.draw_into(rrd)
 
     def report(self) -> None:
-        """Says what went wrong, where things are written, and how much is."""
+        """Sends a report: new errors, where files are written, and how many ticks are on disk."""
         viewer = None if self._drawing is None else self._drawing.viewer
         while viewer is not None and viewer.problems:
             self._errors.append(viewer.problems.pop(0))
-        if self._drawing is not None and self._drawing.dropped > 2 * self._said_dropped:
-            self._said_dropped = self._drawing.dropped
-            self._errors.append(f"the drawing cannot keep up: {self._said_dropped} of its entries dropped")
+        if self._drawing is not None and self._drawing.dropped > 2 * self._reported_dropped:
+            self._reported_dropped = self._drawing.dropped
+            self._errors.append(f"the drawing cannot keep up: {self._reported_dropped} of its entries dropped")
         segments = self._segments
-        self._said_kept = segments.kept
-        report = Report(
+        self._reported_kept = segments.kept
+        report = ScribeReport(
             state=segments.state,
             recording=None if segments.path is None else str(segments.path),
             rrd=None if self._drawing is None else self._drawing.rrd,
@@ -161,10 +160,8 @@ class ScribeProcess:
             self._errors.clear()
 
     def report_kept(self) -> None:
-        """Says how much is on disk, if that is more by now: what is not said counts as lost with a
-        process that is killed.
-        """
-        if self._segments.kept != self._said_kept:
+        """Sends a report if more is on disk: unreported ticks count as lost if it dies."""
+        if self._segments.kept != self._reported_kept:
             self.report()
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
@@ -176,15 +173,15 @@ class ScribeProcess:
                 viewer = self._drawing.viewer
                 self._drawing.put(lambda: viewer.note(key, text, time_ns))
             return
-        told = unpack(message, skills, joints=self._joints)
-        time_ns = int(told.timing["time_ns"])
-        if missing := self._segments.write(told):
-            self._show(f"{missing} ticks before tick {told.tick.index} are not recorded", "WARN", time_ns)
+        received = unpack(message, skills, joints=self._joints)
+        time_ns = int(received.timing["time_ns"])
+        if missing := self._segments.write(received):
+            self._show(f"{missing} ticks before tick {received.tick.index} are not recorded", "WARN", time_ns)
         if self._drawing is not None:
-            viewer, events = self._drawing.viewer, [(event.kind, event.payload) for event in told.tick.inbox]
-            if (skill := told.skill) is not None:
+            viewer, events = self._drawing.viewer, [(event.kind, event.payload) for event in received.tick.inbox]
+            if (skill := received.skill) is not None:
                 self._drawing.put(lambda: viewer.learn(skill))
-            self._drawing.put(lambda: viewer.add(told.frame, time_ns, told.timing, events))
+            self._drawing.put(lambda: viewer.add(received.frame, time_ns, received.timing, events))
 
     def _show(self, text: str, level: str, time_ns: int) -> None:
         if self._drawing is not None:
@@ -192,7 +189,7 @@ class ScribeProcess:
             self._drawing.put(lambda: viewer.log(text, level, time_ns))
 
     def flush(self) -> None:
-        """Hands what was recorded to the system, and says so."""
+        """Hands what was recorded to the operating system, and reports it."""
         self._segments.flush()
         self.report()
 
@@ -206,7 +203,7 @@ class ScribeProcess:
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
-    """The next message and the files that came along; no bytes: the other side is gone."""
+    """The next message and the files sent along; an empty message: the other side is gone."""
     while True:
         try:
             size, ancillary, _, _ = source.recvmsg_into([buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT)
@@ -218,10 +215,10 @@ def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[byte
 
 
 def _work(source: socket.socket) -> None:
-    """Writes what comes until the other side is gone."""
+    """Writes and draws what is received until the other side is gone."""
     buffer = bytearray(LARGEST_MESSAGE)
     first, skills = _receive(source, buffer)
-    task = msgspec.json.decode(first, type=Task)
+    setup = msgspec.json.decode(first, type=ScribeSetup)
     waiting: deque[tuple[bytes, list[bytes]]] = deque()
     ended = threading.Event()
 
@@ -232,11 +229,11 @@ def _work(source: socket.socket) -> None:
                 while len(waiting) >= QUEUED:
                     time.sleep(POLL_S)
         except ConnectionError:
-            pass  # as good as its end
+            pass  # the same as its end
         finally:
-            ended.set()  # whatever happened: without a reader there is nothing to wait for
+            ended.set()  # in any case: without this reader nothing more comes
 
-    scribe = ScribeProcess(task, skills[0] if skills else None, source)
+    scribe = ScribeProcess(setup, skills[0] if skills else None, source)
     threading.Thread(target=read, name="socket", daemon=True).start()
     flushed = time.monotonic()
     over = False
@@ -258,13 +255,13 @@ def _work(source: socket.socket) -> None:
 def main() -> None:
     """Serves the socket whose descriptor is the only argument."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # it ends when the socket does, with all that was told
-    for name, value in RERUN_SAYS.items():
+        signal.signal(number, signal.SIG_IGN)  # it ends with its socket, once all is written
+    for name, value in RERUN_LOG.items():
         os.environ.setdefault(name, value)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(HUNG_S)
-    # Its daemon's death makes it go on where it was stopped, and then it sees the socket's end. The
-    # signal comes also when only the thread that started it ends: so it must be a harmless one.
+    # The daemon's death continues this process if it was stopped; then it sees the socket's end.
+    # The signal also comes when only the thread that started it ends, so it must be harmless.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -277,7 +274,7 @@ def main() -> None:
     except BaseException:
         traceback.print_exc()
     finally:
-        os._exit(code)  # without waiting for a drawing that hangs
+        os._exit(code)  # does not wait for a drawing that hangs
 
 
 if __name__ == "__main__":

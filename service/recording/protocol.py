@@ -1,6 +1,4 @@
-"""The messages by which the control loop tells the scribe process of each tick, and the task it is
-started with.
-"""
+"""The messages between control process and scribe: setup, ticks, notes and reports."""
 
 from __future__ import annotations
 
@@ -20,15 +18,15 @@ LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
 LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
 
 _TICK, NOTE = 1, 2
-HEAD = struct.Struct("<BBHIq")  # type, what follows, number of events, ticks lost before, index
+HEAD = struct.Struct("<BBHIq")  # type, flags of what follows, number of events, ticks lost before, index
 _EVENT = struct.Struct("<BI")  # kind, bytes
 _HAS_STATE, _HAS_SKILL = 1, 2
-_ELSEWHERE = 0xFFFFFFFF  # the bytes are in a file in memory that comes along
+_ELSEWHERE = 0xFFFFFFFF  # as a size: the bytes are in a memory file that is sent along
 _SKILL = EVENT_NUMBERS["skill"]
 
 
-class Told(NamedTuple):
-    """What one message tells of a tick."""
+class TickMessage(NamedTuple):
+    """One tick as it is sent to the scribe; `lost` ticks before it were not sent."""
 
     tick: Tick
     frame: Record
@@ -39,7 +37,7 @@ class Told(NamedTuple):
 
 
 def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, lost: int, with_skill: bool) -> bytes:
-    """One message about a tick; the bytes of skills are not in it."""
+    """One message about a tick, without the bytes of skills."""
     head, bodies = [b""], []
     for event in tick.inbox:
         kind = EVENT_NUMBERS[event.kind]
@@ -56,11 +54,11 @@ def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, los
     return b"".join(head + bodies)
 
 
-def unpack(message: bytes, skills: list[bytes], *, joints: int) -> Told:
-    """What a message about a tick of an arm with `joints` joints tells; `skills` are the files that
-    came along, in order.
+def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage:
+    """The tick in a message, for an arm with so many joints; `skills` are the files sent along, in
+    order.
     """
-    of_frame, of_state = frame_layout(joints), state_layout(joints)
+    frame_type, state_type = frame_layout(joints), state_layout(joints)
     _, follows, count, lost, index = HEAD.unpack_from(message)
     kinds = [_EVENT.unpack_from(message, HEAD.size + i * _EVENT.size) for i in range(count)]
     at, files, inbox = HEAD.size + count * _EVENT.size, iter(skills), []
@@ -68,12 +66,12 @@ def unpack(message: bytes, skills: list[bytes], *, joints: int) -> Told:
         payload = next(files) if size == _ELSEWHERE else message[at : at + size]
         at += 0 if size == _ELSEWHERE else size
         inbox.append(Event(EVENT_KINDS[kind], payload, None))
-    frame: Record = np.frombuffer(message, of_frame, 1, at)[0]
-    timing: Record = np.frombuffer(message, TIMING, 1, at + of_frame.itemsize)[0]
-    at += of_frame.itemsize + TIMING.itemsize
-    state: Record | None = np.frombuffer(message, of_state, 1, at)[0] if follows & _HAS_STATE else None
+    frame: Record = np.frombuffer(message, frame_type, 1, at)[0]
+    timing: Record = np.frombuffer(message, TIMING, 1, at + frame_type.itemsize)[0]
+    at += frame_type.itemsize + TIMING.itemsize
+    state: Record | None = np.frombuffer(message, state_type, 1, at)[0] if follows & _HAS_STATE else None
     skill = next(files) if follows & _HAS_SKILL else None
-    return Told(Tick(index, tuple(inbox)), frame, timing, state, skill, lost)
+    return TickMessage(Tick(index, tuple(inbox)), frame, timing, state, skill, lost)
 
 
 def pack_note(key: str, text: str, time_ns: int) -> bytes:
@@ -89,11 +87,11 @@ def unpack_note(message: bytes) -> tuple[str, str, int] | None:
     return key, text, HEAD.unpack_from(message)[4]
 
 
-class Task(msgspec.Struct, frozen=True):
-    """What a scribe is started with; the skill comes as a file in memory.
+class ScribeSetup(msgspec.Struct, frozen=True):
+    """What a scribe is started with; the skill is sent along as a memory file.
 
     Without state it begins with the first message that has one. `recording` and `rrd` are explicit
-    paths instead of names in `folder`; the `attempt` counts the scribes of one daemon.
+    paths instead of names in `folder`; `attempt` counts the scribes of one daemon.
     """
 
     settings: Settings
@@ -105,10 +103,10 @@ class Task(msgspec.Struct, frozen=True):
     attempt: int
 
 
-class Report(msgspec.Struct, frozen=True):
-    """What a scribe says of itself, twice a second: where it writes, and of the ticks it was told
-    how many are on disk (`kept`), how many are not and will not be (`lost`), and how many of these
-    no recording says yet (`unmarked`).
+class ScribeReport(msgspec.Struct, frozen=True):
+    """A scribe's report, twice a second: where it writes, and how many of the ticks sent to it are
+    on disk (`kept`), how many never will be (`lost`), and how many of the lost ones no recording
+    marks yet (`unmarked`).
     """
 
     state: Literal["starting", "recording", "interrupted", "drawing"] = "starting"
@@ -119,4 +117,4 @@ class Report(msgspec.Struct, frozen=True):
     lost: int = 0
     unmarked: int = 0
     errors: tuple[str, ...] = ()  # new ones
-    free_mb: float | None = None  # room left where it writes; None: it writes nothing
+    free_mb: float | None = None  # free space where it writes; None: it writes nothing

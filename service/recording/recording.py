@@ -1,10 +1,9 @@
-"""Recordings as MCAP files: a Recorder that writes what each tick consumed and decided, a Recording
-that gives it back.
+"""Recordings as MCAP files: a Recorder writes what each tick consumed and decided, a Recording
+reads it.
 
 All channels are ROS 2 messages in CDR, so that ROS 2 tools, Rerun and Foxglove read a recording as
-it is. Within a file the order is: settings, skill and URDF as attachments, then tick by tick
-`tick`, its events, `frame`, `timing`, `state`; what is there only for other tools is ignored on
-reading.
+it is. Settings, skill and URDF are attachments; then follow, tick by tick, `tick`, its events,
+`frame`, `timing` and `state`. What is stored only for other tools is ignored on reading.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Quaternion, Thing, Transform, Vector3
+from service.contract.messages import BASE, Quaternion, SceneObject, Transform, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Tick, encode
 from service.core.outputs import outgoing
 from service.core.record import Record
 from service.demonstrations.pose_streams import ENDINGS
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
-from service.recording.mcap_reader import Fault, Messages
+from service.recording.mcap_reader import FileFault, Messages
 from service.recording.steps import REPLAYED, Gap, Step, steps
 from service.urdf import Urdf
-from service.viewer.markers import with_balls
+from service.viewer.urdf_markers import with_markers
 
-THINGS = "objects"
-FORMAT = "2"  # of State and Frame too: another version decides otherwise, and does not replay it
+OBJECTS = "objects"
+FORMAT = "2"  # of State and Frame too: another format cannot be replayed
 _LATCHED = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
     "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
@@ -93,21 +92,18 @@ class Recorder:
         return self._skill
 
     def lost_name(self) -> str:
-        """Empty while the file is where it was made; else `removed` or `moved`."""
+        """Empty while the file is at its path; else `removed` or `moved`."""
         return self._file.lost_name()
 
     def _begin(self, time_ns: int) -> None:
-        """The initial state and the robot's description carry the time of the first thing written.
-
-        A reader's time line starts there.
-        """
+        """Writes the robot's description and the initial state, timed as the first message."""
         self._begun = True
-        self._put("/robot_description", cdr.encode_string(with_balls(self._urdf)), time_ns, qos=_LATCHED)
+        self._put("/robot_description", cdr.encode_string(with_markers(self._urdf)), time_ns, qos=_LATCHED)
         if self._state is not None:
             self._put("state", encode(self._state), time_ns)
 
     def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
-        """One message on a channel: as the channel has it, or as its events are kept."""
+        """Writes one message on a channel, in the type in which its events are kept."""
         channel = channels.BY_KEY[key]
         kind = channel.kept_as.type
         self._file.put(self._topics[key], kind, data, time_ns, self._sequence, qos=qos)
@@ -123,11 +119,10 @@ class Recorder:
         skill: bytes | None = None,
         lost: int = 0,
     ) -> None:
-        """Writes a tick and what came of it.
+        """Writes a tick and its frame.
 
-        After `lost` ticks that could not be recorded, `state` (the controller's, after this tick)
-        and `skill` (in force) let a replay go on. The skill is written only if it differs from the
-        last that was.
+        After `lost` ticks that could not be recorded, `state` (after this tick) and `skill` (in
+        force) let a replay continue. The skill is written only if it differs from the last one.
         """
         if not self._begun:
             self._begin(time_ns)
@@ -160,7 +155,7 @@ class Recorder:
         self.kept, self.pending = self.kept + self.pending, 0
 
     def _transforms(self, frame: Record) -> list[Transform]:
-        """Where everything is, for viewers: the arm's links, tool, setpoint, target and hands."""
+        """Transforms for viewers: the arm's links, tool, setpoint, target and hands."""
         settings = self._settings
         joints = dict(zip(settings.joints.names, frame["joints"].tolist(), strict=True))
         found = self._links.transforms(joints)
@@ -175,16 +170,16 @@ class Recorder:
         return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or things given
+        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects given
         as JSON under `objects`; replay ignores it.
         """
         if key in REPLAYED:
             raise ValueError(f"a note under {key!r}: that topic holds what a replay needs")
         if not self._begun:
             self._begin(time_ns)
-        if key == THINGS:
-            things = msgspec.json.decode(text, type=tuple[Thing, ...])
-            return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, things), time_ns)
+        if key == OBJECTS:
+            objects = msgspec.json.decode(text, type=tuple[SceneObject, ...])
+            return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, objects), time_ns)
         topic = channels.topic(self._settings.cell, key)
         self._file.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
         return None
@@ -195,7 +190,7 @@ class Recorder:
         self._keep()
 
     def close(self) -> None:
-        """Ends the file; it is closed even where that fails. A second call does nothing."""
+        """Ends the file; it is closed even if that fails. A second call does nothing."""
         if self._file.closed:
             return
         if not self._begun and self._state is not None:
@@ -229,12 +224,12 @@ def _quaternion(orientation: Any) -> Quaternion:
     return x, y, z, w
 
 
-def _as_take(path: Path) -> str:
-    """What a file that is no recording is, where it is a take, and what shows it."""
+def _take_hint(path: Path) -> str:
+    """For the error on a file that is a take: that it is one, and the command that shows it."""
     topics: list[str] = []
     with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
-        told = make_reader(stream).get_summary()
-        topics = [f"/{channel.topic}" for channel in told.channels.values()] if told else []
+        contents = make_reader(stream).get_summary()
+        topics = [f"/{channel.topic}" for channel in contents.channels.values()] if contents else []
     if path.suffix != ".mcap" or not all(any(t.endswith(f"/{end}") for t in topics) for end in ENDINGS.values()):
         return ""
     name, folder = shlex.quote(path.stem), shlex.quote(str(path.parent))
@@ -242,16 +237,14 @@ def _as_take(path: Path) -> str:
 
 
 class Recording:
-    """A recording on disk: its settings, its skill, and its steps one after the other, however long
-    it is.
-    """
+    """A recording on disk: its settings, its skill, and its steps, which are read one by one."""
 
     def __init__(
         self, path: Path, settings: Settings, skill: bytes, urdf: str, metadata: dict[str, str], *, truncated: bool
     ) -> None:
         self.path, self.settings, self.skill, self.urdf, self.metadata = path, settings, skill, urdf, metadata
-        self.truncated = truncated  # its end is missing
-        self.faults: list[Fault] = []  # known once all steps are read
+        self.truncated = truncated
+        self.faults: list[FileFault] = []  # known once all steps are read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -271,7 +264,7 @@ class Recording:
                 )
             raise RecordingError(
                 f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
-                + _as_take(path)
+                + _take_hint(path)
             )
         if about.get("format") != FORMAT:
             raise RecordingError(
@@ -285,43 +278,39 @@ class Recording:
         return cls(path, settings, parts["skill.npz"], urdf, about, truncated=ends_early(path))
 
     def ticks(self) -> int | None:
-        """How many ticks the file says that it holds; None where its end, which says so, is not
-        there.
-        """
+        """The number of ticks by the file's summary; None where the summary is missing."""
         topic = channels.key(self.settings.cell, "tick")
         with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
-            told = make_reader(stream).get_summary()
-            if told is not None and told.statistics is not None:
-                numbers = [number for number, channel in told.channels.items() if channel.topic == topic]
-                return sum(told.statistics.channel_message_counts.get(number, 0) for number in numbers)
+            contents = make_reader(stream).get_summary()
+            if contents is not None and contents.statistics is not None:
+                numbers = [number for number, channel in contents.channels.items() if channel.topic == topic]
+                return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
         return None
 
     def steps(self, *, outputs: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.
 
-        Raises RecordingError on what is not understood.
-
-        Without `outputs` only what went in: a recording of a version with other frames and states
-        can be read so.
+        Without `outputs` only the inputs: so recordings of versions with other frames and states
+        can be read. Raises RecordingError on what cannot be decoded.
         """
         messages = Messages(self.path)
         yield from steps(messages, self.settings, outputs=outputs)
         self.faults = messages.faults
         self.truncated = any(fault.cut for fault in messages.faults)
 
-    def unsaid(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
-        """What is damaged or cut besides the gaps, once all steps are read up to tick `last`."""
-        said = "".join(gap.why for gap in gaps)
+    def unreported(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
+        """The faults that no gap names, as text, once all steps are read up to tick `last`."""
+        reported = "".join(gap.why for gap in gaps)
         read = "no tick was read" if last is None else f"the last tick read is {last}"
-        return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in said]
+        return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported]
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
-        """Key, text and time [ns] of the notes under the keys, in order; things as JSON."""
+        """Key, text and time [ns] of the notes under the keys, in order; objects as JSON."""
         topics = channels.keys_by_topic(self.settings.cell, keys)
         for _, channel, message in Messages(self.path):
             key = topics.get(channel.topic)
-            if key == THINGS:
-                things = channels.BY_KEY[key].codec.decode(message.data)
-                yield key, msgspec.json.encode(things).decode(), message.log_time
+            if key == OBJECTS:
+                objects = channels.BY_KEY[key].codec.decode(message.data)
+                yield key, msgspec.json.encode(objects).decode(), message.log_time
             elif key is not None:
                 yield key, cdr.decode_string(message.data), message.log_time

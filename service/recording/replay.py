@@ -27,19 +27,19 @@ POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
 
 @dataclass
 class Pause(Gap):
-    """A gap, and the tick from whose state the replay went on."""
+    """A gap, and the tick from whose state the replay continued."""
 
     resumed: int | None = None
 
     def __str__(self) -> str:
-        went_on = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
-        return f"{super().__str__()}; {went_on}"
+        continued = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
+        return f"{super().__str__()}; {continued}"
 
 
 @dataclass
 class Replay:
-    """What came of it: how many frames were compared and are identical, where and how far others
-    differ, and what is missing.
+    """The result of a replay: how many frames were compared and are identical, where and by how
+    much others differ, and what is missing.
     """
 
     ticks: int = 0
@@ -55,20 +55,18 @@ class Replay:
 
     @property
     def gaps(self) -> int:
-        """How often ticks are missing."""
+        """The number of gaps."""
         return len(self.missing)
 
     @property
     def exact(self) -> bool:
-        """Whether nothing is missing, and every frame up to the regular end identical, bit for
-        bit.
-        """
+        """Whether nothing is missing and every frame is identical, bit for bit."""
         complete = not (self.missing or self.faults or self.truncated)
         return self.ticks > 0 and self.identical == self.ticks and complete
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether no position that is there differs by more than 10 µm or 10 µrad."""
+        """Whether no recorded position differs by more than 10 µm or 10 µrad."""
         return self.ticks > 0 and all(self.largest.get(name, 0.0) <= TOLERANCE for name in POSITIONS)
 
     def text(self) -> str:
@@ -96,33 +94,30 @@ def replay(
     """Runs the core on a recording, and on those that follow it, and compares every frame.
 
     It starts from the first state or, with `after`, from the first one at or after that tick, and
-    anew from the state that follows each gap. Two recordings join without one where the second
-    begins with the state in which the first ends. Raises RecordingError.
+    again from the state behind each gap. Two recordings join without a gap where the second begins
+    with the state in which the first ends. Raises RecordingError.
     """
     recordings = [Recording.open(path) for path in (first, *more)]
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
     before: Step | None = None
     with threadpool_limits(1):
         for i, recording in enumerate(recordings):
-            pieces = _Pieces(recording, result, after=after, before=before, follows=i > 0, progress=progress)
-            before = pieces.compared()
-            result.faults += recording.unsaid(result.missing, last=None if before is None else before.tick)
+            segments = _Comparison(recording, result, after=after, before=before, follows=i > 0, progress=progress)
+            before = segments.compared()
+            result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
             result.truncated = result.truncated or recording.truncated
     return result
 
 
 class _Skills:
-    """The skills of a recording, by their digests, as far as it has been read."""
+    """The skills of a recording by digest, as far as it has been read."""
 
     def __init__(self, recording: Recording) -> None:
         self._found: dict[bytes, Skill] = {}
         self.decoded(recording.skill)
 
     def decoded(self, data: bytes) -> Skill:
-        """The skill in the bytes of its file, once for all times that it is met.
-
-        Raises SkillError.
-        """
+        """The skill in the bytes of its file; the same object each time. Raises SkillError."""
         skill = decoded(data, origin="the recording", recorded=True)
         return self._found.setdefault(skill.digest, skill)
 
@@ -133,7 +128,7 @@ class _Skills:
         return tuple(self._event(kind, payload) for kind, payload in step.events)
 
     def in_force(self, start: Step) -> Skill | None:
-        """The skill in force after a step with a state; None where it was not read."""
+        """The skill in force after a step with a state; None where it has not been read."""
         assert start.state is not None
         return self._found.get(start.state["skill"].tobytes())
 
@@ -147,8 +142,8 @@ class _Skills:
             raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
 
 
-class _Pieces:
-    """A recording from gap to gap, each piece run by a controller that goes on from a state."""
+class _Comparison:
+    """Compares a recording from gap to gap; each part is run by a controller of its own."""
 
     def __init__(
         self,
@@ -169,7 +164,7 @@ class _Pieces:
         self._controller: Controller
 
     def compared(self) -> Step | None:
-        """Compares all there is; the last step."""
+        """The last step, once all are compared."""
         start = next(self._steps, None)
         if start is not None and not self._begins(start):
             start = self._next_start(start)
@@ -183,7 +178,7 @@ class _Pieces:
         return self._step
 
     def _begins(self, start: Step) -> bool:
-        """Whether the first step is a state to start from; says what is missing before it."""
+        """Whether the first step has a state to start from; notes what is missing before it."""
         before, result = self._step, self._result
         self._skills.events(start)
         joins = (
@@ -204,7 +199,7 @@ class _Pieces:
         self._result.missing.append(Pause(before, step.tick, step.lost, why))
 
     def _resumes(self, step: Step) -> bool:
-        """Whether a controller can go on from the state of a step."""
+        """Whether a controller can continue from the state of a step."""
         skill = self._skills.in_force(step)
         for gap in reversed(self._result.missing):
             if gap.resumed is not None:
@@ -215,7 +210,7 @@ class _Pieces:
         return skill is not None
 
     def _next_start(self, step: Step | None) -> Step | None:
-        """The next step, `step` or behind it, from whose state a controller can go on."""
+        """The next step, `step` or later, from whose state a controller can continue."""
         while step is not None:
             self._skills.events(step)
             self._step = step
@@ -244,20 +239,20 @@ class _Pieces:
             yield Tick(step.tick, events)
 
     def compare(self, tick: Tick, frame: Frame) -> None:
-        """Holds the frame of the newest tick, and the state after it, against what was recorded."""
+        """Compares the newest tick's frame, and the state after it, with what was recorded."""
         step, result = self._step, self._result
         assert step is not None
         assert step.frame is not None
-        unlike = differences(step.frame, frame)
+        different = differences(step.frame, frame)
         if step.state is not None:
             after = differences(step.state, self._controller.state)
-            unlike |= {f"state.{name}": value for name, value in after.items()}
+            different |= {f"state.{name}": value for name, value in after.items()}
         result.ticks += 1
-        result.identical += not unlike
-        if unlike and not result.first_difference:
-            what = ", ".join(f"{name} by {value:.3g}" for name, value in unlike.items())
-            result.first_difference = f"first difference at tick {tick.index}: {what}"
-        for name, value in unlike.items():
+        result.identical += not different
+        if different and not result.first_difference:
+            fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
+            result.first_difference = f"first difference at tick {tick.index}: {fields}"
+        for name, value in different.items():
             result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
         if self._progress is not None and result.ticks % 1000 == 0:
             self._progress(result.ticks)

@@ -1,8 +1,8 @@
-"""The ticks that the scribe is told, written into one recording after another.
+"""The ticks that the scribe receives, written into one recording after another.
 
 A recording that is large or old enough ends at a tick whose state is known, and the next begins
-with that state: nothing is between them. A recording that fails is left as it is, and the next
-begins with the first state once that works; what was lost meanwhile is counted, and marked there.
+with that state, so that no tick is missing between them. A recording that fails is left as it is;
+the next one begins as soon as that is possible. Ticks lost meanwhile are counted, and marked there.
 """
 
 from __future__ import annotations
@@ -17,27 +17,26 @@ from typing import Literal
 
 from service.config import Settings
 from service.core.record import Record
-from service.recording.paths import MB, Places
-from service.recording.protocol import Told
+from service.recording.paths import MB, RecordingPaths
+from service.recording.protocol import TickMessage
 from service.recording.recording import Recorder
 
 RETRY_S = 1.0
-ROOM_BYTES = 1_000_000  # some seconds of ticks: with less, a disk that was full is not tried again
+ROOM_BYTES = 1_000_000  # some seconds of ticks; a disk that was full is tried again once this is free
 PRUNE_S = 5.0
 
 
 class Segments:
-    """Writes ticks and notes; what fails is told to `say`, in words, once.
+    """Writes ticks and notes; `say` is called once with what fails, in words.
 
-    `draw` is told where the drawing that belongs to a new recording goes. Of the ticks told,
-    `kept` are on disk, `lost` are not and will not be, and of these no recording says yet that
-    `unmarked` are missing.
+    `draw` is called with the path of the drawing beside a new recording. Of the ticks received,
+    `kept` are on disk and `lost` never will be; of the lost ones no recording marks `unmarked` yet.
     """
 
     def __init__(
-        self, settings: Settings, places: Places, *, say: Callable[[str], None], draw: Callable[[Path], None]
+        self, settings: Settings, paths: RecordingPaths, *, say: Callable[[str], None], draw: Callable[[Path], None]
     ) -> None:
-        self._settings, self._places, self._say, self._draw = settings, places, say, draw
+        self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
         self._recorder: Recorder | None = None
         self._wanted = True
         self._skill: bytes | None = None
@@ -47,7 +46,7 @@ class Segments:
         self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = self._drawn = False
-        self._said: object = None
+        self._failure: object = None  # the last that was reported
 
     @property
     def kept(self) -> int:
@@ -61,25 +60,21 @@ class Segments:
 
     @property
     def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
-        """`starting` before there is a skill, `recording`, `interrupted`, or `drawing` where no
-        recording is wanted.
-        """
+        """`starting` before there is a skill; `drawing` where no recording is wanted."""
         if self._skill is None or not self._wanted:
             return "starting" if self._skill is None else "drawing"
         return "interrupted" if self._recorder is None else "recording"
 
     def begin(self, skill: bytes | None, state: Record | None) -> None:
-        """Begins with a skill and a state; without them, with the first that are told."""
+        """Begins with a skill and a state; without them, with the first that are received."""
         self._skill = skill
         if skill is not None:
             self._recorder = self._opened(state)
 
     def _opened(self, state: Record | None) -> Recorder | None:
-        """A new recording, if it can be begun, and a new drawing beside it; a first one in any
-        case.
-        """
+        """A new recording and drawing, if it can be begun; the first drawing begins in any case."""
         self._tried = time.monotonic()
-        path, rrd = self._places.next()
+        path, rrd = self._paths.next()
         self._wanted = path is not None
         recorder = None if path is None else self._recorder_at(path, state)
         if recorder is not None or not self._wanted:
@@ -95,7 +90,7 @@ class Segments:
     def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
         assert self._skill is not None
         try:
-            if self._full and shutil.disk_usage(_there(path)).free < ROOM_BYTES:
+            if self._full and shutil.disk_usage(_existing_folder(path)).free < ROOM_BYTES:
                 return None
             return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
         except OSError as error:
@@ -104,42 +99,44 @@ class Segments:
             return None
 
     def free_mb(self) -> float | None:
-        """Room left where the recording is written; None where none is."""
+        """Free space where the recording is written [MB]; None where none is written."""
         with contextlib.suppress(OSError):
-            return None if self.path is None else round(shutil.disk_usage(_there(self.path)).free / 1e6)
+            return None if self.path is None else round(shutil.disk_usage(_existing_folder(self.path)).free / 1e6)
         return None
 
     def _failed(self, path: Path, error: OSError) -> None:
         self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         cause = error.errno or str(error)
-        if cause != self._said:
-            self._said = cause
-            self._say(f"recording to {path} ended: {error}; it goes on once that is mended")
+        if cause != self._failure:
+            self._failure = cause
+            self._say(f"recording to {path} ended: {error}; it continues once that is repaired")
 
-    def write(self, told: Told) -> int:
-        """Writes a tick; how many before it are missing, where that is said now."""
-        self._skill = next((event.payload for event in reversed(told.tick.inbox) if event.kind == "skill"), self._skill)
-        self._skill = told.skill or self._skill
+    def write(self, received: TickMessage) -> int:
+        """Writes a tick; the number of missing ticks before it, if it is marked now, else 0."""
+        self._skill = next(
+            (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"), self._skill
+        )
+        self._skill = received.skill or self._skill
         now = time.monotonic()
-        may_begin = told.state is not None and self._skill is not None
+        may_begin = received.state is not None and self._skill is not None
         if may_begin and self._recorder is None and now - self._tried > RETRY_S and (self._wanted or self._due(now)):
             self._recorder = self._opened(None)
         if self._recorder is None:
             if self._wanted:
                 self.lost += 1
-                self.unmarked += 1 + told.lost
+                self.unmarked += 1 + received.lost
             else:
-                self._kept += 1  # all that was asked for
-            return 0 if self._wanted else told.lost
-        missing = told.lost + self.unmarked
+                self._kept += 1  # drawing was all that was asked for
+            return 0 if self._wanted else received.lost
+        missing = received.lost + self.unmarked
         self._marked += missing
         self._marked_pending += missing
         self.unmarked = 0
-        self._safely(lambda recorder: _written(recorder, told, missing))
+        self._safely(lambda recorder: _write_tick(recorder, received, missing))
         if self._recorder is not None and not self._recorder.pending:
             self._marked_pending = 0
-        if self._recorder is not None and told.state is not None and self._due(now):
-            self._next(told.state)
+        if self._recorder is not None and received.state is not None and self._due(now):
+            self._next(received.state)
         return missing
 
     def _due(self, now: float) -> bool:
@@ -152,8 +149,8 @@ class Segments:
         return too_large or self._moved or now - self._began > files.segment_minutes * 60
 
     def _next(self, state: Record) -> None:
-        """Goes on in a new recording, which begins with the state that the old one ends with; stays
-        where none can be begun.
+        """Continues in a new recording, which begins with the old one's last state; stays in the
+        old one where none can be begun.
         """
         self._safely(Recorder.flush)
         new = None if self._recorder is None else self._opened(state)
@@ -169,9 +166,7 @@ class Segments:
             self._recorder = None
 
     def _safely(self, act: Callable[[Recorder], None]) -> None:
-        """Does one thing with the recording, which ends where that fails; what of it is not on disk
-        is lost.
-        """
+        """Acts on the recording; where that fails it ends, and its pending ticks are lost."""
         recorder = self._recorder
         if recorder is None:
             return
@@ -196,25 +191,23 @@ class Segments:
         self._safely(lambda recorder: recorder.note(key, text, time_ns))
 
     def flush(self) -> None:
-        """Hands what was written to the system, and sees whether the files are where they were
-        made.
-
-        Now and then the oldest recordings are removed.
+        """Hands what was written to the operating system, and checks that the files are at their
+        paths; every PRUNE_S the oldest recordings are removed.
         """
         self._safely(Recorder.flush)
-        self._look()
+        self._check_files()
         if time.monotonic() - self._pruned > PRUNE_S:
             self._pruned = time.monotonic()
             with contextlib.suppress(OSError):
-                self._places.prune(self.path)
+                self._paths.prune(self.path)
 
-    def _look(self) -> None:
+    def _check_files(self) -> None:
         recorder = self._recorder
         if recorder is None:
             return
         self._marked_pending = 0
         if recorder.kept:
-            self._full, self._said = False, None
+            self._full, self._failure = False, None
         lost_name = recorder.lost_name()
         if lost_name == "removed":
             self._say(f"recording {recorder.path} was removed while it was written; the next one begins")
@@ -231,16 +224,22 @@ class Segments:
         self.flush()
         path = self.path
         self._end()
-        self._complete = path if self._said is None else None
+        self._complete = path if self._failure is None else None
 
 
-def _written(recorder: Recorder, told: Told, missing: int) -> None:
-    time_ns = int(told.timing["time_ns"])
+def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None:
+    time_ns = int(received.timing["time_ns"])
     recorder.write(
-        told.tick, told.frame, time_ns=time_ns, timing=told.timing, state=told.state, skill=told.skill, lost=missing
+        received.tick,
+        received.frame,
+        time_ns=time_ns,
+        timing=received.timing,
+        state=received.state,
+        skill=received.skill,
+        lost=missing,
     )
     if missing:
-        recorder.note("log", f"{missing} ticks before tick {told.tick.index} are not recorded", time_ns)
+        recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)
 
 
 def _discard(path: Path) -> None:
@@ -250,6 +249,6 @@ def _discard(path: Path) -> None:
             path.unlink()
 
 
-def _there(path: Path) -> Path:
+def _existing_folder(path: Path) -> Path:
     """The nearest folder above a path that exists."""
     return next((folder for folder in path.parents if folder.is_dir()), Path("/"))

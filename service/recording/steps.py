@@ -1,5 +1,5 @@
-"""The steps of a recording, put together from its messages: what each tick consumed, what it
-decided, and where ticks are missing.
+"""The steps of a recording, assembled from its messages: what each tick consumed, what it decided,
+and where ticks are missing.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
 class Step(NamedTuple):
-    """One recorded tick: what it consumed, what it decided, and the state after it where that was
-    recorded.
+    """One recorded tick: what it consumed, what it decided, and the state after it if recorded.
 
-    A step may hold the state before the first tick, or the first behind damage, and nothing else:
-    its `frame` is None. Where ticks were `lost` before this one, replay continues from its `state`,
-    with the skill in force, which is told where it may have changed meanwhile. Where `damage` is
-    not empty, what was recorded before this step cannot be read, and why.
+    A step without `frame` holds only a state: before the first tick, or the first behind damage.
+    Where ticks were `lost` before this one, replay continues from its `state` with the skill in
+    force, which is recorded again where it may have changed. `damage` says why what was recorded
+    before this step cannot be read; empty: it can.
     """
 
     tick: int
@@ -43,8 +42,8 @@ class Step(NamedTuple):
 
 @dataclass
 class Gap:
-    """Ticks that are not there: between which they would be (None: the beginning, the end), how
-    many were counted as lost, and why.
+    """Missing ticks: the ticks around them (None: the beginning, the end), how many were counted as
+    lost, and why.
     """
 
     after: int | None
@@ -61,8 +60,8 @@ class Gap:
 
 
 def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[Step]:
-    """Every tick that is whole, in order, after the initial state if there is one; without
-    `outputs` only what went in. Raises RecordingError on what is not understood.
+    """Every complete tick, in order, after the initial state if there is one; without `outputs`
+    only its inputs. Raises RecordingError on what cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
@@ -71,7 +70,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
     seen, damage = 0, ""
 
     def finished() -> Iterator[Step]:
-        """The step in progress, unless damage or a cut took its rest."""
+        """The step in progress, unless its rest is damaged or cut."""
         if step is not None and (len(messages.faults) == seen or _is_whole(step, outputs=outputs)):
             yield _finished(step, outputs=outputs)
 

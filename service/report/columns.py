@@ -124,7 +124,7 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             progress(BLOCK * len(blocks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
     found.statuses = list(_statuses(recording))
-    found.gaps = [*map(str, gaps), *recording.unsaid(gaps, last=last)]
+    found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
     if found.skills and len(found.frames):
         found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
     return found

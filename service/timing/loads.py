@@ -1,8 +1,7 @@
-"""What happens beside a loop in its days: each done to a running daemon, and to an empty loop in
-its place, for `thirdhand bench --loads`.
+"""Loads beside a running daemon, and beside an empty loop in its place, for `thirdhand bench
+--loads`.
 
-`python -m service.timing.loads KIND ENDPOINT` is the part of it that asks and publishes, a
-process of its own.
+`python -m service.timing.loads KIND ENDPOINT` is a process that sends requests or hands.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from service.learning.skill_file import with_file
 from service.recording.replay import replay
 from service.shipped import SHIPPED_SKILL, recordings, shipped_skill
 from service.timing.probe import TRACKER_HZ, hands_of
-from service.timing.probes import probe
+from service.timing.probe_processes import probe
 from service.viewer.stream import rerun_program
 
 QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
@@ -59,12 +58,12 @@ sys.exit(main(sys.argv[1:]))
 
 
 class LoadError(ExplainedError):
-    """A load could not be put on; the message says what failed."""
+    """A load could not be applied; the message says why."""
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A running daemon, and what a load needs to reach it."""
+class LoadedCell:
+    """A running daemon under load, and what a load needs to reach it."""
 
     service: Launched
     client: Client
@@ -79,12 +78,12 @@ class Cell:
 
 
 @contextlib.contextmanager
-def _nothing(cell: Cell) -> Iterator[None]:
+def _nothing(cell: LoadedCell) -> Iterator[None]:
     yield
 
 
 @contextlib.contextmanager
-def _frozen(cell: Cell) -> Iterator[None]:
+def _frozen(cell: LoadedCell) -> Iterator[None]:
     pid = cell.scribe()
     os.kill(pid, signal.SIGSTOP)
     yield
@@ -93,14 +92,14 @@ def _frozen(cell: Cell) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _killed(cell: Cell) -> Iterator[None]:
+def _killed(cell: LoadedCell) -> Iterator[None]:
     os.kill(cell.scribe(), signal.SIGKILL)
     yield
 
 
 @contextlib.contextmanager
-def _full(cell: Cell) -> Iterator[None]:
-    """The scribe's files may not grow any more, which fails as a full disk does."""
+def _full(cell: LoadedCell) -> Iterator[None]:
+    """Limits the size of the scribe's files, which fails as a full disk does."""
     pid, none = cell.scribe(), resource.RLIM_INFINITY
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, none))
     yield
@@ -109,8 +108,8 @@ def _full(cell: Cell) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stalled(cell: Cell) -> Iterator[None]:
-    """A viewer that has begun to listen, and reads no more."""
+def _stalled(cell: LoadedCell) -> Iterator[None]:
+    """A viewer that connects, and then stops reading."""
     with tempfile.TemporaryDirectory() as folder:
         url = f"rerun+http://127.0.0.1:{cell.live_port}/proxy"
         with _process([str(rerun_program()), "--save", str(Path(folder) / "live.rrd"), url]) as viewer:
@@ -121,9 +120,9 @@ def _stalled(cell: Cell) -> Iterator[None]:
             yield
 
 
-def _asking(kind: str) -> Callable[[Cell], contextlib.AbstractContextManager[None]]:
+def _asking(kind: str) -> Callable[[LoadedCell], contextlib.AbstractContextManager[None]]:
     @contextlib.contextmanager
-    def asked(cell: Cell) -> Iterator[None]:
+    def asked(cell: LoadedCell) -> Iterator[None]:
         with asking(kind, cell.service.endpoint) as process:
             yield
             if process.poll() is not None:
@@ -134,15 +133,15 @@ def _asking(kind: str) -> Callable[[Cell], contextlib.AbstractContextManager[Non
 
 @dataclass(frozen=True)
 class Load:
-    """One of them: its name for people, and what puts it on."""
+    """A load: its name for people, and what applies it."""
 
     what: str
-    put_on: Callable[[Cell], contextlib.AbstractContextManager[None]] = _nothing
+    put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[None]] = _nothing
     program: tuple[str, ...] = ("-m", "service")
 
 
 def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
-    """Acts at a rate, or as fast as it can, until killed."""
+    """Calls `act` at a rate, or as fast as it can, until killed."""
     began, k = time.monotonic(), 0
     while True:
         with contextlib.suppress(RefusedError):
@@ -158,7 +157,7 @@ def _status(client: Client, session: Any) -> None:
 
 
 def _teaching(client: Client, session: Any) -> None:
-    """A place, taught over and over, a millimetre beside where it was."""
+    """Teaches one via-point over and over, alternating by a millimetre."""
     skill = shipped_skill()
     primitive = skill.primitive
     x = primitive.inputs[0].tolist()
@@ -203,9 +202,11 @@ LOADS = (
 
 
 def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """For each load what the daemon's loop misses and how late it is, for so many seconds, and the
-    same of an empty loop while all the rest goes on; and how much of what was recorded replays bit
-    for bit. Raises LoadError and LaunchError.
+    """A row for each load: missed deadlines and lateness of the daemon's loop over `seconds` [s],
+    the same of an empty loop under the same load, and how much of the recording replays bit for
+    bit.
+
+    Raises LoadError and LaunchError.
     """
     with tempfile.TemporaryDirectory() as name:
         skills = Path(name)
@@ -228,7 +229,7 @@ def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[
             open_session(connect=[service.endpoint]) as session,
             asking("hands", service.endpoint),
         ):
-            cell = Cell(service, Client(session), port)
+            cell = LoadedCell(service, Client(session), port)
             until_following(cell.client)
             with load.put_on(cell):
                 before = cell.client.status()
@@ -256,7 +257,7 @@ def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[
 
 
 def _let_others_first(pid: int) -> bool:
-    """Takes real-time scheduling from a daemon's loop; whether it had it."""
+    """Whether a daemon's loop had real-time scheduling, which is taken from it."""
     had = os.sched_getscheduler(pid) == os.SCHED_FIFO
     if had:
         os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
@@ -264,7 +265,7 @@ def _let_others_first(pid: int) -> bool:
 
 
 def until_following(client: Client) -> None:
-    """Waits until a daemon follows the hands, and a little more. Raises LoadError."""
+    """Waits until a daemon follows the hands, and SETTLE_S more. Raises LoadError."""
     until = time.monotonic() + 15.0
     while (now := client.status()).mode != "follow":
         if time.monotonic() > until:
@@ -293,7 +294,7 @@ def large_skill() -> bytes:
 
 @contextlib.contextmanager
 def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
-    """One of ASKING as a process of its own, which has begun. Raises LoadError."""
+    """One of ASKING as a running process of its own. Raises LoadError."""
     with _process([sys.executable, "-m", "service.timing.loads", kind, endpoint]) as process:
         assert process.stdout is not None
         if not process.stdout.readline():

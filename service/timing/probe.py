@@ -1,6 +1,6 @@
-"""What a daemon is measured with and against, each a process of its own that prints one JSON line:
-a loop that only does a fixed piece of work, the core alone in such a loop, a tracker that waits for
-the commands which answer its hands, and an echo.
+"""Probes for `thirdhand bench`, each a process of its own that prints one JSON line: a loop that
+only does a fixed piece of work, the core alone in such a loop, a tracker that waits for the
+commands which answer its hands, and an echo.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from service.learning.skill_file import decoded
 
 SHARES = (50.0, 99.0, 99.9, 100.0)
 EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms
-TRACKER_HZ, SWAY_M, SWAY_HZ = 487.3, 0.03, 0.3  # a rate that no loop's divides
+TRACKER_HZ = 487.3  # no multiple of a loop's rate
+SWAY_M, SWAY_HZ = 0.03, 0.3  # of the hands
 HANDS_EVERY_S = 0.01
 PING_EVERY = 20  # samples
 FLOATS, CALLS = 200, 20  # of the fixed piece of work
-SETTLE_S = 1.0  # that is not counted
+SETTLE_S = 1.0  # at the start, not counted
 
 
 def percentiles(values: Any) -> dict[str, float]:
@@ -49,7 +50,7 @@ def percentiles(values: Any) -> dict[str, float]:
 
 
 def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
-    """What a report says of a loop's lateness and work [us]: SHARES, counts between EDGES_US."""
+    """Percentiles (SHARES) and histograms (EDGES_US) of a loop's lateness and work [us]."""
     found: dict[str, Any] = {}
     for name, values in (("lateness", lateness_us), ("work", work_us)):
         found[f"{name}_us"] = percentiles(values)
@@ -58,9 +59,7 @@ def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
 
 
 def fixed_work(array: Vector) -> float:
-    """A piece of Python and NumPy that is the same in every version: what a machine's hour is
-    measured by.
-    """
+    """A fixed piece of Python and NumPy, by which the machine's speed at the moment is measured."""
     total = 0.0
     for k in range(FLOATS):
         total += 0.5 * k
@@ -70,7 +69,7 @@ def fixed_work(array: Vector) -> float:
 
 
 def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[str, Any]:
-    """Missed deadlines, lateness and work [us] of a loop."""
+    """Missed deadlines, lateness and work [us] of a loop that does `work` each tick."""
     realtime = ask_for_real_time().realtime
     clock = Deadlines(rate_hz, spin_ns=SPIN_NS if realtime else 0)
     late_us, work_us = [], []
@@ -96,14 +95,14 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
 
 
 def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
-    """Both hands [m] at a time [s], about the middle of what the skill has learned."""
+    """Both hands [m] at a time [s], about the mean of the skill's inputs."""
     middle = skill.hands.mean(axis=0).tolist()
     x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 
 
 def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], None]:
-    """What publishes both hands, swaying, of a time [s] under a stamp [ns]."""
+    """The function that publishes both swaying hands of a time [s] with a stamp [ns]."""
     cell = Settings().cell
     publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
 
@@ -115,7 +114,7 @@ def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], Non
 
 
 def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
-    """The core alone, in the loop."""
+    """The result of the loop with the core alone."""
     settings = Settings(rate_hz=rate_hz)
     settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
     skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
@@ -133,9 +132,7 @@ def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
 
 
 def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[str, Any]:
-    """Time from a hand published to the command that answers it, and there and back to an echo
-    [ms].
-    """
+    """Time from a published hand to the command that answers it, and round trip to an echo [ms]."""
     cell = Settings().cell
     answered: dict[int, int] = {}
     trips_ms: list[float] = []
@@ -173,7 +170,7 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
 
 
 def echo() -> None:
-    """Sends back what comes, until its standard input ends."""
+    """Sends back what it receives, until its standard input ends."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         back = session.declare_publisher("probe/pong", express=True)
         heard = session.declare_subscriber("probe/ping", lambda sample: back.put(sample.payload))

@@ -1,5 +1,5 @@
-"""Whether a daemon can run for days: its processes' memory and open files over minutes, with
-recorder, viewer and a tracker, for `thirdhand bench --soak`.
+"""Memory and open files of a daemon's processes over minutes, with recorder, viewer and a tracker,
+for `thirdhand bench --soak`.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ import numpy as np
 from service.client import Client, open_session
 from service.launch import launched
 from service.timing.loads import asking, until_following
-from service.timing.probes import family
+from service.timing.probe_processes import family
 
-LONGEST_PAUSE_S, FEWEST = 5.0, 60  # between samples, of samples
-WARM_UP = 0.2  # share of the time that is not counted
-T_95 = 1.96
+LONGEST_PAUSE_S = 5.0  # between samples
+FEWEST = 60  # samples
+WARM_UP = 0.2  # share of the duration that is not counted
+T_95 = 1.96  # of a 95 % interval
 
 
 def run(minutes: float, rate_hz: int, *, say: Callable[[str], None]) -> dict[str, Any]:
-    """Memory's slope of each process [MB/h] with its interval, files open at first and at last,
-    what the loop missed. Raises LoadError and LaunchError.
+    """The growth of each process's memory [MB/h] with its interval, open files at start and end,
+    and missed deadlines. Raises LoadError and LaunchError.
     """
     say(f"daemon with recorder and viewer, a tracker: {minutes:g} min")
     with tempfile.TemporaryDirectory() as name:
@@ -57,8 +58,9 @@ def run(minutes: float, rate_hz: int, *, say: Callable[[str], None]) -> dict[str
 
 
 def judged(samples: Any) -> dict[str, Any]:
-    """Memory's slope by least squares after warming up, half the width of its 95 % interval (from
-    the slopes of ten parts, as neighbouring samples are no independent ones).
+    """Memory's growth by least squares after warming up, and half the width of its 95 % interval.
+
+    The interval follows from ten blocks, as neighbouring samples are correlated.
     """
     kept = samples[samples[:, 0] >= WARM_UP * samples[-1, 0]]
     hours, memory, files = kept[:, 0] / 3600, kept[:, 1], kept[:, 2]

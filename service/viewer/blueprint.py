@@ -1,8 +1,8 @@
-"""The arrangement of the views: three tabs, for the task, the timing, and what was learned.
+"""The Rerun blueprint: three tabs of views, for the task, the timing, and what was learned.
 
-All curves have one axis of time, seconds from the start, so that their cursors stand in line; it
-goes on behind the newest value, where the legends are. How far up each view reaches is told by the
-limits in force, or by what was drawn: a single value that stands out does not flatten the rest.
+All curves share one time axis, seconds from the start; it continues behind the newest value, where
+the legends are. Each view's range follows from the limits in force, or from what was drawn: a
+single outlier does not flatten the rest.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from service.config import Settings
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
-WINDOW_S, LEGEND_SHARE = 20.0, 0.28  # of live curves; of the axis, kept free for legends
-ROOM = 1.25  # of an axis, times how far most seconds' curves reach
-GATE_FAR = 4.0  # times as high as the curves, the gate would flatten them
+WINDOW_S = 20.0  # of live curves
+LEGEND_SHARE = 0.28  # of the time axis, kept free for legends
+HEADROOM = 1.25  # an axis' range over the curves' usual range
+GATE_FAR = 4.0  # a gate this many times above the curves is not drawn: it would flatten them
 EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
 
 
-class Curves(NamedTuple):
-    """One view of curves: where they are, their title, and the least and greatest value shown
-    unless what was drawn says otherwise; None: from 0, and from minus to plus.
+class PlotView(NamedTuple):
+    """One view of curves: their path, title, and the range shown unless what was drawn is known;
+    `fixed` ranges stay in any case.
     """
 
     origin: str
@@ -38,29 +39,29 @@ class Curves(NamedTuple):
     fixed: bool = False
 
 
-def curves(settings: Settings) -> dict[str, Curves]:
-    """All views of curves by their origin, as high as the settings let the values be."""
+def plot_views(settings: Settings) -> dict[str, PlotView]:
+    """All views of curves by path, with the ranges that follow from the settings."""
     joints, tool, period_us = settings.joints, settings.tool, 1e6 * settings.period_s
     velocity, acceleration = max(joints.velocity), max(joints.acceleration)
     return {
         view.origin: view
         for view in (
-            Curves("/error", "Tool to target [mm]", 0, 60),
-            Curves("/turn", "Tool turned from the target [°]", 0, 10),
-            Curves("/gripper", "Gripper: how far closed [%]", 0, 110, True),
-            Curves("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
-            Curves("/speed", "Speed [m/s]", 0, tool.max_speed),
-            Curves("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
-            Curves("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
-            Curves("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
-            Curves("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
-            Curves("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),
-            Curves("/joints/error", "Joint, measured less commanded [rad]", 0, settings.arm.fault_error_rad),
-            Curves("/latency", "Hand to command [ms]", 0, 20),
-            Curves("/timing/lateness", "How late a tick begins [µs]", 0, period_us / 2),
-            Curves("/timing/work", "Work of a tick [µs]", 0, period_us),
-            Curves("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
-            Curves("/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.stale_ms, True),
+            PlotView("/error", "Tool to target [mm]", 0, 60),
+            PlotView("/turn", "Tool turned from the target [°]", 0, 10),
+            PlotView("/gripper", "Gripper: how far closed [%]", 0, 110, True),
+            PlotView("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
+            PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
+            PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
+            PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
+            PlotView("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
+            PlotView("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
+            PlotView("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),
+            PlotView("/joints/error", "Joint, measured less commanded [rad]", 0, settings.arm.fault_error_rad),
+            PlotView("/latency", "Hand to command [ms]", 0, 20),
+            PlotView("/timing/lateness", "How late a tick begins [µs]", 0, period_us / 2),
+            PlotView("/timing/work", "Work of a tick [µs]", 0, period_us),
+            PlotView("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
+            PlotView("/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.stale_ms, True),
         )
     }
 
@@ -74,15 +75,14 @@ def blueprint(
     end_s: float | None = None,
     tab: str = TABS[0],
 ) -> rrb.Blueprint:
-    """The arrangement for a live view, or for a file that lasts `end_s` [s] and in which the curves
-    reach up to `tops`; both are known once it is drawn. `gate_m` is the deviation [m] above which
-    the skill in force holds.
+    """The blueprint of a live view, or of a file that lasts `end_s` [s] and whose curves reach up
+    to `tops`. `gate_m` is the deviation [m] above which the skill in force holds.
     """
-    views, reached = curves(settings), dict(tops or {})
-    tops = {origin: ROOM * top for origin, top in reached.items()}
+    views, reached = plot_views(settings), dict(tops or {})
+    tops = {origin: HEADROOM * top for origin, top in reached.items()}
     gate_mm, most_mm = 1e3 * gate_m, GATE_FAR * reached.get("/deviation", views["/deviation"].high)
     if gate_mm <= most_mm:
-        tops["/deviation"] = ROOM * max(gate_mm, reached.get("/deviation", 0.0))
+        tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
     left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
     relative = rrb.TimeRangeBoundary.cursor_relative
     if end_s is None:

@@ -1,4 +1,4 @@
-"""Frames as chunks of columns: the scene at about 100 Hz, the curves at the full rate."""
+"""What changes: frames as Rerun chunks, the scene at about 100 Hz, the curves at the full rate."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from service.core.skill.pose import CLOSED, UNKNOWN
 from service.core.skill.skill import standard_deviations
 from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
-from service.viewer.static import Trees
+from service.viewer.static import ArmModels
 
 SCENE_HZ = 100
 TRAIL_S, TRAIL_HZ = 3.0, 20
-TRAIL_BREAK_M = 0.15  # between two corners no hand goes as far: another was taken for it
+TRAIL_BREAK_M = 0.15  # a longer step between two corners is no motion of one hand
 NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
-SAME_M = 1e-5  # by which a deviation and the target's differ at most where they are one, by rounding
-LOG_NS = 100_000_000  # a log's seconds are told to that, so that their column shows all digits
-REPEAT_S = 1.0  # a live view says the mode again as often, for those who come later
+SAME_M = 1e-5  # rounding: at most this much apart, a deviation and the target's are the same
+LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
+REPEAT_S = 1.0  # the mode is sent again to live viewers, for those that connect later
 Columns = Callable[..., rr.chunk.Chunk]
 
 
-class Shown(NamedTuple):
-    """A frame, when it was [ns], how long it took, and the joints (J,) measured last [rad]."""
+class DrawnFrame(NamedTuple):
+    """A frame, its time [ns], its timing, and the joints (J,) measured last [rad]."""
 
     frame: Record
     time_ns: int
@@ -45,13 +45,13 @@ class Shown(NamedTuple):
     measured: NDArray[np.float64] | None
 
 
-class Chunks:
-    """Batches of frames as chunks of columns; remembers what the next batch continues."""
+class DynamicScene:
+    """Turns batches of frames into chunks; remembers what the next batch continues."""
 
-    def __init__(self, trees: Trees, settings: Settings, urdf: str, *, live: bool) -> None:
+    def __init__(self, models: ArmModels, settings: Settings, urdf: str, *, live: bool) -> None:
         rate_hz, names = settings.rate_hz, settings.joints.names
         self._joints, self._ghost = (
-            [tree.get_joint_by_name(name) for name in names] for tree in (trees.commanded, trees.measured)
+            [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
         self._live = live
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
@@ -66,24 +66,24 @@ class Chunks:
         self._forearm, self._hand_radius = people.length / np.linalg.norm(toward) * toward, people.radius
         self._gate: float | None = None
         self._missed = 0
-        self.begin_anew()
+        self.restart()
 
-    def begin_anew(self) -> None:
-        """What comes goes into another file: its time begins anew, and the mode is said again."""
+    def restart(self) -> None:
+        """Starts another file: its time begins at 0, and the mode is sent again."""
         self._followed = False
         self._shown: tuple[int, int] | None = None
-        self._said_ns = 0
+        self._mode_sent_ns = 0
         self._scene_at = self._trail_at = -1
         self._start_ns: int | None = None
         self.end_s = 0.0
         self.peaks: dict[str, list[float]] = {}  # of each view of curves, one for each batch
 
-    def gate(self, deviation_m: float) -> None:
-        """From now on the skill holds above this deviation [m]."""
+    def set_gate(self, deviation_m: float) -> None:
+        """Sets the deviation [m] above which the skill in force holds."""
         self._gate = deviation_m
 
     def index(self, times_ns: NDArray[np.int64], *, to_ns: int = 1) -> list[rr.TimeColumn]:
-        """The columns of time for what happens at these times [ns], its seconds to so many ns."""
+        """The time columns of these times [ns]; seconds since the start rounded to `to_ns`."""
         if self._start_ns is None:
             self._start_ns = int(times_ns[0])
         since = np.maximum(times_ns - self._start_ns, 0) // to_ns * to_ns
@@ -93,25 +93,25 @@ class Chunks:
             rr.TimeColumn("time", timestamp=times_ns.view("datetime64[ns]")),
         ]
 
-    def of(self, batch: list[Shown]) -> Iterator[rr.chunk.Chunk]:
-        """The chunks that show a batch."""
+    def chunks(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
+        """The chunks that show a batch of frames."""
         frames = np.array([shown.frame for shown in batch])
         times = np.array([shown.time_ns for shown in batch], np.int64)
         ticks = frames["tick"]
         self.index(times[:1])
 
-        def columns(path: str, rows: Any, *what: Any) -> rr.chunk.Chunk:
+        def columns(path: str, rows: Any, *parts: Any) -> rr.chunk.Chunk:
             to_ns = LOG_NS if path == "/log" else 1
             index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows], to_ns=to_ns)]
-            return rr.chunk.Chunk.from_columns(path, index, [column for part in what for column in part])
+            return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
         seen = frames["hand_ages"] >= 0
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, times, columns)
-        drawn = np.flatnonzero(ticks // self._every != np.concatenate([[self._scene_at], ticks[:-1] // self._every]))
+        sampled = np.flatnonzero(ticks // self._every != np.concatenate([[self._scene_at], ticks[:-1] // self._every]))
         self._scene_at = int(ticks[-1]) // self._every
-        if len(drawn):
-            yield from self._scene(batch, frames, drawn, seen, columns)
+        if len(sampled):
+            yield from self._scene(batch, frames, sampled, seen, columns)
         corners = np.flatnonzero(
             ticks // self._trail_every != np.concatenate([[self._trail_at], ticks[:-1] // self._trail_every])
         )
@@ -120,7 +120,7 @@ class Chunks:
             yield from self._trail(frames, corners, columns)
 
     def _curves(
-        self, batch: list[Shown], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns
+        self, batch: list[DrawnFrame], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns
     ) -> Iterator[rr.chunk.Chunk]:
         def scalars(path: str, rows: Any, values: NDArray[Any], view: str = "") -> Iterator[rr.chunk.Chunk]:
             found = values[rows]
@@ -143,21 +143,23 @@ class Chunks:
         aimed = np.flatnonzero(seen.all(axis=1))
         following = seen.all(axis=1) & (frames["mode"] == Mode.FOLLOW)
         off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
-        ended = ~following & np.concatenate([[self._followed], following[:-1]])  # there the curve has a gap
+        gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
         self._followed = bool(following[-1])
-        yield from scalars("/error/target", np.flatnonzero(following | ended), off_mm, "/error")
-        yield from scalars("/turn/target", np.flatnonzero(following | ended), self._turned(frames, following), "/turn")
+        yield from scalars("/error/target", np.flatnonzero(following | gap_starts), off_mm, "/error")
+        yield from scalars(
+            "/turn/target", np.flatnonzero(following | gap_starts), self._rotation_error(frames, following), "/turn"
+        )
         std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
         known = seen.all(axis=1)
         yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
         gripping = known & (frames["closure"] >= 0)
         yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
-        told = gripping & (frames["gripper"] != UNKNOWN)
+        is_commanded = gripping & (frames["gripper"] != UNKNOWN)
         closed = 100.0 * (frames["gripper"] == CLOSED)
-        yield from scalars("/gripper/commanded", np.flatnonzero(told), closed, "/gripper")
+        yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        other = known & (np.abs(frames["deviation"] - std_m) > SAME_M)  # of a skill between places
-        yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["deviation"], "/deviation")
+        differs = known & (np.abs(frames["deviation"] - std_m) > SAME_M)
+        yield from scalars("/deviation/hands", np.flatnonzero(differs), 1e3 * frames["deviation"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
         measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
@@ -181,9 +183,9 @@ class Chunks:
             self._missed = missed
         yield from scalars("/age", aimed, frames["hand_ages"] * self._period_ms)
 
-    def _turned(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
-        """By how much the tool is turned from its target (T,) [°]: of what it follows, see
-        `[tool] orientation`; NaN where it does not follow.
+    def _rotation_error(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
+        """Angle between tool and target (T,) [°], of the part that `[tool] orientation` names; NaN
+        where the arm does not follow.
         """
         angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
         for name in names:  # a frame may be damaged
@@ -193,49 +195,49 @@ class Chunks:
         return angles
 
     def _modes(self, frames: NDArray[Any], times: NDArray[np.int64], columns: Columns) -> Iterator[rr.chunk.Chunk]:
-        """Mode and reason where they change; to live viewers also now and then."""
-        changed, told = [], []
+        """Mode and reason where they change; to live viewers also every REPEAT_S."""
+        changed, sent = [], []
         for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), strict=True)):
             if now != self._shown:
                 changed.append(i)
                 self._shown = now
-            elif not (self._live and times[i] - self._said_ns > REPEAT_S * 1e9):
+            elif not (self._live and times[i] - self._mode_sent_ns > REPEAT_S * 1e9):
                 continue
-            told.append(i)
-            self._said_ns = int(times[i])
-        if not told:
+            sent.append(i)
+            self._mode_sent_ns = int(times[i])
+        if not sent:
             return
         modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
-        yield columns("/mode/mode", told, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in told]))
-        yield columns("/mode/reason", told, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in told]))
-        for i in told:
+        yield columns("/mode/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
+        yield columns("/mode/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
+        for i in sent:
             picture = banner(modes[i], reasons[i])
             layout = rr.components.ImageFormat(
                 width=picture.shape[1], height=picture.shape[0], color_model="RGB", channel_datatype="U8"
             )
-            look = rr.Mesh3D.columns(albedo_texture_buffer=[picture.tobytes()], albedo_texture_format=[layout])
-            yield columns("/scene/banner", [i], look)
-        for i in changed:  # each apart: the viewer shows one level for all rows of a chunk
+            texture = rr.Mesh3D.columns(albedo_texture_buffer=[picture.tobytes()], albedo_texture_format=[layout])
+            yield columns("/scene/banner", [i], texture)
+        for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
             yield columns("/log", [i], rr.TextLog.columns(text=[line(modes[i], reasons[i])], level=[level]))
 
     def _scene(
         self,
-        batch: list[Shown],
+        batch: list[DrawnFrame],
         frames: NDArray[Any],
         rows: NDArray[np.intp],
         seen: NDArray[np.bool_],
         columns: Columns,
     ) -> Iterator[rr.chunk.Chunk]:
-        told = np.array([i for i in rows if batch[i].measured is not None], np.intp)
-        measured = [batch[i].measured for i in told]
+        known = np.array([i for i in rows if batch[i].measured is not None], np.intp)
+        measured = [batch[i].measured for i in known]
         for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
             if joint is not None:
                 angles = frames["joints"][rows, number].tolist()
                 yield columns(f"/arm/joints/{number}", rows, joint.compute_transform_columns(angles, clamp=False))
-            if ghost is not None and len(told):
+            if ghost is not None and len(known):
                 angles = [float(q[number]) for q in measured if q is not None]
-                yield columns(f"/measured/joints/{number}", told, ghost.compute_transform_columns(angles, clamp=False))
+                yield columns(f"/measured/joints/{number}", known, ghost.compute_transform_columns(angles, clamp=False))
         tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows])
         yield columns("/scene/tool", rows, tool)
         yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
@@ -248,17 +250,17 @@ class Chunks:
             variances, axes = np.linalg.eigh(frames["covariance"][shown])
             axes[:, :, 0] *= np.linalg.det(axes)[:, None]
             half = np.clip(2.0 * np.sqrt(np.maximum(variances, 0.0)), 1e-4, 0.3)
-            turned, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][shown]
-            look = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=turned)
-            yield columns("/scene/target", shown, look)
+            orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][shown]
+            region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations)
+            yield columns("/scene/target", shown, region)
         if len(near := rows[seen[rows].any(axis=1)]):
             lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)
-            look = rr.LineStrips3D.columns(strips=lines, labels=labels)
-            yield columns("/scene/nearest", near, look)
+            strips = rr.LineStrips3D.columns(strips=lines, labels=labels)
+            yield columns("/scene/nearest", near, strips)
 
     def _nearest(self, frame: Record, seen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], str]:
-        """The line (2, 3) from the nearest hand to the arm, and how long it is; a point without a
-        word where no hand is near.
+        """The line (2, 3) from the nearest hand to the arm, and its length as text; where no hand
+        is near a point, and no text.
         """
         body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
         placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
@@ -269,13 +271,13 @@ class Chunks:
                 for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
                     distance = between_segments(ends, hand, near) - radius - self._hand_radius
                     if distance < found[0]:
-                        ways = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]
-                        found = distance, np.stack(ways)
+                        surfaces = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]
+                        found = distance, np.stack(surfaces)
         distance, line = found
         return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
 
     def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
-        """The ways of the last seconds: each from where the hand was first seen, or seen again."""
+        """The trails of the last TRAIL_S; each starts anew where its hand was lost meanwhile."""
         tracks = [(name, frames["hands"][:, side], frames["hand_ages"][:, side]) for side, name in enumerate(SIDES)]
         tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1)))
         for name, positions, ages in tracks:

@@ -1,7 +1,7 @@
-"""What the viewer draws of a skill: its demonstrations and reference as faint lines and points, and
-the taught places, each with the neighbourhood of hands for which it holds.
+"""What the viewer draws of a skill: demonstrations and reference as faint lines and points, and
+via-points with the hands' radius within which they hold.
 
-Read leniently, straight from the arrays of the skill's file: what is not there is not drawn.
+It is read from the arrays of the skill's file; what is missing there is not drawn.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from numpy.typing import NDArray
 
 from service import palette
 from service.contract.requests import ViaPoint
-from service.demonstrations.files import read_demonstration
+from service.demonstrations.demonstration_reader import read_demonstration
 from service.learning.demonstration import Demonstration, fingerprint
 from service.recording.mcap_file import RecordingError
 
-MOST_CORNERS = 300  # of a line
+MOST_POINTS = 300  # of a line
 MOST_FILES, MOST_FOLDERS = 60, 20
 Points = NDArray[np.float64]
 Point = tuple[float, float, float]
 Column = Callable[..., rr.chunk.Chunk]
 
 
-class Place(NamedTuple):
-    """A place with a name: where hands and tool are at it [m], and for hands how far off it holds;
-    without a radius of its own it was demonstrated, not taught.
+class MarkedViaPoint(NamedTuple):
+    """A via-point with a name: positions of hands and tool [m], and the hands' radius within which
+    it holds [m]. Without a radius it was demonstrated, not taught.
     """
 
     name: str
@@ -44,36 +44,36 @@ class Place(NamedTuple):
     follow: str = "demonstrated"
 
 
-class Taught(NamedTuple):
-    """What a skill's file says: reference points of the tool (N, 3) [m], places with names, the
-    deviation above which it holds [m], what was found in learning.
+class SkillContents(NamedTuple):
+    """What a skill's file holds: reference points of the tool (N, 3) [m], via-points, the deviation
+    above which it holds [m], the figures of its learning.
     """
 
     name: str
     learned_from: str
     reference: Points
-    places: tuple[Place, ...]
+    via_points: tuple[MarkedViaPoint, ...]
     threshold: float
     figures: dict[str, Any]
 
 
-def taught(skill: bytes) -> Taught:
-    """What is to be drawn of the skill in the bytes of an .npz file. Raises ValueError."""
+def skill_contents(skill: bytes) -> SkillContents:
+    """What can be drawn of a skill, given the bytes of its .npz file. Raises ValueError."""
     try:
         with np.load(io.BytesIO(skill), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         reference = np.asarray(arrays.get("base_mean", np.empty((0, 3))), np.float64)
         is_tool = "outputs: tool x y z [m]" in str(arrays.get("units", "")) and reference.shape[1:] == (3,)
-        places = {place.name: place for place in _demonstrated(arrays)}
-        places |= {
-            place.name: Place(place.name, place.left, place.right, place.tool, place.radius, place.follow)
-            for place in msgspec.json.decode(str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...])
+        via_points = {point.name: point for point in _demonstrated(arrays)}
+        via_points |= {
+            point.name: MarkedViaPoint(point.name, point.left, point.right, point.tool, point.radius, point.follow)
+            for point in msgspec.json.decode(str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...])
         }
-        return Taught(
+        return SkillContents(
             str(arrays.get("name", "")),
             str(arrays.get("learned_from", "")),
             reference if is_tool else np.empty((0, 3)),
-            tuple(places.values()),
+            tuple(via_points.values()),
             float(arrays.get("threshold", np.inf)),
             msgspec.json.decode(str(arrays["figures"])) if "figures" in arrays else {},
         )
@@ -90,26 +90,27 @@ def taught(skill: bytes) -> Taught:
         raise ValueError(f"a skill of which nothing can be drawn: {error}") from None
 
 
-def _demonstrated(arrays: dict[str, Any]) -> Iterator[Place]:
-    """The places that a skill knows from its demonstrations."""
+def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
+    """The named via-points in a skill's demonstrations."""
     if "names" in arrays and "nominal" in arrays:
         names = msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...])
         for name, at in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
             left, right, tool = ((x, y, z) for x, y, z in at)
-            yield Place(name, left, right, tool)
+            yield MarkedViaPoint(name, left, right, tool)
 
 
-def demonstrations(skill: Taught, folder: Path) -> list[Demonstration]:
-    """The demonstrations that a skill was learned from, where they are in a folder or one below it;
-    else none.
+def demonstrations(skill: SkillContents, folder: Path) -> list[Demonstration]:
+    """The demonstrations that a skill was learned from, if a folder or one below it holds them all.
 
-    They are found by the names in the skill's figures, or among the folder's files in their order,
-    and are known by their hash.
+    They are found by the names in the skill's figures, or by the order of the folder's files, and
+    checked by their hash.
     """
     names = [str(row.get("name")) for row in skill.figures.get("demonstrations", ())]
     below = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
-    for place in (folder, *below[:MOST_FOLDERS]):
-        paths = [place / f"{name}.mcap" for name in names] or sorted(place.glob("demonstration-*.mcap"))[:MOST_FILES]
+    for searched in (folder, *below[:MOST_FOLDERS]):
+        paths = [searched / f"{name}.mcap" for name in names] or sorted(searched.glob("demonstration-*.mcap"))[
+            :MOST_FILES
+        ]
         found: list[Demonstration] = []
         with contextlib.suppress(RecordingError, OSError):
             for path in paths if all(path.is_file() for path in paths) else ():
@@ -119,34 +120,34 @@ def demonstrations(skill: Taught, folder: Path) -> list[Demonstration]:
     return []
 
 
-def drawn(skill: Taught, shown: list[Demonstration], at: Column) -> Iterator[rr.chunk.Chunk]:
-    """The chunks that show a skill; `at` makes one of a path and columns of one row."""
+def skill_chunks(skill: SkillContents, shown: list[Demonstration], at: Column) -> Iterator[rr.chunk.Chunk]:
+    """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
     for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
-        ways = [getattr(one, name)[:, :3] for one in shown]
-        lines = [way[:: 1 + len(way) // MOST_CORNERS].astype(np.float32) for way in ways]
-        look = {"colors": [palette.faint(colour, 0.22)] * len(lines), "radii": [0.001] * len(lines)}
-        yield at(f"/skill/demonstrations/{name}", *_one(rr.LineStrips3D, len(lines), strips=lines, **look))
+        trajectories = [getattr(one, name)[:, :3] for one in shown]
+        lines = [one[:: 1 + len(one) // MOST_POINTS].astype(np.float32) for one in trajectories]
+        style = {"colors": [palette.faint(colour, 0.22)] * len(lines), "radii": [0.001] * len(lines)}
+        yield at(f"/skill/demonstrations/{name}", *_one(rr.LineStrips3D, len(lines), strips=lines, **style))
     count = len(skill.reference)
-    look = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}
-    yield at("/skill/reference", *_one(rr.Points3D, count, positions=skill.reference, **look))
-    places, count = skill.places, len(skill.places)
-    look = {"colors": [palette.PLACE] * count, "radii": [0.01] * count, "labels": [place.name for place in places]}
-    yield at("/skill/places/tool", *_one(rr.Points3D, count, positions=[place.tool for place in places], **look))
+    style = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}
+    yield at("/skill/reference", *_one(rr.Points3D, count, positions=skill.reference, **style))
+    points, count = skill.via_points, len(skill.via_points)
+    style = {"colors": [palette.PLACE] * count, "radii": [0.01] * count, "labels": [point.name for point in points]}
+    yield at("/skill/places/tool", *_one(rr.Points3D, count, positions=[point.tool for point in points], **style))
     for side, colour in (("left", palette.LEFT), ("right", palette.RIGHT)):
-        centres = [getattr(place, side) for place in places]
-        half = [[max(place.radius, 0.004)] * 3 for place in places]
-        look = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
-        look |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
-        yield at(f"/skill/places/{side}", *_one(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **look))
-    lines = [[place.left, place.tool, place.right] for place in places]
-    look = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
-    yield at("/skill/places/belong", *_one(rr.LineStrips3D, count, strips=lines, **look))
+        centres = [getattr(point, side) for point in points]
+        half = [[max(point.radius, 0.004)] * 3 for point in points]
+        style = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
+        style |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
+        yield at(f"/skill/places/{side}", *_one(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style))
+    lines = [[point.left, point.tool, point.right] for point in points]
+    style = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
+    yield at("/skill/places/belong", *_one(rr.LineStrips3D, count, strips=lines, **style))
     text = about(skill, len(shown))
     yield at("/about/skill", *rr.TextDocument.columns(text=[text], media_type=["text/markdown"]))
 
 
 def _one(kind: Any, count: int, **columns: Any) -> Any:
-    """Columns of one row with so many of a kind; with none of them what was there is gone."""
+    """Columns of one row with `count` elements; 0 removes those that were shown."""
     if not count:
         key = next(iter(columns))
         flat = kind.columns(**{key: np.empty((0, 2, 3) if key == "strips" else (0, 3))})
@@ -154,8 +155,8 @@ def _one(kind: Any, count: int, **columns: Any) -> Any:
     return kind.columns(**columns).partition([count])
 
 
-def about(skill: Taught, shown: int) -> str:
-    """What is known of a skill, as Markdown."""
+def about(skill: SkillContents, shown: int) -> str:
+    """A description of the skill, as Markdown."""
     rows = skill.figures.get("demonstrations", ())
     lines = [f"# {skill.name or 'skill'}", ""]
     if len(skill.reference):
@@ -163,11 +164,11 @@ def about(skill: Taught, shown: int) -> str:
     lines.append(f"Learned from {shown} demonstrations (faint lines)." if shown else "Its demonstrations are not here.")
     lines.append(f"It holds where it is off what it knows by more than {1000 * skill.threshold:.0f} mm.")
     lines += ["", "## Places", ""]
-    if skill.places:
+    if skill.via_points:
         lines += ["| place | tool x, y, z [m] | within [mm] of the hands | goes with |", "|---|---|---|---|"]
-        for place in skill.places:
-            at = ", ".join(f"{value:.3f}" for value in place.tool)
-            lines.append(f"| {place.name} | {at} | {1000 * place.radius:.0f} | {place.follow} |")
+        for point in skill.via_points:
+            at = ", ".join(f"{value:.3f}" for value in point.tool)
+            lines.append(f"| {point.name} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
     else:
         lines.append("None.")
     if rows:

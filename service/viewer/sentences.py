@@ -1,4 +1,4 @@
-"""The notes of a recording as sentences, for people who read the log beside the scene."""
+"""The notes of a recording as sentences, for the viewer's log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ASKED = {"via_points": "Teaching", "skill": "Loading a skill", **{name: f"A req
 
 
 def sentence(note: str) -> str:
-    """What a note says, in words; one that is a text already stays as it is."""
+    """A note as a sentence; one that is plain text already stays as it is."""
     asked, _, rest = note.partition(" ")
     if asked not in _ASKED:
         return note

@@ -1,7 +1,7 @@
 """What the viewer shows and never changes: the arm and its ghost, table, reach, names and colours.
 
-Millimetres, microseconds and degrees of transparency are chosen here, in `chunks` and
-`arrangement`, and nowhere else.
+Millimetres, microseconds and degrees of transparency are chosen here, in `dynamic` and
+`blueprint`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from service.viewer.blueprint import EYE, LOOK_AT, UP
 
 GHOST = "measured/"  # before the names of its frames
 ARC_STEPS = 48
-BANNER_AT, BANNER_WIDTH = (0.55, 0.66, -0.44), 0.74  # right of, above and before where the camera looks, by how far
+BANNER_AT = (0.55, 0.66, -0.44)  # right of, above and before the point that the camera looks at
+BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 
 
-class Trees:
-    """The arm as commanded and as measured: the same URDF twice, under names of their own."""
+class ArmModels:
+    """The arm as commanded and as measured: one URDF, loaded twice under different names."""
 
     def __init__(self, urdf: Path) -> None:
         self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
@@ -37,17 +38,17 @@ class Trees:
         )
 
 
-def log_fixed(stream: rr.RecordingStream, trees: Trees, settings: Settings) -> None:
-    """Logs what never changes."""
+def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
+    """Logs everything that never changes."""
 
-    def fix(path: str, *what: Any) -> None:
-        stream.log(path, *what, static=True)
+    def fix(path: str, *archetypes: Any) -> None:
+        stream.log(path, *archetypes, static=True)
 
-    _log_arm(stream, trees.commanded, "/arm", ghost=False)
-    _log_arm(stream, trees.measured, "/measured", ghost=True)
+    _log_arm(stream, models.commanded, "/arm", ghost=False)
+    _log_arm(stream, models.measured, "/measured", ghost=True)
     fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=trees.commanded.root_link().name))
-    fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + trees.measured.root_link().name))
+    fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name))
+    fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + models.measured.root_link().name))
     _log_surroundings(fix, settings)
     fix("/scene/tool", rr.TransformAxes3D(0.07))
     for name, colour, radius in (
@@ -55,12 +56,12 @@ def log_fixed(stream: rr.RecordingStream, trees: Trees, settings: Settings) -> N
         ("right_hand", palette.RIGHT, 0.022),
         ("setpoint", palette.TOOL, 0.008),
     ):
-        words = [name.replace("_", " ")]
-        ball = rr.Points3D.from_fields(colors=[colour], radii=[radius], labels=words, show_labels=radius > 0.01)
-        fix(f"/scene/{name}", ball)
-    wires = rr.components.FillMode.TransparentFillMajorWireframe
+        labels = [name.replace("_", " ")]
+        marker = rr.Points3D.from_fields(colors=[colour], radii=[radius], labels=labels, show_labels=radius > 0.01)
+        fix(f"/scene/{name}", marker)
+    wireframe = rr.components.FillMode.TransparentFillMajorWireframe
     region = rr.Ellipsoids3D.from_fields(
-        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wires, labels=["target, 2 sigma"], show_labels=False
+        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wireframe, labels=["target, 2 sigma"], show_labels=False
     )
     fix("/scene/target", region)
     for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
@@ -70,7 +71,7 @@ def log_fixed(stream: rr.RecordingStream, trees: Trees, settings: Settings) -> N
 
 
 def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, ghost: bool) -> None:
-    """The shapes of the arm: solid, or as a ghost that one sees through."""
+    """Logs the shapes of the arm: solid, or transparent as a ghost."""
     fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
     colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
@@ -81,8 +82,8 @@ def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, g
         for shape in _SHAPES:
             if any(name.startswith(f"{shape.__name__}:") for name in names):
                 lines = "radii" if shape is rr.Boxes3D else "line_radii"
-                look: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
-                stream.log(chunk.entity_path, shape.from_fields(fill_mode=fill, **look), static=True)
+                style: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
+                stream.log(chunk.entity_path, shape.from_fields(fill_mode=fill, **style), static=True)
         if ghost and any(name.startswith("Asset3D:") for name in names):
             stream.log(chunk.entity_path, rr.Asset3D.from_fields(albedo_factor=colour), static=True)
     for joint in tree.joints():
@@ -91,7 +92,7 @@ def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, g
 
 
 def _log_surroundings(fix: Any, settings: Settings) -> None:
-    """Table, boxes, and how far the arm reaches."""
+    """Logs the table, the obstacles and the arm's reach."""
     (x, y, top), (half_x, half_y) = settings.table.centre, settings.table.half_size
     solid = rr.components.FillMode.Solid
     half = [(half_x, half_y, 0.0095)]
@@ -111,52 +112,52 @@ def _log_surroundings(fix: Any, settings: Settings) -> None:
                 fill_mode=solid,
             ),
         )
-    faint, thin = palette.faint(palette.GREY, 0.08), rr.Radius.ui_points(0.5)  # else thick where it nears the eye
+    faint, thin = palette.faint(palette.GREY, 0.08), rr.Radius.ui_points(0.5)  # in pixels: constant near the camera
     fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=thin))
 
 
 def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
-    """Lines (P, 3) [m] on the outer shell of the reach: around at two heights, and up and down at
-    three bearings.
-    """
+    """Lines (P, 3) [m] on the outer shell of the reach: two parallels and three meridians."""
     centre = np.array(reach.centre)
     lowest = max(np.arcsin(np.clip((reach.min_z - centre[2]) / reach.outer, -1.0, 1.0)), -np.pi / 2)
     around, up = np.linspace(-np.pi / 2, np.pi / 2, ARC_STEPS), np.linspace(lowest, np.pi / 2, ARC_STEPS)
     arcs = [(around, np.full(ARC_STEPS, height)) for height in (lowest, 0.0)]
     arcs += [(np.full(ARC_STEPS, bearing), up) for bearing in (-np.pi / 3, 0.0, np.pi / 3)]
     for bearing, height in arcs:
-        way = np.stack([np.cos(bearing) * np.cos(height), np.sin(bearing) * np.cos(height), np.sin(height)], axis=1)
-        points = centre + reach.outer * way
+        direction = np.stack(
+            [np.cos(bearing) * np.cos(height), np.sin(bearing) * np.cos(height), np.sin(height)], axis=1
+        )
+        points = centre + reach.outer * direction
         points = points[points[:, 0] >= reach.min_x]
         if len(points) > 1:
             yield points
 
 
 def _log_names(fix: Any, settings: Settings) -> None:
-    """Names, units and colours of the curves, and the words and colours of the modes."""
+    """Logs names, units and colours of the curves, and the labels and colours of the modes."""
     joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
-    several: list[tuple[str, list[str], str, tuple[palette.Colour, ...]]] = [
-        (f"/joints/{what}", joints, unit, palette.JOINTS)
-        for what, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
+    multiple: list[tuple[str, list[str], str, tuple[palette.Colour, ...]]] = [
+        (f"/joints/{quantity}", joints, unit, palette.JOINTS)
+        for quantity, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
     ]
-    several += [
+    multiple += [
         ("/timing/stages", list(STAGES), "µs", palette.JOINTS),
         ("/age", [f"{side} hand" for side in SIDES], "ms", (palette.LEFT, palette.RIGHT)),
     ]
-    for path, names, unit, colours in several:
-        look: dict[str, Any] = {
+    for path, names, unit, colours in multiple:
+        style: dict[str, Any] = {
             "colors": [colours[i % len(colours)] for i in range(len(names))],
             "widths": [1.5] * len(names),
         }
-        fix(path, rr.SeriesLines(names=[f"{name} [{unit}]" for name in names], **look, **_drawn_as(path)))
+        fix(path, rr.SeriesLines(names=[f"{name} [{unit}]" for name in names], **style, **_aggregation(path)))
     for path, name, colour in (
         ("/error/target", "tool to target [mm]", palette.TOOL),
-        ("/turn/target", "turned from the target [°]", palette.TOOL),
+        ("/turn/target", "tool rotated from the target [°]", palette.TOOL),
         ("/turn/std", "target's standard deviation [°]", palette.TARGET),
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
         ("/deviation/target", "target's standard deviation [mm]", palette.TARGET),
-        ("/deviation/hands", "hands off what is known [mm]", palette.OFF),
+        ("/deviation/hands", "deviation of the hands [mm]", palette.OFF),
         ("/deviation/gate", "holds above [mm]", palette.GATE),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),
@@ -168,24 +169,24 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),
     ):
-        fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_drawn_as(path)))
-    for path, words, numbers in (
+        fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_aggregation(path)))
+    for path, names, colours_packed in (
         ("/mode/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
         ("/mode/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
     ):
-        labels = [word.replace("_", " ") for word in words]
-        fix(path, rr.StateConfiguration(values=words, labels=labels, colors=np.array(numbers, np.uint32)))
-    fix("/scene/banner", _sign())
+        labels = [name.replace("_", " ") for name in names]
+        fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))
+    fix("/scene/banner", _board())
 
 
-def _drawn_as(path: str) -> dict[str, Any]:
-    """Where a curve has more values than the screen has dots, the worst of them count."""
-    worst = path.startswith(("/timing", "/latency", "/age"))
-    return {"aggregation_policy": rr.components.AggregationPolicy.Max} if worst else {}
+def _aggregation(path: str) -> dict[str, Any]:
+    """How values that share one pixel column are drawn: of times and ages, the largest."""
+    is_largest = path.startswith(("/timing", "/latency", "/age"))
+    return {"aggregation_policy": rr.components.AggregationPolicy.Max} if is_largest else {}
 
 
-def _sign() -> rr.Mesh3D:
-    """The board behind the arm on which mode and reason are written: it faces the camera."""
+def _board() -> rr.Mesh3D:
+    """The board behind the arm that shows mode and reason: it faces the camera."""
     far = np.linalg.norm(np.subtract(EYE, LOOK_AT))
     toward = np.subtract(EYE, LOOK_AT) / far
     right = np.cross(UP, toward) / np.linalg.norm(np.cross(UP, toward))

@@ -25,31 +25,30 @@ from numpy.typing import NDArray
 from service.config import Settings
 from service.contract import cdr
 from service.contract.explain import ExplainedError
-from service.contract.messages import Thing, WireError, in_order
+from service.contract.messages import SceneObject, WireError, in_order
 from service.core.record import Record
 from service.learning.demonstration import Demonstration
 from service.recording.paths import skills_folder
-from service.recording.recording import THINGS
-from service.viewer import learned as taught
-from service.viewer import things
+from service.recording.recording import OBJECTS
+from service.viewer import learned, scene_objects
 from service.viewer.blueprint import blueprint
-from service.viewer.dynamic import LOG_NS, Chunks, Shown
-from service.viewer.learned import Taught
+from service.viewer.dynamic import LOG_NS, DrawnFrame, DynamicScene
+from service.viewer.learned import SkillContents
 from service.viewer.sentences import sentence
-from service.viewer.static import Trees, log_fixed
+from service.viewer.static import ArmModels, log_static
 
 FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
 LIVE_MEMORY = "64MiB"
 FLUSH_TIMEOUT_S = 5.0
-REPEAT_S = 10.0  # what is in force is said again to live viewers as often
+REPEAT_S = 10.0  # skill and objects are sent again to live viewers, for those that connect later
 
 
 class ViewerError(ExplainedError, RuntimeError):
-    """Something that cannot be shown: says what, and what would help."""
+    """Something cannot be shown; the message says what, and what would help."""
 
 
 class _Destination:
-    """Where the scene goes: collects frames, sends them by batches."""
+    """Where the scene goes: collects frames, and sends them in batches."""
 
     def __init__(
         self,
@@ -61,38 +60,39 @@ class _Destination:
         urdf: Path,
         settings: Settings,
         recording_id: str,
-        skill: tuple[Taught, list[Demonstration]] | None,
+        skill: tuple[SkillContents, list[Demonstration]] | None,
     ) -> None:
         self._batch_ns = round(batch_s * 1e9)
-        self._pending: list[Shown] = []
+        self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
-        self._trees = Trees(urdf)
-        self._chunks = Chunks(self._trees, settings, urdf.read_text(encoding="utf-8"), live=live)
+        self._models = ArmModels(urdf)
+        self._dynamic = DynamicScene(self._models, settings, urdf.read_text(encoding="utf-8"), live=live)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
-        self._taught = skill
+        self._skill = skill
         if skill is not None:
-            self._chunks.gate(skill[0].threshold)
-        self._things: tuple[Thing, ...] = ()
+            self._dynamic.set_gate(skill[0].threshold)
+        self._objects: tuple[SceneObject, ...] = ()
         self._repeated_ns = 0
         self._open = False
-        self.turn(name, sink)
+        self.redirect(name, sink)
 
-    def turn(self, name: str, sink: Any) -> None:
-        """From now on the scene goes elsewhere: what never changes is sent there first, and what is
-        in force with the first frame.
+    def redirect(self, name: str, sink: Any) -> None:
+        """Sends the scene to another sink from now on.
+
+        The static part is sent first; skill and objects follow with the first frame.
         """
         self._finish()
         self.name = name
-        self._chunks.begin_anew()
+        self._dynamic.restart()
         self._repeated_ns, self._open = 0, True
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(self._settings.cell)
         # no more often than this: Rerun keeps 1.5 MB of each for good
         self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
-        log_fixed(self._stream, self._trees, self._settings)
+        log_static(self._stream, self._models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
-    def add(self, shown: Shown) -> None:
+    def add(self, shown: DrawnFrame) -> None:
         """Takes in one frame."""
         if not self._repeated_ns:
             self._repeat(shown.time_ns)
@@ -103,54 +103,54 @@ class _Destination:
             self._repeat(shown.time_ns)
 
     def _repeat(self, time_ns: int) -> None:
-        """Says what is in force, also for those who come later."""
+        """Sends skill and objects, also for viewers that connect later."""
         self._repeated_ns = time_ns
-        if self._taught is not None:
-            self.put(list(taught.drawn(*self._taught, self._at(time_ns))))
-        self.put(list(things.drawn(self._things, (), self._at(time_ns))))
+        if self._skill is not None:
+            self.put(list(learned.skill_chunks(*self._skill, self._at(time_ns))))
+        self.put(list(scene_objects.object_chunks(self._objects, (), self._at(time_ns))))
 
-    def learn(self, skill: Taught, demonstrations: list[Demonstration]) -> None:
-        """Takes in the skill in force from now on."""
-        self._taught = skill, demonstrations
-        self._chunks.gate(skill.threshold)
+    def learn(self, skill: SkillContents, demonstrations: list[Demonstration]) -> None:
+        """Shows the skill that is in force from now on."""
+        self._skill = skill, demonstrations
+        self._dynamic.set_gate(skill.threshold)
         if self._repeated_ns:
             self.send()
-            self.put(list(taught.drawn(skill, demonstrations, self._at(self._repeated_ns))))
+            self.put(list(learned.skill_chunks(skill, demonstrations, self._at(self._repeated_ns))))
 
-    def place(self, found: tuple[Thing, ...], time_ns: int) -> None:
-        """Takes in what lies on the bench."""
-        before, self._things = self._things, found
-        if self._repeated_ns and found != before:
-            self.put(list(things.drawn(found, (thing.name for thing in before), self._at(time_ns))))
+    def show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
+        """Shows the objects on the bench."""
+        before, self._objects = self._objects, objects
+        if self._repeated_ns and objects != before:
+            self.put(list(scene_objects.object_chunks(objects, (one.name for one in before), self._at(time_ns))))
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Takes in one line of the log."""
         self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
 
     def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
-        """What makes a chunk of one row at a time [ns]."""
-        index = self._chunks.index(np.array([time_ns], np.int64), to_ns=to_ns)
+        """The function that makes a chunk of one row at this time [ns]."""
+        index = self._dynamic.index(np.array([time_ns], np.int64), to_ns=to_ns)
         return lambda path, *columns: rr.chunk.Chunk.from_columns(path, index, list(columns))
 
     def send(self) -> None:
         """Sends what is pending."""
         if self._pending:
             batch, self._pending = self._pending, []
-            self.put(list(self._chunks.of(batch)))
+            self.put(list(self._dynamic.chunks(batch)))
 
     def _finish(self) -> None:
-        """Sends what is pending, and to a file how far its curves reach, now that this is known."""
+        """Sends what is pending; to a file also its blueprint, with the curves' ranges."""
         self.send()
-        if self._open and not self._live and self._chunks.end_s > 0:
-            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._chunks.peaks.items()}
+        if self._open and not self._live and self._dynamic.end_s > 0:
+            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
             self._stream.send_blueprint(
-                blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._chunks.end_s),
+                blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._dynamic.end_s),
                 make_active=True,
             )
 
     @property
     def _gate_m(self) -> float:
-        return np.inf if self._taught is None else self._taught[0].threshold
+        return np.inf if self._skill is None else self._skill[0].threshold
 
     def put(self, chunks: list[rr.chunk.Chunk]) -> None:
         """Hands chunks to the stream."""
@@ -168,8 +168,9 @@ class _Destination:
 
 
 class _Live(_Destination):
-    """A server for live viewers, fed on a thread of its own: a viewer that stalls holds up nobody,
-    the oldest batches are dropped.
+    """A server for live viewers, fed on a thread of its own.
+
+    A viewer that stalls delays nobody: the oldest batches are dropped.
     """
 
     def __init__(self, port: int, **common: Any) -> None:
@@ -213,7 +214,7 @@ class _Live(_Destination):
 class Viewer:
     """Draws frames as a Rerun scene into a file, for live viewers, or both.
 
-    Where it fails is told in `problems`, not raised.
+    What fails is listed in `problems`, not raised.
     """
 
     def __init__(
@@ -231,7 +232,7 @@ class Viewer:
         self._settings = settings
         self._measured: NDArray[np.float64] | None = None
         self._skill, self._learned_from = b"", ""
-        self._unread: Taught | None = None  # whose demonstrations are to be read, which takes a while
+        self._unread: SkillContents | None = None  # its demonstrations are still to be read, which takes a while
         self._remarks: list[str] = []  # for the log, with the next frame
         self._demonstrations: list[Demonstration] = []
         self._destinations: list[_Destination] = []
@@ -247,32 +248,32 @@ class Viewer:
         if rrd is not None:
             self.draw_into(rrd)
         if live_port is not None:
-            with self._sparing("the live view", None):
+            with self._contained("the live view", None):
                 live = _Live(live_port, **self._common)
                 self._destinations.append(live)
                 self.url = live.url
 
     def draw_into(self, rrd: Path) -> None:
-        """Ends the file drawn into, if there is one, and goes on in another.
+        """Ends the file drawn into, if there is one, and continues in another.
 
-        Each shows its part of the scene by itself; one endless file would fill the memory, which
-        holds a list of all that was sent.
+        Each file can be viewed alone. One endless file would fill the memory: Rerun keeps a list
+        of all that was sent.
         """
         name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
         self.rrd = None
-        with self._sparing(name, drawn):
+        with self._contained(name, drawn):
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
             if drawn is None:
                 self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
                 self._destinations.append(self._file)
             else:
-                drawn.turn(name, rr.FileSink(rrd))
+                drawn.redirect(name, rr.FileSink(rrd))
             self.rrd = str(rrd)
 
     @contextlib.contextmanager
-    def _sparing(self, name: str, destination: _Destination | None) -> Iterator[None]:
-        """What goes wrong inside is noted, and ends the destination only."""
+    def _contained(self, name: str, destination: _Destination | None) -> Iterator[None]:
+        """Within it an exception is noted in `problems`, and ends only this destination."""
         try:
             yield
         except Exception as error:
@@ -284,15 +285,13 @@ class Viewer:
 
     def _each(self, act: Callable[[_Destination], None]) -> None:
         for destination in list(self._destinations):
-            with self._sparing(destination.name, destination):
+            with self._contained(destination.name, destination):
                 act(destination)
 
     def add(
         self, frame: Record, time_ns: int, timing: Record | None = None, events: Iterable[tuple[str, bytes]] = ()
     ) -> None:
-        """Draws a frame at a time [ns], and what its `events` (kind and bytes) say of arm and
-        skill.
-        """
+        """Draws a frame at a time [ns], and the arm and skill in its `events` (kind, bytes)."""
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):
@@ -301,20 +300,20 @@ class Viewer:
                 self.learn(payload)
         if self._unread is not None:
             found, self._unread = self._unread, None
-            self._demonstrations = taught.demonstrations(found, skills_folder(self._settings))
+            self._demonstrations = learned.demonstrations(found, skills_folder(self._settings))
             self._show(found)
         while self._remarks:
             self.log(self._remarks.pop(0), "WARN", time_ns)
-        shown = Shown(frame, time_ns, timing, self._measured)
+        shown = DrawnFrame(frame, time_ns, timing, self._measured)
         self._each(lambda destination: destination.add(shown))
 
     def learn(self, skill: bytes) -> None:
-        """Draws what a skill was learned from and taught, from now on."""
+        """Draws a skill's demonstrations and via-points from now on."""
         if skill == self._skill:
             return
         self._skill = skill
         try:
-            found = taught.taught(skill)
+            found = learned.skill_contents(skill)
         except ValueError as error:
             self._remarks.append(str(error))
             return
@@ -323,15 +322,15 @@ class Viewer:
             self._unread = found
         self._show(found)
 
-    def _show(self, skill: Taught) -> None:
+    def _show(self, skill: SkillContents) -> None:
         self._common["skill"] = skill, self._demonstrations
         self._each(lambda destination: destination.learn(skill, self._demonstrations))
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Shows a note: things on the bench, or a line in the log, a warning under `log`."""
-        if key == THINGS:
-            found = msgspec.json.decode(text, type=tuple[Thing, ...])
-            self._each(lambda destination: destination.place(found, time_ns))
+        """Shows a note: objects on the bench, or a line in the log (a warning under `log`)."""
+        if key == OBJECTS:
+            found = msgspec.json.decode(text, type=tuple[SceneObject, ...])
+            self._each(lambda destination: destination.show_objects(found, time_ns))
         else:
             self.log(sentence(text), "WARN" if key == "log" else "INFO", time_ns)
 
@@ -340,7 +339,7 @@ class Viewer:
         self._each(lambda destination: destination.log(text, level, time_ns))
 
     def flush(self) -> None:
-        """Sends what is pending and sees to it that the file has it."""
+        """Sends what is pending, and waits until the file has it."""
         self._each(lambda destination: destination.flush())
 
     def close(self) -> None:

@@ -20,11 +20,11 @@ DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts
 OTHERS = ("demo", "replay", "learn", "status", "play")
 GOLDEN = str(RECORDINGS / "golden.mcap")
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in range(1, 6)]
-PUT_AWAY_SLOWLY = """
+CLEAN_UP_SLOWLY = """
 import time
 from service import interrupt
 interrupt.watch()
-with interrupt.put_away_first():
+with interrupt.clean_up_first():
     try:
         print("begun", flush=True)
         time.sleep(60)
@@ -127,7 +127,7 @@ def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
 
 def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", PUT_AWAY_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
+        [sys.executable, "-c", CLEAN_UP_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"

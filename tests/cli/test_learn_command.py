@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.demonstrations.files import write_demonstration
+from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations

@@ -87,9 +87,9 @@ turns = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda turn: math.hypot(*t
 
 
 @st.composite
-def a_thing(draw: st.DrawFn) -> messages.Thing:
+def a_thing(draw: st.DrawFn) -> messages.SceneObject:
     turn = draw(turns)
-    return messages.Thing(
+    return messages.SceneObject(
         draw(st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=20)),
         draw(st.sampled_from(("box", "ball", "cylinder"))),
         draw(st.sampled_from(FRAMES)),
@@ -101,17 +101,17 @@ def a_thing(draw: st.DrawFn) -> messages.Thing:
 
 
 @given(stamps, st.lists(a_thing(), max_size=5, unique_by=lambda thing: thing.name))
-def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.Thing]) -> None:
-    data = channels.THINGS.encode(stamp_ns, things)
-    read = ROS.deserialize_cdr(data, channels.THINGS.type)
-    assert bytes(ROS.serialize_cdr(read, channels.THINGS.type)) == data
+def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: list[messages.SceneObject]) -> None:
+    data = channels.OBJECTS.encode(stamp_ns, things)
+    read = ROS.deserialize_cdr(data, channels.OBJECTS.type)
+    assert bytes(ROS.serialize_cdr(read, channels.OBJECTS.type)) == data
     assert [(item.ns, item.header.frame_id, item.scale.x) for item in read.markers] == [
         (thing.name, thing.frame_id, thing.size[0]) for thing in things
     ]
-    assert channels.THINGS.decode(data) == tuple(things)
+    assert channels.OBJECTS.decode(data) == tuple(things)
     if things:
         with pytest.raises(messages.WireError):
-            channels.THINGS.decode(data[: len(data) // 2])
+            channels.OBJECTS.decode(data[: len(data) // 2])
 
 
 @pytest.mark.parametrize(
@@ -125,11 +125,13 @@ def test_things_are_the_bytes_of_another_implementation(stamp_ns: int, things: l
     ],
 )
 def test_a_thing_that_cannot_be_is_refused_in_words(change: dict[str, Any], error: str) -> None:
-    thing = messages.Thing("board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1))
+    thing = messages.SceneObject(
+        "board", "box", "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.1), (0, 0, 0, 1)
+    )
     with pytest.raises(messages.WireError, match=error):
-        channels.THINGS.decode(channels.THINGS.encode(1, [thing._replace(**change)]))
+        channels.OBJECTS.decode(channels.OBJECTS.encode(1, [thing._replace(**change)]))
     with pytest.raises(messages.WireError, match="a name of its own"):
-        channels.THINGS.decode(channels.THINGS.encode(1, [thing, thing]))
+        channels.OBJECTS.decode(channels.OBJECTS.encode(1, [thing, thing]))
 
 
 @given(stamps, st.lists(finite, min_size=14, max_size=14))

@@ -239,11 +239,11 @@ def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill:
     controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
     tool, wanted = MeasuredTool(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
-    assert tool.told(controller.state) is None
+    assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))
-    np.testing.assert_allclose(tool.told(controller.state), wanted, atol=1e-4)
+    np.testing.assert_allclose(tool.position(controller.state), wanted, atol=1e-4)
     controller.step(Tick(200))
-    assert tool.told(controller.state) is None
+    assert tool.position(controller.state) is None
 
 
 def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
@@ -331,8 +331,8 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     assert "example:" in done.stdout
 
 
-def test_the_client_in_the_readme_works(shared_daemon: Any) -> None:
-    code = (ROOT / "README.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
+def test_the_client_on_the_page_of_the_wire_works(shared_daemon: Any) -> None:
+    code = (ROOT / "docs" / "wire.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
     code = code.replace("tcp/127.0.0.1:7447", shared_daemon.endpoint)
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT

@@ -22,7 +22,7 @@ from service.contract import channels, requests
 from service.contract.records import Mode, Reason
 from service.core.frame import Event
 from service.core.skill.skill import Skill
-from service.daemon.requests import Pending, Requests, SavedViaPoints
+from service.daemon.queryables import PendingEvent, Queryables, SavedViaPoints
 from service.daemon.saved_via_points import state_folder
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import with_file
@@ -52,7 +52,7 @@ class Cell:
         self.failures: list[str] = []
         tell = {"status": lambda: requests.encode_json(self.status()), "frame": self.frame}
         tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
-        self.requests = Requests(near, self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
+        self.requests = Queryables(near, self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
         self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
@@ -285,14 +285,14 @@ def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[SkillW
 
 
 def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.requests.ADOPTION_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
     cell.running = False
     with pytest.raises(RefusedError, match="the loop did not take the request: it is starting, ending or stalled"):
         cell.client.ask("hold")
 
 
 def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.requests.ADOPTION_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
     cell.running = False
     with pytest.raises(RefusedError):
         cell.client.add(PLACES)
@@ -455,6 +455,6 @@ def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -
 
 def test_a_pending_event_tells_the_tick_that_took_it() -> None:
     event = Event("hold", b"", None)
-    pending = Pending(event)
+    pending = PendingEvent(event)
     assert pending.claimed(42) is event
     assert pending.wait() == 42

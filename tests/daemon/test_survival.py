@@ -165,7 +165,7 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe" / "daemon.lock")
     for name in ("link", "pipe"):
         lock = Lock(tmp_path / name, "thirdhand")
-        lock.tell(["tcp/127.0.0.1:1"])
+        lock.announce(["tcp/127.0.0.1:1"])
         lock.close()
     assert victim.read_text() == "untouched"
 

@@ -16,7 +16,7 @@ from service.contract.cdr import encode_pose
 from service.contract.channels import POSE
 from service.contract.messages import PoseStamped
 from service.core.frame import encode
-from service.demonstrations.files import iter_hands, read_demonstration, write_demonstration
+from service.demonstrations.demonstration_reader import iter_hands, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.recording import Recorder, Recording

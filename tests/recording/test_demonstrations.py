@@ -12,7 +12,7 @@ from mcap.writer import Writer
 
 from service.contract import cdr, channels, messages
 from service.contract.ros2msg import schema
-from service.demonstrations.files import iter_hands, read_demonstration, write_demonstration
+from service.demonstrations.demonstration_reader import iter_hands, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import RecordingError
 from support.recorded import START_NS, at_ns, write

@@ -24,12 +24,12 @@ from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
 from service.core.frame import Event, Tick, encode
 from service.core.record import blank
-from service.demonstrations.files import write_demonstration
+from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.recording import Recorder, Recording
 from service.urdf import Urdf
-from service.viewer.markers import with_balls
+from service.viewer.urdf_markers import with_markers
 from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
 from support.wam import FRAME
 
@@ -231,9 +231,9 @@ def test_rerun_by_itself_draws_hands_and_target_as_balls_in_frames_that_move(tmp
 
 def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
     text = '<robot name="a"><link name="base"/><link name="target"/></robot>'
-    assert with_balls(text) == text
-    assert with_balls("no robot") == "no robot"
-    assert Urdf(with_balls(robot_description(Settings()))).chain("left_hand")[0].parent == "base"
+    assert with_markers(text) == text
+    assert with_markers("no robot") == "no robot"
+    assert Urdf(with_markers(robot_description(Settings()))).chain("left_hand")[0].parent == "base"
 
 
 def test_recordings_with_topics_as_earlier_versions_wrote_them_are_read(tmp_path: Path) -> None:

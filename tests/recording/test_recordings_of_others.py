@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from service.config import HandSettings, Settings
-from service.demonstrations.files import read_demonstration
-from service.demonstrations.pose_streams import Source
+from service.demonstrations.demonstration_reader import read_demonstration
+from service.demonstrations.pose_streams import PoseTopic
 from service.recording.mcap_file import RecordingError
 from support.paths import RECORDINGS
 
@@ -93,22 +93,25 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
     hands = moving(lambda stamp, way: array(stamp, "base", (way, 0.3, 0.0), (way, -0.3, 0.0)))
     frames = moving(lambda stamp, way: tree(stamp, "base", elbow=(0.0, 0.0, 1.0), glass=(0.5, way, 0.2)))
     folder = bag(tmp_path / "bag", {"/mocap/hands": hands, "/tf": frames}, plugin=plugin)
-    sources = {name: Source.parsed(text) for name, text in
+    sources = {name: PoseTopic.parsed(text) for name, text in
                (("left", "mocap/hands:1"), ("right", "/mocap/hands:0"), ("tool", "/tf:glass"))}  # fmt: skip
     (file,) = [path for path in folder.iterdir() if path.suffix != ".yaml"]
     for path in (folder, file):
-        got = read_demonstration(path, sources=sources)
+        got = read_demonstration(path, topics=sources)
         np.testing.assert_array_equal(got.stamps_ns, STAMPS)
         np.testing.assert_allclose(got.left[:, :2], np.column_stack([WAY, np.full(len(WAY), -0.3)]))
         np.testing.assert_allclose(got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)]))
     for given, words in (
-        ({"left": Source("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
-        ({**sources, "tool": Source("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
-        ({"left": Source("/nowhere")}, r"--left /nowhere: no topic there; its topics: .*of these hold poses: /mocap"),
+        ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
+        ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
+        (
+            {"left": PoseTopic("/nowhere")},
+            r"--left /nowhere: no topic there; its topics: .*of these hold poses: /mocap",
+        ),
         ({}, r"no topic ending in hands/left .*; --left TOPIC\[:PART\] names another"),
     ):
         with pytest.raises(RecordingError, match=words):
-            read_demonstration(path, sources=given)
+            read_demonstration(path, topics=given)
 
 
 def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ import pytest
 
 from service.config import Files, Settings
 from service.core.frame import Event, Tick, encode
-from service.recording.client import Scribe
 from service.recording.protocol import pack, unpack
 from service.recording.recording import Recording
+from service.recording.scribe import Scribe
 from support.recorded import SKILL, at_ns, state_after, tell, ticks
 
 SETTINGS = Settings(cell="hall/bench-1", rate_hz=50)
@@ -203,7 +203,7 @@ DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
 from service.config import Settings
-from service.recording.client import Scribe
+from service.recording.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
 one = Scribe(Settings(cell="hall/bench-1", rate_hz=50), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))

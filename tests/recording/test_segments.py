@@ -23,10 +23,10 @@ from service.core.controller import Controller, run
 from service.core.frame import TIMING, Frame, Tick
 from service.core.record import blank
 from service.core.skill.skill import Skill
-from service.recording.client import Scribe
-from service.recording.paths import Places
+from service.recording.paths import RecordingPaths
 from service.recording.recording import Recording
 from service.recording.replay import replay
+from service.recording.scribe import Scribe
 from sim.scene import Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, ticks_of
@@ -89,7 +89,7 @@ def test_a_recording_missing_in_a_row_is_a_gap(rotated: list[Path], capsys: pyte
 
 def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp_path: Path) -> None:
     settings = msgspec.structs.replace(CELL, files=Files(keep_mb=0.32))
-    places = Places(settings, str(tmp_path), None, None)
+    places = RecordingPaths(settings, str(tmp_path), None, None)
     current, rrd = places.next()
     assert current is not None
     assert rrd is not None
@@ -113,7 +113,7 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
     assert places.prune(current) == []
     os.utime(old[2], (0, 0))
     os.utime(old[2].with_suffix(".rrd"), (0, 0))
-    aged = Places(msgspec.structs.replace(CELL, files=Files(keep_hours=1)), str(tmp_path), None, None)
+    aged = RecordingPaths(msgspec.structs.replace(CELL, files=Files(keep_hours=1)), str(tmp_path), None, None)
     assert sorted(aged.prune(current)) == sorted([old[2], old[2].with_suffix(".rrd")])
 
 

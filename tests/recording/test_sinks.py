@@ -21,7 +21,7 @@ from service.cli.usage import UsageError
 from service.cli.view import convert, moment, screenshot
 from service.config import WAM, Settings
 from service.contract import cdr
-from service.contract.messages import JointState, Thing
+from service.contract.messages import JointState, SceneObject
 from service.contract.records import Mode, Reason
 from service.contract.requests import ViaPoint, encode_json
 from service.core.skill.pose import CLOSED
@@ -202,8 +202,10 @@ def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_th
 
 
 def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
-    board = Thing("board", "box", "tool_plate", (0, 0, 0.05), (0, 0, 0, 1), (0.08, 0.05, 0.002), (0, 0.5, 0, 1))
-    glass = Thing("glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1))
+    board = SceneObject("board", "box", "tool_plate", (0, 0, 0.05), (0, 0, 0, 1), (0.08, 0.05, 0.002), (0, 0.5, 0, 1))
+    glass = SceneObject(
+        "glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1)
+    )
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(60):
         one.add(frame, at_ns(tick.index), timing)

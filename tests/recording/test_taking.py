@@ -24,10 +24,20 @@ from service.contract import cdr, channels
 from service.contract.messages import JointState, PoseStamped
 from service.contract.requests import Add, encode_json
 from service.core.arm.arm import Arm
-from service.demonstrations.capture import JOINT_STATES, KEPT_S, MOVED, REST_M, REST_RAD, Sample, Take, TakeError, take
-from service.demonstrations.files import iter_hands, read_demonstration
-from service.demonstrations.pose_streams import Recorded, Source
-from service.demonstrations.takes import summary, table, takes, trim, uncut
+from service.demonstrations.capture import (
+    JOINT_STATES,
+    KEPT_S,
+    MOVED,
+    REST_M,
+    REST_RAD,
+    Capture,
+    CaptureError,
+    Sample,
+    capture,
+)
+from service.demonstrations.demonstration_files import demonstration_paths, summary, table, trim, uncut
+from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
+from service.demonstrations.pose_streams import PoseTopic, Recorded
 from service.launch import free_port
 from service.recording.mcap_file import RecordingError
 from sim.scene import Scene
@@ -47,7 +57,7 @@ def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
         yield hearing, told
 
 
-def heard(taken: Take, count: int) -> None:
+def heard(taken: Capture, count: int) -> None:
     """Waits until so many messages came."""
     end = time.monotonic() + 10
     while sum(map(len, taken.samples.values())) + sum(taken.malformed.values()) < count:
@@ -60,7 +70,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
     hearing, told = sessions
-    taken, joints = Take(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
+    taken, joints = Capture(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
     publishers = {key: told.declare_publisher(f"bench/{key}") for key in taken.samples}
     end, sent = time.monotonic() + 10, []
     while not all(publisher.matching_status.matching for publisher in publishers.values()):
@@ -88,18 +98,20 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
     assert Recorded.open(path).settings == SETTINGS
     longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
-    of_joints = {"tool": Source("bench/joints/state")}
+    of_joints = {"tool": PoseTopic("bench/joints/state")}
     np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
-    moved = read_demonstration(path, settings=longer, sources=of_joints).tool - got.tool
+    moved = read_demonstration(path, settings=longer, topics=of_joints).tool - got.tool
     np.testing.assert_allclose(np.linalg.norm(moved[:, :3], axis=1), 0.1)
 
 
 def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
-    with pytest.raises(TakeError, match=r"not heard: hands/left, hands/right, tool/pose or joints/state\. Are tracker"):
-        take(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
-    empty = Take(sessions[0], "bench", SETTINGS)
+    with pytest.raises(
+        CaptureError, match=r"not heard: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
+    ):
+        capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
+    empty = Capture(sessions[0], "bench", SETTINGS)
     empty.close()
-    with pytest.raises(TakeError, match=r"nothing of hands/left, .* came in this time"):
+    with pytest.raises(CaptureError, match=r"nothing of hands/left, .* came in this time"):
         empty.write(tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
 
@@ -137,8 +149,8 @@ def test_what_is_published_otherwise_than_needed_is_said_before_anything_is_reco
     tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
     tracker.start()
     try:
-        with pytest.raises(TakeError, match=words):
-            take(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
+        with pytest.raises(CaptureError, match=words):
+            capture(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
     finally:
         over.set()
         tracker.join(10)
@@ -149,7 +161,7 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
 ) -> None:
     """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
     taken, path = (
-        Take(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker"))),
+        Capture(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker"))),
         tmp_path / "a.mcap",
     )
     taken.close()
@@ -175,7 +187,7 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     words = (
         r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is in metres, whatever \[hands\] unit says"
     )
-    with pytest.raises(TakeError, match=f"tool/pose is {words}"):
+    with pytest.raises(CaptureError, match=f"tool/pose is {words}"):
         taken.check()
     with pytest.raises(RecordingError, match=f"all 9 poses on tool/pose are too far, the first {words}"):
         read_demonstration(path)
@@ -192,7 +204,7 @@ def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
 
 
 def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
-    taken, now_ns = Take(sessions[0], "bench", SETTINGS), time.time_ns()
+    taken, now_ns = Capture(sessions[0], "bench", SETTINGS), time.time_ns()
     taken.close()
     noise = 0.002 * np.random.default_rng(0).standard_normal(400)
     rest, motion = np.zeros(100), np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
@@ -260,7 +272,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     )
     assert "the uncut take is still " in trim(path, 0, 0.4)
     assert uncut(path).read_bytes() == whole
-    assert takes(path.parent) == [path]
+    assert demonstration_paths(path.parent) == [path]
     assert main(["replay", str(path)]) == 1
     assert f"; it is a take: thirdhand record take-1 --folder {path.parent} --show" in capsys.readouterr().err
     with pytest.raises(RecordingError, match=r"takes is a folder: give its files, .*takes/\*\.mcap"):
@@ -312,7 +324,7 @@ def test_hands_are_passed_on_by_a_daemons_session(sessions: tuple[zenoh.Session,
     """Whoever takes a demonstration as a client of a daemon hears what another client publishes."""
     daemon, tracker = sessions
     with open_session(connect=endpoints(daemon), more={"mode": "client"}) as client:
-        taken = Take(client, "bench", SETTINGS)
+        taken = Capture(client, "bench", SETTINGS)
         publisher = tracker.declare_publisher(channels.key("bench", "hands/left"))
         end = time.monotonic() + 10
         while not taken.samples["hands/left"]:

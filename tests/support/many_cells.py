@@ -21,7 +21,7 @@ from service.daemon.saved_via_points import state_folder
 from service.daemon.single_instance import Lock
 from service.daemon.skill_worker import SkillWorker
 from service.network_settings import Network
-from service.recording.client import Scribe
+from service.recording.scribe import Scribe
 from service.shipped import recordings, shipped_skill
 
 RATE_HZ, ROS2_DOMAIN = 50, 7

@@ -13,8 +13,8 @@ from service.config import Settings
 from service.contract import cdr, messages
 from service.core.frame import TIMING, Event, Tick
 from service.core.record import Record, blank
-from service.recording.client import Scribe
 from service.recording.recording import Recorder
+from service.recording.scribe import Scribe
 from support.wam import FRAME, JOINT_NAMES, STATE
 
 START_NS = 1_700_000_000_000_000_000

@@ -1,4 +1,4 @@
-"""`thirdhand report`: what recordings tell, on the terminal, as one page or as tables in files."""
+"""`thirdhand report`: a report of recordings, on the terminal, as a page or as tables in files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from service.report.columns import KEPT
 from service.report.report import Report, reported
 from service.report.tables import Table, comparison, names_of, summary, tables
 
-BAR = 72  # characters of the line that shows the modes over the time
+BAR = 72  # characters of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
 MOST_ROWS = 40  # of a table on a terminal
 PLAIN_WIDTH = 120  # characters, where it is no terminal
 
 
 def report(args: argparse.Namespace) -> int:
-    """Exit code 0 once all recordings are told of, whatever they tell."""
+    """Exit code 0 once all recordings are reported, whatever they hold."""
     if args.html:
         check_writable(args.html)
     if args.csv and args.csv.exists() and not args.csv.is_dir():
@@ -69,7 +69,7 @@ def _print(console: Console, one: Report) -> None:
 
 
 def _bar(one: Report) -> Text:
-    """The modes over the time, and what its marks mean."""
+    """A line that shows the modes over time, and its legend."""
     bar, cells = Text(), [one.lasts_s * (i + 0.5) / BAR for i in range(BAR)]
     for at_s in cells if one.lasts_s else ():
         modes = [span.mode for span in one.spans if span.start_s <= at_s < span.start_s + span.lasts_s]
@@ -92,12 +92,12 @@ def _print_table(console: Console, table: Table) -> None:
     console.print(Text(table.title, style="bold"))
     console.print(drawn)
     if len(table.rows) > MOST_ROWS:
-        console.print(f"... and {len(table.rows) - MOST_ROWS} more; --csv and --html tell all")
+        console.print(f"... and {len(table.rows) - MOST_ROWS} more; --csv and --html show all")
 
 
 def write_csv(reports: Sequence[Report], folder: Path) -> None:
-    """Each table of each report as a file in a folder of the report's name, with what was decided
-    tick by tick in `ticks.csv`; for several reports a comparison beside these folders.
+    """Writes each table of each report as a file in a folder of the report's name, and every tick
+    in `ticks.csv`; for several reports a comparison beside these folders.
     """
     for name, one in zip(names_of(reports), reports, strict=True):
         inside = folder / name
@@ -118,7 +118,7 @@ def _write(path: Path, table: Table) -> None:
 
 
 def _write_ticks(path: Path, one: Report) -> None:
-    """Every field that a report is made of, a row each tick, in metres, radians and seconds."""
+    """Writes every field of the report's frames, a row each tick, in SI units."""
     frames = one.columns.frames
     heads, formats, columns = ["time_s"], ["%.4f"], [one.columns.times[:, None]]
     for name in KEPT:

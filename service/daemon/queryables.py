@@ -1,4 +1,4 @@
-"""Requests of clients: validated and answered beside the loop, carried out through its inbox."""
+"""Clients' requests: validated on other threads, carried out through the loop's inbox."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ from service.learning.skill_file import SkillError
 from service.learning.via_points import in_force, points_made_of, warnings_of
 
 ADOPTION_TIMEOUT_S = 2.0
-DECIDED_S = 0.001  # between looks whether the tick that took a request has been decided
-MOST_POINTS = 400  # that all via-points come to, with their neighbours
-MOST_WAITING = 16  # requests in a line
+POLL_S = 0.001  # while waiting for the tick that took a request
+MOST_POINTS = 400  # of all via-points, with the points of their neighbourhoods
+MOST_WAITING = 16  # requests in a queue
 LONGEST_LIST = 100  # bytes
 TEXT = zenoh.Encoding.TEXT_PLAIN
 ORDERS = ("hold", "resume", "reset")
-COMPUTED = "teaching"  # the line of what the skill worker computes for
+COMPUTED = "teaching"  # the queue of requests for which the skill worker computes
 
 
-class Pending:
+class PendingEvent:
     """An event on its way into the loop, and the tick that took it.
 
-    Either the loop takes it or its asker gives it up, never both.
+    Either the loop takes it or the requesting thread withdraws it, never both.
     """
 
     def __init__(self, event: Event) -> None:
@@ -63,7 +63,7 @@ class Pending:
         self._taken = threading.Event()
 
     def claimed(self, tick: int) -> Event | None:
-        """The event, consumed by this tick, or None where it was given up. Called by the loop."""
+        """The event, consumed by this tick, or None where it was withdrawn. Called by the loop."""
         if not self._claim.acquire(blocking=False):
             return None
         self._tick = tick
@@ -71,10 +71,7 @@ class Pending:
         return self._event
 
     def wait(self) -> int:
-        """The tick that consumed it.
-
-        Raises RequestError where the loop does not; then it never will.
-        """
+        """The tick that consumed it. Raises RequestError where none does, nor ever will."""
         if not self._taken.wait(ADOPTION_TIMEOUT_S):
             if self._claim.acquire(blocking=False):
                 raise RequestError("the loop did not take the request: it is starting, ending or stalled")
@@ -82,8 +79,8 @@ class Pending:
         return self._tick
 
 
-class Line:
-    """Requests that wait for a thread of their own; beyond MOST_WAITING they are refused."""
+class RequestQueue:
+    """Requests that wait for a thread of their own; one beyond MOST_WAITING is refused."""
 
     def __init__(self, name: str, answer: Callable[[str, zenoh.Query], None], failed: Callable[[str], None]) -> None:
         self._name, self._answer = name, answer
@@ -96,11 +93,11 @@ class Line:
             self._waiting.put_nowait((suffix, query))
         except queue.Full:
             with query:
-                said = f"busy: {MOST_WAITING} {self._name} requests wait already; try again later"
-                query.reply_err(said.encode(), encoding=TEXT)
+                refusal = f"busy: {MOST_WAITING} {self._name} requests wait already; try again later"
+                query.reply_err(refusal.encode(), encoding=TEXT)
 
     def close(self) -> None:
-        """Ends the thread; what waits is answered first."""
+        """Ends the thread; waiting requests are answered first."""
         self._waiting.put(None)
         self._thread.join(ADOPTION_TIMEOUT_S + 1)
 
@@ -108,14 +105,14 @@ class Line:
         run_beside_real_time()
         while (item := self._waiting.get()) is not None:
             self._answer(*item)
-            item = None  # the asker is told of the end where its query is let go
+            item = None  # the client's query ends once its last reference is gone
 
 
-class Requests:
+class Queryables:
     """The queryables of one cell.
 
-    What is known is answered where it comes in. Each of hold, resume and reset has a line of its
-    own, and so have all that the skill worker computes for: none waits behind another.
+    What is known is answered at once. Each of hold, resume and reset has a queue of its own, and
+    the requests for which the skill worker computes have one: no kind waits behind another.
     """
 
     def __init__(
@@ -132,10 +129,10 @@ class Requests:
         keep: Callable[[bytes], object],
         failed: Callable[[str], None],
     ) -> None:
-        self.inbox: deque[Pending] = deque()
+        self.inbox: deque[PendingEvent] = deque()
         self._settings = settings
         self._skill, self._in_force = skill, in_force(skill)
-        self._workshop = skill_worker
+        self._skill_worker = skill_worker
         self._skills = skills
         self._status = status
         self._frame = frame
@@ -143,32 +140,32 @@ class Requests:
         self._keep = keep
         self._failed = failed
         self._saved = SavedViaPoints(settings)
-        self._lines = {name: Line(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
+        self._queues = {name: RequestQueue(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
-        here = threading.local()  # Zenoh calls from a thread of its own for each queryable
+        local = threading.local()  # Zenoh calls from a thread of its own for each queryable
 
-        def come_in(query: zenoh.Query) -> None:
+        def receive(query: zenoh.Query) -> None:
             try:
-                if not hasattr(here, "is_beside"):
-                    here.is_beside = True
+                if not hasattr(local, "is_prioritised"):
+                    local.is_prioritised = True
                     run_beside_real_time()
                 if suffix == "status" or self._is_list(suffix, query):
                     self._reply(suffix, query, noted=False)
                 else:
-                    self._lines[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
+                    self._queues[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
             except Exception as error:
-                self._failed(f"the way in of {suffix} requests failed: {error!r}")
+                self._failed(f"receiving {suffix} requests failed: {error!r}")
 
-        return session.declare_queryable(channels.key(self._settings.cell, suffix), come_in)
+        return session.declare_queryable(channels.key(self._settings.cell, suffix), receive)
 
     def close(self) -> None:
         """Ends all threads; requests still waiting are answered first."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for line in self._lines.values():
-            line.close()
+        for waiting in self._queues.values():
+            waiting.close()
 
     @staticmethod
     def _is_list(suffix: str, query: zenoh.Query) -> bool:
@@ -181,7 +178,7 @@ class Requests:
 
     def _reply(self, suffix: str, query: zenoh.Query, *, noted: bool = True) -> None:
         key = channels.key(self._settings.cell, suffix)
-        with query:  # its end tells the asker that no more replies come
+        with query:  # its end tells the client that no more replies come
             try:
                 if str(query.key_expr) != key and suffix != "status":
                     raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
@@ -193,7 +190,7 @@ class Requests:
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")
                 query.reply_err(str(error).encode(), encoding=TEXT)
-            except Exception as error:  # one request that fails must not end all others
+            except Exception as error:  # one request that fails must not end the thread
                 self._note(f"{suffix} failed: {error!r}")
                 query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
             else:
@@ -215,11 +212,11 @@ class Requests:
         raise RequestError(f"nothing is done with a request on {suffix}")
 
     def _order(self, suffix: str) -> Reply:
-        """Hold, resume or reset, with the mode that resulted."""
+        """The reply to hold, resume or reset, with the mode that resulted."""
         before, _ = outcome(self._frame())
         tick, end = self._through_the_loop(order(suffix)), time.monotonic() + ADOPTION_TIMEOUT_S
         while int(self._frame()["tick"]) < tick and time.monotonic() < end:
-            time.sleep(DECIDED_S)
+            time.sleep(POLL_S)
         mode, reason = outcome(self._frame())
         note = ""
         if suffix == "reset" and before is not Mode.FAULT:
@@ -231,13 +228,13 @@ class Requests:
         return Reply(tick, mode=word(mode), reason=word(reason), note=note)
 
     def _through_the_loop(self, event: Event) -> int:
-        pending = Pending(event)
+        pending = PendingEvent(event)
         self.inbox.append(pending)
         return pending.wait()
 
     def _adopt(self, skill: Skill) -> Reply:
         self._keep(skill.file)
-        draft = self._saved.draft(skill)  # what cannot be saved is not taught
+        draft = self._saved.draft(skill)  # first: what cannot be saved is not taught
         try:
             tick = self._through_the_loop(Event("skill", skill.file, skill))
             draft.replace(self._saved.path(skill))
@@ -249,15 +246,15 @@ class Requests:
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
         files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
-        there = {path.stem: path for path in files}  # and not what lies elsewhere, and is linked to
-        path = there.get(name.removesuffix(".npz"))
+        found = {path.stem: path for path in files}  # without links to files elsewhere
+        path = found.get(name.removesuffix(".npz"))
         if path is None:
-            names = ", ".join(there) or "none"
+            names = ", ".join(found) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {names}")
-        skill = self._workshop.load(path)
-        if found := self._saved.read(skill):  # what was taught goes with what was learned
-            points, tolerance = found
-            skill = self._workshop.adapt(skill, points, tolerance=tolerance)
+        skill = self._skill_worker.load(path)
+        if saved := self._saved.read(skill):  # its via-points were taught before
+            points, tolerance = saved
+            skill = self._skill_worker.adapt(skill, points, tolerance=tolerance)
         return self._adopt(skill)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:
@@ -271,16 +268,16 @@ class Requests:
                     if name in names[:i]:
                         raise RequestError(f"$.names[{i}]: {name!r} given twice, names once each needed")
                     if name not in points:
-                        there = ", ".join(points) or "none"
-                        raise RequestError(f"$.names[{i}]: no via-point {name!r}. There are: {there}")
+                        known = ", ".join(points) or "none"
+                        raise RequestError(f"$.names[{i}]: no via-point {name!r}. There are: {known}")
                 points = {name: point for name, point in points.items() if name not in names}
             case Add(added, tolerance):
                 self._check(added)
                 points |= {point.name: point for point in added}
-        return self._adopt(self._workshop.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
+        return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
 
     def _check(self, added: Sequence[ViaPoint]) -> None:
-        """Raises RequestError for too many via-points, and for those that no target may reach."""
+        """Raises RequestError for too many via-points, and for those out of reach."""
         total = points_made_of(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
         if total > MOST_POINTS:
             raise RequestError(

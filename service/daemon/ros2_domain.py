@@ -1,5 +1,6 @@
-"""A cell as a ROS 2 node of rmw_zenoh: the loop takes its inputs like any others, its outputs are
-published beside the loop.
+"""A cell as a ROS 2 node of rmw_zenoh: its outputs are published on a thread beside the loop.
+
+Its inputs come in by CellStreams, like those of other clients.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ MOST_WAITING = 256  # messages: half a second of commands
 CLOSED_WITHIN_S = 2.0
 
 
-class Ros2:
+class Ros2Domain:
     """The topics of a cell in a ROS 2 domain, with the liveliness tokens by which tools list them.
 
-    `publish` is for the loop and never waits: what a thread that is behind cannot take is dropped.
-    What ends that thread's work is told to `failed`.
+    `publish` is for the loop and never waits: beyond MOST_WAITING messages are dropped. `failed` is
+    called with what ends the thread's work.
     """
 
     def __init__(
@@ -53,12 +54,12 @@ class Ros2:
         self._thread = supervised_thread.start("ROS 2 thread", self._serve, failed)
 
     def publish(self, suffix: str, payload: bytes) -> None:
-        """Publishes what goes out on a channel on its topic too."""
+        """Publishes an output of a channel on its ROS 2 topic."""
         if self._waiting.qsize() < MOST_WAITING:
             self._waiting.put((suffix, payload))
 
     def close(self) -> None:
-        """Ends the thread, and takes back the tokens."""
+        """Ends the thread, and undeclares the tokens."""
         self._waiting.put(None)
         self._thread.join(CLOSED_WITHIN_S)
         for token in self._tokens:

@@ -1,6 +1,4 @@
-"""Demonstrations on disk, one file a take: what is in them, as text and as a picture; trimmed and
-deleted.
-"""
+"""Demonstrations on disk, one file each (a take): shown as text or as a picture, trimmed."""
 
 from __future__ import annotations
 
@@ -14,15 +12,15 @@ from service import palette
 from service.config import Settings
 from service.contract.channels import JOINTS, POSE
 from service.core.record import Vector
-from service.demonstrations.files import read_demonstration
+from service.demonstrations.demonstration_reader import read_demonstration
 from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
 from service.learning.demonstration import LEAST_M, Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.mcap_reader import Messages
 
 NAME = r"\w[\w .-]{0,63}"
-GAP_S = 0.1  # after which the daemon calls a hand stale
-JUMP_M, FASTEST = 0.02, 5.0  # [m, m/s] of a hand, from one sample to the next
+GAP_S = 0.1  # without a sample, after which the daemon holds for a stale hand
+JUMP_M, MAX_HAND_SPEED = 0.02, 5.0  # [m, m/s]: a larger step from one sample to the next is a jump
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDTH = 60  # letters of the plot
 COLOURS = {
@@ -31,13 +29,13 @@ COLOURS = {
 }
 
 
-class TakeNameError(RecordingError):
-    """A take that is not there, is there already, or cannot be called so."""
+class DemonstrationNameError(RecordingError):
+    """A take does not exist, exists already, or cannot have this name."""
 
 
 class Stream(NamedTuple):
-    """What there is of one stream: how many poses at which rate [Hz], the longest time without one
-    [s] and when that began [s], and their frame.
+    """One stream of a take: number of poses, rate [Hz], the longest gap [s] and when it began [s],
+    and the poses' frame.
     """
 
     name: str
@@ -49,7 +47,7 @@ class Stream(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """What a take holds, and what learning would make of it."""
+    """The contents of a take: the demonstration as learning reads it, its streams, and remarks."""
 
     path: Path
     demonstration: Demonstration
@@ -63,23 +61,23 @@ class Summary(NamedTuple):
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Where a take of this name is, or is to be. Raises TakeNameError."""
+    """The path of a take of this name. Raises DemonstrationNameError."""
     name = name.removesuffix(".mcap")
     if not re.fullmatch(NAME, name):
-        raise TakeNameError(f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name")
+        raise DemonstrationNameError(f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name")
     return folder / f"{name}.mcap"
 
 
-def there(folder: Path, name: str) -> Path:
-    """The path of a take that is there. Raises TakeNameError."""
+def existing_path(folder: Path, name: str) -> Path:
+    """The path of a take that exists. Raises DemonstrationNameError."""
     path = path_of(folder, name)
     if not path.is_file():
-        names = ", ".join(found.stem for found in takes(folder)) or "none"
-        raise TakeNameError(f"no take {path.stem!r} in {folder}. There are: {names}")
+        names = ", ".join(found.stem for found in demonstration_paths(folder)) or "none"
+        raise DemonstrationNameError(f"no take {path.stem!r} in {folder}. There are: {names}")
     return path
 
 
-def takes(folder: Path) -> list[Path]:
+def demonstration_paths(folder: Path) -> list[Path]:
     """The files of the takes in a folder, `take-2` before `take-10`."""
     return sorted(folder.glob("*.mcap"), key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
 
@@ -89,7 +87,7 @@ def _split(name: str) -> list[str]:
 
 
 def summary(path: Path, *, settings: Settings | None = None) -> Summary:
-    """What a take holds, by `settings` or those it was taken with. Raises RecordingError."""
+    """The contents of a take, by `settings` or those in the file. Raises RecordingError."""
     remarks: list[str] = []
     demonstration = read_demonstration(path, settings=settings, say=lambda line: remarks.append(_without(path, line)))
     recorded = Recorded.open(path)
@@ -103,7 +101,7 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
 
 
 def _still(demonstration: Demonstration) -> list[str]:
-    """What is said where hands or tool do not move, and nothing can be learned."""
+    """Remarks on hands or a tool that do not move, so that nothing can be learned."""
     found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
     moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
     return [
@@ -118,8 +116,8 @@ def _without(path: Path, line: str) -> str:
 
 
 def _jumps(at: Vector, seconds: Vector) -> int:
-    """How often positions (N, 3) [m] change as no hand moves."""
-    return int((np.linalg.norm(np.diff(at, axis=0), axis=1) > JUMP_M + FASTEST * np.diff(seconds)).sum())
+    """The number of steps in positions (N, 3) [m] that are no motion of a hand."""
+    return int((np.linalg.norm(np.diff(at, axis=0), axis=1) > JUMP_M + MAX_HAND_SPEED * np.diff(seconds)).sum())
 
 
 def _stream(side: str, track: Track) -> Stream:
@@ -132,7 +130,7 @@ def _stream(side: str, track: Track) -> Stream:
 
 
 def table(found: Summary) -> str:
-    """What a take holds, as lines of text with a plot of speeds."""
+    """The contents of a take as lines of text, with a plot of speeds."""
     lines = [f"{found.path}: {found.lasts_s:.1f} s"]
     lines += [
         f"  {one.name:<6}{one.poses:>7} poses  {one.rate_hz:6.1f} Hz  longest gap {1e3 * one.gap_s:.0f} ms at "
@@ -152,7 +150,7 @@ def table(found: Summary) -> str:
 
 
 def _speed(demonstration: Demonstration, side: str) -> Vector:
-    """Greatest speed [m/s] in each of WIDTH parts of the time, over 0.1 s."""
+    """The speed [m/s] at WIDTH + 1 times, each averaged over 0.1 s."""
     at: Vector = getattr(demonstration, side)[:, :3]
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
     edges = np.linspace(0.0, seconds[-1], WIDTH + 1)
@@ -166,12 +164,12 @@ def _speed(demonstration: Demonstration, side: str) -> Vector:
 
 
 def _blocks(speed: Vector) -> str:
-    greatest = max(float(np.max(speed)), 0.05)  # rest is no mountain
+    greatest = max(float(np.max(speed)), 0.05)  # so that noise at rest stays flat
     return "".join(BLOCKS[min(int(len(BLOCKS) * one / greatest), len(BLOCKS) - 1)] for one in speed)
 
 
 def draw(found: Summary, path: Path) -> None:
-    """Writes a picture of a take, a PNG: positions over time, gaps shaded; the ways from above."""
+    """Writes a picture of a take, a PNG: positions over time, gaps shaded, and from above."""
     from matplotlib.figure import Figure  # heavy, and most do without
 
     figure = Figure(figsize=(11, 6.5), layout="constrained", dpi=110)
@@ -202,16 +200,17 @@ def draw(found: Summary, path: Path) -> None:
 
 
 def uncut(path: Path) -> Path:
-    """Where a take is kept as it was before it was trimmed: out of reach of `learn *.mcap`."""
+    """The path of a take as it was before trimming; `learn *.mcap` does not match it."""
     return path.with_name(f"{path.name}.uncut")
 
 
 def trim(path: Path, start_s: float, end_s: float) -> str:
-    """Cuts a take to what was recorded from `start_s` to `end_s` [s] after its first sample, all or
-    nothing; in words what was cut. What is no stream of poses or joints stays whole. The take as it
-    was stays beside it, under the name that `uncut` tells, unless there is one already.
+    """What was cut, in words, once a take is trimmed to `start_s` to `end_s` [s] after its first
+    sample, all or nothing.
 
-    Raises RecordingError where nothing that can be learned from would be left.
+    Messages other than poses and joints are kept. The original stays beside it, at the path that
+    `uncut` returns, unless there is one already. Raises RecordingError where too little to learn
+    from would be left.
     """
     messages = Messages(path)
     rows = list(messages)
@@ -246,14 +245,14 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
                 f"{path} lasts {lasts_s:.1f} s: from {start_s:g} to {end_s:g} s too little is left, and it stays as "
                 "it was"
             ) from None
-        whole = uncut(path)
-        was_there = whole.exists()
-        if not was_there:
-            path.replace(whole)
+        original = uncut(path)
+        existed = original.exists()
+        if not existed:
+            path.replace(original)
         part.replace(path)
         return (
             f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s; "
-            f"the uncut take is {'still' if was_there else 'kept as'} {whole}"
+            f"the uncut take is {'still' if existed else 'kept as'} {original}"
         )
     except KeyError as error:
         raise RecordingError(f"{path}: messages of type {error} are of no take; it is not trimmed") from None

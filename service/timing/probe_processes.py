@@ -1,4 +1,4 @@
-"""The probes of `service.timing.probe`, started and heard; and a daemon's processes."""
+"""Starts the probes of `service.timing.probe`; finds a daemon's processes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ TIMEOUT_S = 900.0
 
 
 class BenchError(ExplainedError):
-    """The measurement could not be made; the message says what failed."""
+    """A measurement failed; the message says why."""
 
 
 def probe(kind: str, *arguments: object) -> dict[str, Any]:
-    """What one of the probes found. Raises BenchError."""
+    """The result of one of the probes. Raises BenchError."""
     command = [*PROBE, kind, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     if done.returncode != 0:
@@ -33,7 +33,7 @@ def probe(kind: str, *arguments: object) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def echo() -> Iterator[str]:
-    """Where an echo listens."""
+    """The endpoint at which an echo listens, while the context lasts."""
     process = subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdin is not None
@@ -50,7 +50,7 @@ def echo() -> Iterator[str]:
 
 
 def family(pid: int) -> dict[str, psutil.Process]:
-    """A daemon's process and its children's, by what they are."""
+    """A daemon's process and its children, by kind."""
     found = {"daemon": psutil.Process(pid)}
     kinds = {"service.recording.process": "scribe", "service.daemon.skill_worker": "skill worker"}
     for child in found["daemon"].children():

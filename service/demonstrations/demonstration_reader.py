@@ -1,6 +1,4 @@
-"""Demonstrations and hands in recordings, ours and others': brought to frame `base` and to common
-stamps.
-"""
+"""Reads and writes demonstrations; they are brought to frame `base` and to common stamps."""
 
 from __future__ import annotations
 
@@ -22,13 +20,13 @@ from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.core.record import Vector
 from service.core.rotation import rotation
-from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, Recorded, Source, Track, chosen
+from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, Track, chosen
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.recording.mcap_reader import Messages, next_whole
 
 _STREAMS = tuple(ENDINGS.values())
-LARGEST_DELAY_S = 0.2  # of one stream more than of another, from a stamp to its recording
+LARGEST_DELAY_S = 0.2  # by which the delays from stamp to recording may differ between streams of one clock
 
 
 def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
@@ -68,48 +66,48 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
 def read_demonstration(
     path: str | Path,
     *,
-    sources: Mapping[str, Source] | None = None,
+    topics: Mapping[str, PoseTopic] | None = None,
     settings: Settings | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Demonstration:
-    """The demonstration in a recording: the hands and the tool in frame `base` at the tool's
-    stamps, as far as all three reach.
+    """The demonstration in a recording: hands and tool in frame `base` at the tool's stamps, over
+    the time that all three cover.
 
-    MCAP files, ours and others', and bags. Topics are those in `sources` (by left, right, tool),
-    else they are found by their ends, whatever the cell, or by what can be meant alone. Hands are
-    brought to `base` as the daemon does it, by the `settings`, by default those in the file. Where
-    the streams have stamps of their own, the hands are interpolated linearly; where these are of
-    clocks that differ, the times count at which they were recorded.
+    Reads MCAP files, ours and others', and bags. Topics are those in `topics` (by left, right,
+    tool). Without these they are found by the ends of their names, in any cell, or where only one
+    fits. Hands are brought to `base` as in the daemon, by `settings` or else those in the file.
+    Hands stamped at other times than the tool are interpolated linearly. Where the stamps are of
+    different clocks, the times of recording are used instead.
 
-    Raises RecordingError, also where there is damage: what it took may lie amid a motion. A file
-    that was cut ends early; that, and what was found or assumed, is told to `say`.
+    Raises RecordingError, also for a damaged file: the missing part may lie within a motion. A file
+    that was cut ends early. `say` is called with that, and with what was found or assumed.
     """
     recorded = Recorded.open(path)
     settings = settings or recorded.settings or Settings()
     if any(not fault.cut for fault in recorded.faults):
-        there = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
         faults = "; ".join(map(str, recorded.faults))
-        raise RecordingError(f"{path}: {faults}; {there} can be read; nothing is learned from it")
-    tracks, said = chosen(recorded, sources or {}, settings)
+        raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
+    tracks, remarks = chosen(recorded, topics or {}, settings)
     for fault in recorded.faults:
         say(f"{path}: {fault}; {', '.join(f'{len(track.poses)} poses on {track.name}' for track in tracks)} are there")
     count = sum(len(track.poses) for track in tracks)
     if recorded.is_ours:  # what the daemon rejects, too
-        tracks = [_kept(track, _is_pose(track.poses)) for track in tracks]
-    told = tracks
+        tracks = [_masked(track, _is_pose(track.poses)) for track in tracks]
+    unmapped = tracks
     tracks, mapped = in_base(path, tracks, settings.hands)
     if recorded.is_ours:
-        tracks = [_kept(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
-        for track, before in zip(tracks, told, strict=True):
+        tracks = [_masked(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
+        for track, before in zip(tracks, unmapped, strict=True):
             if len(before.poses) and not len(track.poses):
                 why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings.hands)
                 raise RecordingError(
                     f"{path}: all {len(before.poses)} poses on {before.name} are too far, the first {why}"
                 )
         if left_out := count - sum(len(track.poses) for track in tracks):
-            said.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
-    if said or mapped:
-        say(f"{path}: {'; '.join([*said, *mapped])}")
+            remarks.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
+    if remarks or mapped:
+        say(f"{path}: {'; '.join([*remarks, *mapped])}")
     tracks, clocks = _by_one_clock(tracks)
     if clocks:
         say(f"{path}: {clocks}")
@@ -142,27 +140,25 @@ def _is_pose(poses: Vector) -> NDArray[np.bool_]:
         return np.asarray(np.isfinite(poses).all(axis=1) & (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) <= 0.01))
 
 
-def _kept(track: Track, mask: NDArray[np.bool_]) -> Track:
-    """The track with some of its poses."""
+def _masked(track: Track, mask: NDArray[np.bool_]) -> Track:
+    """The track with those of its poses that the mask selects."""
     return track._replace(stamps_ns=track.stamps_ns[mask], logged_ns=track.logged_ns[mask], poses=track.poses[mask])
 
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
-    """Whether the poses of a stream, `hands/left`, say, are told by the tracker's axes and unit."""
-    of_hands = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as the daemon has it
-    return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in of_hands)
+    """Whether the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as in the daemon
+    return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in tracker_frames)
 
 
 def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) in frame `base` [m], of those in the tracker's frame and unit."""
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's frame and unit."""
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
 
 
 def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
-    """What is said of a position of a stream, as it was told, that is too far from the base plate;
-    and what to do.
-    """
+    """Words and remedy for a stream's position, as published, that is too far away."""
     if is_by_tracker(name, frame, hands):
         return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
     rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
@@ -171,11 +167,11 @@ def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettin
 
 
 def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
-    """Tracks of left hand, right hand and tool in frame `base`, and in words which were brought
-    there.
+    """Tracks of left hand, right hand and tool in frame `base`, and in words which of them were
+    transformed.
 
-    The hands' as the daemon takes what comes in: all but what is in `base` where the tracker has a
-    frame of its own. The tool's only where it names that frame. Raises RecordingError for others.
+    As in the daemon the hands are, except those in `base` where the tracker has a frame of its own.
+    The tool is only where it names that frame. Raises RecordingError for other frames.
     """
     for track in tracks:
         if track.frame not in ("", BASE, hands.frame):
@@ -202,7 +198,7 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
 
 
 def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
-    """Tracks with stamps of one clock, and in words why they are not their own; empty: they are."""
+    """Tracks with stamps of one clock, and in words why their own are not used; empty: they are."""
     if not all(len(track.poses) for track in tracks):
         return list(tracks), ""
     ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
@@ -215,8 +211,8 @@ def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
 
 
 def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (T, 7) at `stamps`, between those at `at` (N,) by linear interpolation, quaternions the
-    short way and of norm 1.
+    """Poses (T, 7) at `stamps` by linear interpolation of those at `at` (N,); quaternions are
+    interpolated the short way and normalised.
     """
     if np.isin(stamps, at).all():
         out = poses[np.searchsorted(at, stamps)]
@@ -231,12 +227,10 @@ def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[
 
 
 def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
-    """Log time [ns], side and CDR bytes of every hand sample in order of time, one after the other.
+    """Log time [ns], side and CDR bytes of every hand sample, in order of time.
 
-    Raises RecordingError.
-
-    Reads demonstrations, recordings and other ROS 2 recordings; of a file that was cut, what is
-    there, in the order of writing.
+    Reads demonstrations, recordings and other ROS 2 recordings; a file that was cut up to its cut,
+    in the order of writing. Raises RecordingError.
     """
     path = existing(path)
     streams = PoseStreams(path, _STREAMS[:2])
@@ -253,9 +247,7 @@ def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
 
 
 class PoseStreams:
-    """Which topics of a file are the wanted streams of poses, or of another type; one topic each,
-    whatever the cell.
-    """
+    """Finds the topics of a file that hold the wanted streams; one topic each, in any cell."""
 
     def __init__(self, path: Path, names: tuple[str, ...], kind: str = POSE.type) -> None:
         self._path, self._names, self._kind = path, names, kind
@@ -263,7 +255,7 @@ class PoseStreams:
         self._seen: set[str] = set()
 
     def name(self, schema: Any, channel: Any) -> str:
-        """The stream that a message belongs to; empty: none of them."""
+        """The stream that a message belongs to; empty: none."""
         topic = channel.topic
         self._seen.add(topic)
         name = next((name for name in self._names if f"/{topic}".endswith(f"/{name}")), "")
@@ -279,6 +271,6 @@ class PoseStreams:
         return name
 
     def missing(self, name: str) -> RecordingError:
-        """The error that says that a stream is not there, and what is."""
+        """The error for a missing stream; it lists the topics."""
         topics = ", ".join(sorted(self._seen)) or "none"
         return RecordingError(f"{self._path} has no topic ending in {name} with {self._kind}; its topics: {topics}")

@@ -1,4 +1,4 @@
-"""The daemon's ends of its cell's streams: the newest samples in, each tick's outputs out."""
+"""The daemon's ends of its cell's streams: reads newest samples, publishes each tick's outputs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from service.contract import channels, ros2
 from service.contract.messages import WireError
 from service.core.frame import Event
 from service.daemon.input_monitor import Arrivals
-from service.daemon.ros2 import Ros2
+from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 
 
-class Streams:
-    """What a cell hears and says on a session, with a ROS 2 domain where its settings name one.
+class CellStreams:
+    """A cell's subscribers and publishers, in a ROS 2 domain too where its settings name one.
 
-    `receive` and `publish` are for the loop; what came is told to `arrivals`, by channel.
-    What fails beside it is told to `failed`.
+    `receive` and `publish` are for the loop. Each message is counted in `arrivals`, by channel;
+    `failed` is called with what fails on another thread.
     """
 
     def __init__(
@@ -38,20 +38,20 @@ class Streams:
         cell, domain = settings.cell, settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
-        heard = [c for c in ros2.HEARD if c.key != "joints/state" or settings.arm.source == "state"]
-        keys = [(channel, channels.key(cell, channel.key)) for channel in heard]
+        inputs = [c for c in ros2.HEARD if c.key != "joints/state" or settings.arm.source == "state"]
+        keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
         if domain is not None:
-            keys += [(channel, ros2.key(domain, cell, channel)) for channel in heard]
+            keys += [(channel, ros2.key(domain, cell, channel)) for channel in inputs]
         self._subscribers = [(channel, session.declare_subscriber(key, RingChannel(1))) for channel, key in keys]
         self._publishers = {
             channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
-        self._ros2 = None if domain is None else Ros2(session, cell, domain, heard=heard, failed=failed)
+        self._ros2 = None if domain is None else Ros2Domain(session, cell, domain, heard=inputs, failed=failed)
 
     def receive(self) -> list[Event]:
-        """The newest message of each source, if it is new and can be read."""
+        """The newest message of each channel, if it is new and can be decoded."""
         return [event for channel, source in self._subscribers if (event := self._receive(channel, source))]
 
     def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
@@ -71,17 +71,17 @@ class Streams:
             return None
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
-        """Sends on a channel; what cannot be sent at once is dropped."""
+        """Publishes on a channel; what cannot be sent at once is dropped."""
         self._publishers[suffix].put(payload, attachment=attachment)
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
 
     @property
     def is_followed(self) -> bool:
-        """Whether anybody hears the commands."""
+        """Whether anybody subscribes to the commands."""
         return bool(self._publishers["joints/command"].matching_status.matching)  # type: ignore[attr-defined]
 
     def close(self) -> None:
-        """Ends what runs beside the loop."""
+        """Ends the threads beside the loop."""
         if self._ros2 is not None:
             self._ros2.close()

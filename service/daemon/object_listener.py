@@ -1,6 +1,4 @@
-"""What lies on the bench, as somebody tells it: handed to the recording and its viewers, beside the
-loop, which it never enters.
-"""
+"""Objects on the bench, as published: passed on to recording and viewers, beside the loop."""
 
 from __future__ import annotations
 
@@ -18,8 +16,8 @@ from service.contract.requests import encode_json
 KEY = "objects"
 
 
-class Things:
-    """The newest that was told, noted; what is not understood is said, once until that changes."""
+class ObjectListener:
+    """Passes the newest message on to `note`; `say` is called once with each new decoding error."""
 
     def __init__(
         self,
@@ -29,13 +27,13 @@ class Things:
         note: Callable[[str, str, int], None],
         say: Callable[[str], None],
     ) -> None:
-        self._key, self._said = channels.key(cell, KEY), ""
-        self._told = session.declare_subscriber(self._key, RingChannel(1))
+        self._key, self._error = channels.key(cell, KEY), ""
+        self._subscriber = session.declare_subscriber(self._key, RingChannel(1))
         self._note, self._say = note, say
 
-    def look(self) -> None:
-        """Notes what came since the last look, if anything did."""
-        sample = self._told.try_recv()
+    def poll(self) -> None:
+        """Notes the newest message since the last call, if there is one."""
+        sample = self._subscriber.try_recv()
         if sample is None:
             return
         try:
@@ -43,9 +41,9 @@ class Things:
                 raise WireError(f"{len(sample.payload)} bytes")
             found = channels.BY_KEY[KEY].codec.decode(sample.payload.to_bytes())
         except WireError as error:
-            if str(error) != self._said:
-                self._said = str(error)
+            if str(error) != self._error:
+                self._error = str(error)
                 self._say(f"what came on {self._key} is not understood: {error}")
             return
-        self._said = ""
+        self._error = ""
         self._note(KEY, encode_json(found).decode(), time.time_ns())

@@ -1,10 +1,9 @@
 """The daemon's end of the scribe, the process that writes the recording and feeds the viewer.
 
-The loop makes one non-blocking send a tick over a socket pair that keeps message boundaries. Slow,
-stuck or dead, the loop does not notice: what does not fit is counted as lost, the next message that
-does carries state and skill, so that a replay goes on behind the gap, and a scribe that is dead or
-silent is replaced. A scribe reports how many ticks it has on disk; what a dead one was told beyond
-that is lost too.
+The loop makes one non-blocking send a tick over a socket pair that keeps message boundaries. A slow
+or dead scribe does not delay it: a message that does not fit is counted as lost, and the next one
+that fits carries state and skill, so that a replay continues behind the gap. A dead or silent
+scribe is replaced; what was sent to it and not reported as on disk is lost.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from service import child
 from service.config import Settings
 from service.core.frame import Tick
 from service.core.record import Record
-from service.recording.protocol import LARGEST_MESSAGE, Report, Task, pack, pack_note
+from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, pack, pack_note
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
 _SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
-READY_TIMEOUT_S = 15.0  # to listen; one that was replaced for it is followed by one with twice the time
+READY_TIMEOUT_S = 15.0  # for a scribe to listen; doubled for the next one each time it is exceeded
 LONGEST_READY_S = 240.0
 RESTART_S = 1.0
 NOT_RECORDED = "ticks are not recorded"
@@ -45,8 +44,8 @@ class Scribe:
     thread, `note` and `keep` for any.
 
     In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another; `recording` and
-    `rrd` are explicit paths. With none of these and no `live_port` there is nothing to do and no
-    process. One that has not reported for `silent_s` is replaced.
+    `rrd` are explicit paths. Without any of these and without `live_port` no process is started.
+    One that has not reported for `silent_s` [s] is replaced.
     """
 
     def __init__(
@@ -66,23 +65,24 @@ class Scribe:
         self._restart_s, self._silent_s = restart_s, silent_s
         self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
         self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
-        self._socket: socket.socket | None = None  # of the child that is told; the loop reads it, the others set it
+        # of the child that ticks are sent to; the loop reads it, other threads set it
+        self._socket: socket.socket | None = None
         self._child: child.Child | None = None
-        self._say_all = True
+        self._send_all = True
         self._gap = self._lost = self._sent = self._restarts = 0
         self._since_state = self._pause = 0
-        self._owed = self._marked = 0  # ticks that scribes took along; how many of them the loop has told of
-        self._buried = self._sent_before = 0  # lost with scribes that are gone; ticks sent before the present one
+        self._owed = self._marked = 0  # ticks lost with dead scribes; how many of these the loop has marked
+        self._buried = self._sent_before = 0  # ticks lost with dead scribes; ticks sent before the present one
         self._started = self._heard = 0.0
         self._memory: dict[int, tuple[bytes, int]] = {}
-        self._report = Report()
+        self._report = ScribeReport()
         self._errors: deque[str] = deque(maxlen=5)
 
     def start(self, *, skill: bytes, state: Record | None) -> None:
-        """Starts the process and waits until it listens. Problems are told by `status`."""
+        """Starts the process and waits until it listens. Problems are listed by `status`."""
         if not self._wanted:
             return
-        self._say_all = state is None
+        self._send_all = state is None
         self._child = self._spawn(skill, state)
         if not self.ready(self._ready_s):
             ended = self._child.process.poll()
@@ -102,9 +102,9 @@ class Scribe:
         return self._socket is not None
 
     def keep(self, skill: bytes) -> int:
-        """The descriptor of a skill prepared to be sent.
+        """The descriptor of a memory file with the skill, ready to be sent.
 
-        That takes a millisecond a megabyte: call it off the loop before the loop adopts one.
+        Preparing takes 1 ms a megabyte: call it on another thread before the loop adopts a skill.
         """
         known = self._memory.get(id(skill))
         if known is None:
@@ -117,10 +117,10 @@ class Scribe:
         return known[1]
 
     def send(self, tick: Tick, frame: Record, timing: Record, *, state: Callable[[], Record], skill: bytes) -> None:
-        """Tells of a tick.
+        """Sends a tick.
 
-        Never waits; what cannot be told is counted. `state` is asked for now and then, and after a
-        loss.
+        Never waits; a tick that cannot be sent is counted. `state` is called once a second, and
+        after a loss.
         """
         target = self._socket
         if target is None or self._pause:
@@ -128,17 +128,17 @@ class Scribe:
             if self._wanted:
                 self._gap += 1
                 self._lost += 1
-                self._say_all = True
+                self._send_all = True
             return
-        say_all = self._say_all
+        send_all = self._send_all
         self._since_state += 1
-        with_state = say_all or self._since_state >= self._settings.rate_hz
+        with_state = send_all or self._since_state >= self._settings.rate_hz
         after, owed = state() if with_state else None, self._owed
         lost = self._gap + owed - self._marked
-        message = pack(tick, frame, timing, state=after, lost=lost, with_skill=say_all)
+        message = pack(tick, frame, timing, state=after, lost=lost, with_skill=send_all)
         try:
             skills = [event.payload for event in tick.inbox if event.kind == "skill"]
-            if say_all:
+            if send_all:
                 skills.append(skill)
             if skills:
                 socket.send_fds(target, [message], [self.keep(data) for data in skills])
@@ -147,25 +147,25 @@ class Scribe:
         except OSError:
             self._gap += 1
             self._lost += 1
-            self._say_all = True
+            self._send_all = True
             self._pause = self._settings.rate_hz // 10  # one gap rather than many
             return
         self._sent += 1
         self._gap, self._marked = 0, owed
-        if say_all:
-            self._say_all = False
+        if send_all:
+            self._send_all = False
         if with_state:
             self._since_state = 0
 
     def skip(self) -> None:
-        """Counts a tick that cannot be told of, as one that was lost; for the loop."""
+        """Counts a tick that cannot be sent as lost; for the loop."""
         self._gap += 1
         self._lost += 1
-        self._say_all = True
+        self._send_all = True
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """A text for the recording, under `<cell>/<key>`; those under `requests` and `log` are
-        shown in the viewer. Never waits.
+        """Sends a text for the recording, under `<cell>/<key>`; the viewer shows those under
+        `requests` and `log`. Never waits.
         """
         target = self._socket
         if target is not None:
@@ -173,8 +173,8 @@ class Scribe:
                 target.send(pack_note(key, text, time_ns))
 
     def supervise(self) -> None:
-        """Hears what the process has to say, and replaces it if it is dead or silent, with new
-        files. Ten times a second.
+        """Reads the process's reports, and replaces it if it is dead or silent, with new files. To
+        be called ten times a second.
         """
         if not self._wanted or self._child is None:
             return
@@ -199,21 +199,21 @@ class Scribe:
             self._socket = None
 
     def _bury(self) -> None:
-        """Counts what a process that is gone was told and has not on disk."""
+        """Counts the ticks that were sent to a dead process and are not on disk."""
         if self._child is not None and self._socket is not None:
             self._errors.append(f"the scribe ended with code {self._child.process.returncode}")
         self._socket = None
         self._listen(timeout_s=0.0)
         self._socket, last = None, self._report
-        unsaid = max(0, self._sent - self._sent_before - last.kept - last.lost)
-        self._buried += last.lost + unsaid
-        self._owed += last.unmarked + unsaid
-        self._sent_before, self._report = self._sent, Report()
+        unreported = max(0, self._sent - self._sent_before - last.kept - last.lost)
+        self._buried += last.lost + unreported
+        self._owed += last.unmarked + unreported
+        self._sent_before, self._report = self._sent, ScribeReport()
 
     def status(self) -> dict[str, Any]:
-        """What is known of the process: alive, its state (`off`, `starting`, `recording`,
-        `drawing` where no recording is wanted, `interrupted` where none can be written), ticks sent
-        and lost, restarts, where it writes, the latest errors.
+        """The process's status: alive, its state (`off`, `starting`, `recording`, `drawing` where
+        no recording is wanted, `interrupted` where none can be written), ticks sent and lost,
+        restarts, where it writes, the latest errors.
         """
         alive = self._socket is not None and self._child is not None and self._child.process.poll() is None
         report = self._report
@@ -232,8 +232,8 @@ class Scribe:
         }
 
     def close(self, timeout_s: float = 20.0) -> str:
-        """Lets the process write what it was told and close its files; ends it if that takes longer
-        than `timeout_s`. What the recordings lack, in words; empty: nothing.
+        """What the recordings lack, in words (empty: nothing), once the process has written all
+        that was sent and closed its files; it is killed if that takes longer than `timeout_s` [s].
         """
         running, self._socket = self._child, None
         if running is not None:
@@ -259,12 +259,12 @@ class Scribe:
         return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> child.Child:
-        """A process that was given its task and is not told anything yet."""
+        """A process that was sent its setup and nothing else yet."""
         folder, recording, rrd = (
             None if path is None else str(path.absolute()) for path in (self._folder, self._recording, self._rrd)
         )
         begin = None if state is None else state.tobytes()
-        task = Task(self._settings, begin, folder, recording, rrd, self._live_port, self._restarts + 1)
+        setup = ScribeSetup(self._settings, begin, folder, recording, rrd, self._live_port, self._restarts + 1)
         running = child.start("service.recording.process", socket.SOCK_SEQPACKET)
         self._started = self._heard = time.monotonic()
         ours = running.socket
@@ -275,13 +275,13 @@ class Scribe:
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         with contextlib.suppress(OSError):
             if skill is None:
-                ours.send(msgspec.json.encode(task))
+                ours.send(msgspec.json.encode(setup))
             else:
-                socket.send_fds(ours, [msgspec.json.encode(task)], [self.keep(skill)])
+                socket.send_fds(ours, [msgspec.json.encode(setup)], [self.keep(skill)])
         return running
 
     def _listen(self, *, timeout_s: float) -> None:
-        """Takes in the reports that have come; the first makes the process the one that is told."""
+        """Reads the reports that have come; a process receives ticks from its first one on."""
         assert self._child is not None
         source = self._child.socket
         poll = select.poll()  # select() knows no descriptor above 1023
@@ -289,9 +289,9 @@ class Scribe:
         poll.poll(1000 * timeout_s)
         with contextlib.suppress(OSError):
             while data := source.recv(LARGEST_MESSAGE):
-                self._report = msgspec.json.decode(data, type=Report)
+                self._report = msgspec.json.decode(data, type=ScribeReport)
                 self._heard = time.monotonic()
                 self._errors.extend(self._report.errors)
                 if self._socket is None:
-                    self._say_all = self._say_all or self._restarts > 0
+                    self._send_all = self._send_all or self._restarts > 0
                     self._socket, self._ready_s = source, self._first_ready_s

@@ -1,5 +1,5 @@
-"""How the loop keeps its time on this machine: beside an empty loop of the same rate, which tells
-what the machine allows, and with the core alone.
+"""Measures the loop's timing on this machine, beside an empty loop of the same rate, which shows
+what the machine allows, and beside the core alone.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from service.recording.recording import Recording
 from service.shipped import SHIPPED_SKILL, recordings
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
-from service.timing.probes import BenchError, echo, family, probe
+from service.timing.probe_processes import BenchError, echo, family, probe
 
 PROGRAM = ("-m", "service")
-PARTS = 6  # of the time: the empty loop before and after, the core before and after, the whole for two
+PARTS = 6  # of the duration: two each for the empty loop, the core and the whole
 MISSED_MORE = 0.0005  # share of deadlines that the whole may miss more than the empty loop
 KERNEL = (
     ("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance", "`performance` keeps the clock up"),
@@ -33,12 +33,12 @@ KERNEL = (
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
 KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
-NOTHING_US = 10.0  # of lateness, that ratios of medians be none of two nothings
-SLOWER = 1.15  # than half a period, the way to the daemon and back, and the work
+NOTHING_US = 10.0  # added to both medians of lateness, so that their ratio is not one of two small numbers
+SLOWER = 1.15  # accepted latency, as a multiple of half a period, the round trip and the work
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Exit code 0 once measured, whatever was found."""
+    """Exit code 0 once measured, whatever the result."""
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
@@ -69,8 +69,9 @@ def run(
     program: tuple[str, ...] = PROGRAM,
     keep: Path | None = None,
 ) -> dict[str, Any]:
-    """Measures for about so many seconds: the empty loop, the core, the whole, the core, the empty
-    loop. What the whole recorded stays in the folder `keep`. Raises BenchError and LaunchError.
+    """The measurements of about `seconds` [s]: empty loop, core, whole, core, empty loop.
+
+    The recording of the whole stays in the folder `keep`. Raises BenchError and LaunchError.
     """
     part_s = seconds / PARTS
     skill = str(recordings() / SHIPPED_SKILL)
@@ -118,7 +119,7 @@ def _whole(
 
 
 def _used(pid: int) -> dict[str, dict[str, float]]:
-    """Processor time [s] and memory [MB] so far, of a daemon and its children by what they are."""
+    """Processor time [s] and memory [MB] so far of a daemon and its children, by kind."""
     return {
         who: {
             "cpu_s": round(sum(process.cpu_times()[:2]), 2),
@@ -129,9 +130,7 @@ def _used(pid: int) -> dict[str, dict[str, float]]:
 
 
 def _joined(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """The blocks of one kind as one: counts added, of each percentile the mean, of maxima the
-    greatest.
-    """
+    """The parts of one kind as one: sums of counts, means of percentiles, the maximum of maxima."""
     out: dict[str, Any] = {name: sum(part[name] for part in parts) for name in ("ticks", "missed")}
     for name in ("lateness_us", "work_us"):
         means = {share: round(float(np.mean([part[name][share] for part in parts])), 2) for share in parts[0][name]}
@@ -228,13 +227,13 @@ def _verdict(report: dict[str, Any]) -> str:
 
 
 def _kernel() -> list[str]:
-    """What of the kernel's settings stands in the way of a loop's time."""
+    """The kernel's settings that disturb a loop's timing, in words."""
     found = []
     for path, good, advice in KERNEL:
         try:
-            is_now = Path(path).read_text().strip()
+            value = Path(path).read_text().strip()
         except OSError:
             continue
-        if is_now != good:
-            found.append(f"{path} is {is_now}, {advice}")
-    return found or ["Nothing that the kernel tells of its settings stands in the way"]
+        if value != good:
+            found.append(f"{path} is {value}, {advice}")
+    return found or ["No setting of the kernel that can be read disturbs the loop"]

@@ -1,7 +1,7 @@
-"""The arm's description as a recording shows it: with a ball each for hands and target.
+"""The arm's description as recordings store it: with a sphere each for hands, target and setpoint.
 
-Rerun, Foxglove and RViz draw a description by the frames in `/tf`, where hands and target are: so
-they show these too, without a plug-in or a setting.
+Rerun, Foxglove and RViz draw a description by the frames in `/tf`, which hold hands and target
+too. So they show these without a plug-in or a setting.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from service import palette
 from service.contract.messages import BASE
 
-BALLS = (
+MARKERS = (
     ("left_hand", palette.LEFT, 0.03),
     ("right_hand", palette.RIGHT, 0.03),
     ("target", palette.TARGET, 0.015),
@@ -17,15 +17,16 @@ BALLS = (
 )  # frame, colour, radius [m]
 
 
-def with_balls(urdf: str) -> str:
-    """The URDF with a link for each ball, which moves freely; as it was where it has no such end or
-    links of these names.
+def with_markers(urdf: str) -> str:
+    """The URDF with a floating link for each marker.
+
+    Unchanged where it has no `</robot>`, or links of these names already.
     """
     head, end, tail = urdf.rpartition("</robot>")
-    if not end or any(f'name="{frame}"' in urdf for frame, _, _ in BALLS):
+    if not end or any(f'name="{frame}"' in urdf for frame, _, _ in MARKERS):
         return urdf
     links = []
-    for frame, colour, radius in BALLS:
+    for frame, colour, radius in MARKERS:
         red, green, blue = (value / 255 for value in colour)
         links.append(
             f'  <link name="{frame}"><visual><geometry><sphere radius="{radius}"/></geometry>'
