@@ -33,7 +33,6 @@ from sim.experiments.trials import (
     Seen,
     judge,
     seen,
-    workspace,
 )
 from sim.experiments.workers import shared_out
 from sim.people import Group, person
@@ -109,11 +108,6 @@ def _taught() -> list[Shown]:
 
 
 @functools.cache
-def _box() -> Array:
-    return workspace(_taught())
-
-
-@functools.cache
 def _learned(method: str, candidate: int) -> Model:
     return METHODS[method].candidates[candidate].learn(_taught())
 
@@ -139,9 +133,9 @@ def outcomes(task: Task) -> list[Outcome]:
     """What became of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
-        return [judge(None, one, _box()) for one in runs]
+        return [judge(None, one) for one in runs]
     model = _learned(task.method, task.candidate)
-    return [judge(model.place(one.session.told), one, _box()) for one in runs]
+    return [judge(model.place(one.session.told), one) for one in runs]
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
