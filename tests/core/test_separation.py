@@ -28,7 +28,7 @@ from service.core.separation.capsules import between_segments, nearest_to_box, p
 from service.core.separation.separation import SLIP, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
-from sim.experiments.separation import _measure
+from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
 
@@ -198,15 +198,8 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
     near its links come to each other and to the table (T,).
     """
-    people, moving = settings.people, int(np.flatnonzero(BODY.links)[0])
-    size = (len(seen), 2, len(BODY.links) - moving)
-    distance, speed, coming, own, table = *(np.empty(size) for _ in range(3)), *(np.empty(len(seen)) for _ in range(2))
-    joints, velocities = (np.ascontiguousarray(seen[name]) for name in ("joints", "joint_velocities"))
-    forearm = np.array([people.length, 0.0, 0.0])
-    _measure(
-        joints, velocities, hands, 0 * hands, *BODY, moving, people.radius, forearm, settings.table.centre[2],
-        distance, speed, coming, own, table,
-    )  # fmt: skip
+    joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
+    distance, speed, _, own, table = measured(settings, BODY, joints, hands)
     return distance, speed, own, table
 
 
