@@ -186,7 +186,7 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
             "ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    primitive.copy_from([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
+    primitive.imitate([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
         primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))
