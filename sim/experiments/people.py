@@ -1,7 +1,7 @@
 """What learned skills are worth on people who did not demonstrate: ours beside its rivals.
 
 All learn from the same demonstrations, are told the same places with the same errors, and are
-followed by the same setpoint stage. Parameters are chosen on the people of the tuning set, of as
+followed by the same core. Parameters are chosen on the people of the tuning set, of as
 many candidates for each method; the figures are those of the test set, whom nothing was chosen on.
 """
 
@@ -70,21 +70,21 @@ METHODS = {
     "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
     "paper": Entry(
         "KMP, the paper's numbers,\nour neighbourhoods",
-        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.01, 0.0001, 0.001, 0.003, 0.005, 0.02)),
+        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.005, 0.0001, 0.001, 0.003, 0.01, 0.02)),
     ),
     "promp": Entry(
         "Interaction ProMP",
         tuple(
             InteractionProMP(by_length=by_length, hands_m=hands_m)
             for by_length in (True, False)
-            for hands_m in (0.02, 0.01, 0.03)
+            for hands_m in (0.01, 0.02, 0.03)
         ),
     ),
     "tp_gmm": Entry(
         "TP-GMM",
         tuple(
             TaskParameterised(components, 0.01, iterations)
-            for components, iterations in ((20, 1), (10, 1), (20, 3), (10, 3), (10, 40), (6, 40))
+            for components, iterations in ((6, 40), (10, 1), (20, 3), (10, 3), (10, 40), (20, 1))
         ),
     ),
 }
