@@ -69,7 +69,7 @@ class CellStatus(NamedTuple):
             turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
-            deviation_m=round(float(frame["deviation"]), 5) if aimed else None,
+            deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,
         )
@@ -88,7 +88,7 @@ class CellStatus(NamedTuple):
             sources=self.sources,
             contested=SETTLED,
             scatter_mm=1e3 * SCATTERED_M,
-            deviation_m=(float(self.frame["deviation"]), skill.threshold),
+            deviation_m=(float(self.frame["gate_m"]), skill.threshold),
             between_places=skill.between is not None,
             outside=self._outside(),
             error_rad=(error_rad, settings.arm.fault_error_rad),

@@ -108,7 +108,7 @@ def _over_time(report: Report) -> Figure:
     _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
     between = any(skill.between is not None for _, skill in report.columns.skills)
     look = (OFF, "hands off what is known") if between else (TARGET, "the target's deviation")
-    _curve(errors, times, np.where(frames["deviation"] > 0, 1000 * frames["deviation"], np.nan), *look)
+    _curve(errors, times, np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan), *look)
     errors.set(ylabel="[mm]", yscale="log")
 
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):

@@ -27,7 +27,7 @@ from service.core.separation.capsules import between_segments, nearest_to_box, p
 from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
-from sim.experiments.separation import measure
+from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
@@ -39,8 +39,8 @@ POSTURE = np.array(ASSUMED.arm.posture)
 
 
 def placed(q: Vector) -> Vector:
-    out = np.empty((len(BODY.links), 2, 3))
-    place(q, BODY.frames, BODY.axes, BODY.links, BODY.ends, out)
+    out = np.empty((len(BODY.capsules), 2, 3))
+    place(q, BODY.frames, BODY.axes, BODY.capsules, out)
     return out
 
 
@@ -49,7 +49,7 @@ def test_capsules_lie_around_the_collision_shapes_as_pinocchio_has_them() -> Non
     shapes = pin.buildGeomFromUrdfString(model, URDF, pin.GeometryType.COLLISION)
     data, there = model.createData(), pin.GeometryData(shapes)
     random = np.random.default_rng(1)
-    assert len(BODY.links) == len(shapes.geometryObjects)
+    assert len(BODY.capsules) == len(shapes.geometryObjects)
     for q in random.uniform(LOWER, UPPER, (20, 7)):
         pin.updateGeometryPlacements(model, data, shapes, there, q)
         capsules = placed(q)
@@ -62,14 +62,14 @@ def test_capsules_lie_around_the_collision_shapes_as_pinocchio_has_them() -> Non
                 r, h = shape.geometry.radius, shape.geometry.halfLength
                 corners = np.array([[r * math.cos(a), r * math.sin(a), z] for a in angles for z in (-h, h)])
             points = np.array([at.act(corner) for corner in corners])
-            for k in np.flatnonzero(BODY.links == shape.parentJoint):
+            for k in np.flatnonzero(BODY.capsules["link"] == shape.parentJoint):
                 far = [between_segments(np.array([p, p]), capsules[k], np.empty(9)) for p in points]
-                if max(far) <= BODY.radii[k] + 1e-9 and max(far) > BODY.radii[k] - 1e-3:
+                if max(far) <= BODY.capsules["radius"][k] + 1e-9 and max(far) > BODY.capsules["radius"][k] - 1e-3:
                     covered.add(int(k))
                     break
             else:
                 pytest.fail(f"{shape.name} is not covered")
-        assert covered == set(range(len(BODY.links)))
+        assert covered == set(range(len(BODY.capsules)))
 
 
 def test_distances_of_capsules_are_those_of_coal() -> None:
@@ -201,15 +201,8 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
     near its links come to each other and to the table (T,).
     """
-    people, moving = settings.people, int(np.flatnonzero(BODY.links)[0])
-    size = (len(seen), 2, len(BODY.links) - moving)
-    distance, speed, coming, own, table = *(np.empty(size) for _ in range(3)), *(np.empty(len(seen)) for _ in range(2))
-    joints, velocities = (np.ascontiguousarray(seen[name]) for name in ("joints", "joint_velocities"))
-    forearm = np.array([people.length, 0.0, 0.0])
-    measure(
-        joints, velocities, hands, 0 * hands, *BODY, moving, people.radius, forearm, settings.table.centre[2],
-        distance, speed, coming, own, table,
-    )  # fmt: skip
+    joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
+    distance, speed, _, own, table = measured(settings, BODY, joints, hands)
     return distance, speed, own, table
 
 
@@ -275,7 +268,10 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
             else:
                 corners = np.array([[0.35, -0.6, -0.73], [1.25, 0.6, 0.27]])
             for k in np.flatnonzero(BODY.links):
-                apart = to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near) - BODY.radii[k]
+                apart = (
+                    to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near)
+                    - BODY.capsules["radius"][k]
+                )
                 assert apart > settings.obstacles.clearance - 0.001, (k, apart)
 
 
