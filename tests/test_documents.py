@@ -15,9 +15,10 @@ import pytest
 from service.config import Settings, robot_description
 from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
-from service.contract.records import FRAME, TIMING, Cause, Flag, Mode, Reason
+from service.contract.records import Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm.arm import Arm
+from service.core.frame import FRAME, TIMING_FIELDS
 from service.recording.scribe import Scribe
 from service.viewer.blueprint import plot_views
 from support.paths import ROOT
@@ -155,7 +156,7 @@ def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() 
     layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text(encoding="utf-8"))
     fields = {
         topic("thirdhand", name): {field.name for field in fields}
-        for name, fields in (("frame", FRAME), ("timing", TIMING))
+        for name, fields in (("frame", FRAME), ("timing", TIMING_FIELDS))
     }
     text = json.dumps(layout)
     topics = {topic("thirdhand", channel.key) for channel in CHANNELS if channel.recorded}

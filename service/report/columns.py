@@ -25,7 +25,7 @@ from service.recording.recording import Recording
 from service.recording.steps import Gap, Step
 
 KEPT = (
-    *("tick", "hands", "hand_velocities", "target", "deviation", "setpoint", "setpoint_velocity", "tool", "joints"),
+    *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "tool", "joints"),
     *("joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages", "rejected"),
     *("mode", "reason", "flags", "commanded"),
 )

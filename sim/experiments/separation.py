@@ -152,7 +152,8 @@ def _judged(
     allowed = np.empty_like(distance)
     _allow(distance, coming, people.brake, reaction_s, people.clearance, allowed)
     offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
-    tool = body.capsules["link"][body.links > 0] == len(settings.joints.names)
+    links = body.capsules["link"]
+    tool = links[links > 0] == len(settings.joints.names)
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
     lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))

@@ -103,7 +103,8 @@ def test_its_recording_replays_identically(cell: Settings, reach: Skill, tmp_pat
 
 def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> None:
     arm = Arm(cell, robot_description(cell))
-    _, position, rotation, *_ = arm.at(np.array(cell.arm.posture))
+    here = arm.at(np.array(cell.arm.posture))
+    position, rotation = here.position, here.rotation
     assert position == pytest.approx(Scene().robot_start, abs=0.03)
     assert rotation[:, 2] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)], abs=0.01)
     assert len(cell.joints.names) == len(cell.joints.lower) == len(cell.arm.posture)

@@ -63,7 +63,7 @@ def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, 
     tell(told, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
     tell(missing, [*head, *[None] * length, *tail], rate_hz)
     assert told.rejected() == {Cause.JUMPED: length}
-    for name in ("hands", "means", "covariances", "noise", "modes"):
+    for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "even_samples", "mode_probabilities"):
         assert told.state[name].tobytes() == missing.state[name].tobytes(), name
 
 
@@ -263,7 +263,7 @@ def test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculat
         hands.intake.take_hand(hands.state, LEFT_SIDE, PoseStamped(stamp_ns, frame, position, turn))  # type: ignore[arg-type]
         taken = sum(hands.rejected().values()) == count
         assert taken <= (int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])), (k, before)
-        for name in ("hands", "means", "covariances", "noise", "modes", "contested"):
+        for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "mode_probabilities", "contested"):
             assert np.isfinite(hands.state[name]).all(), name
         assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 0]) < 10.0
 
@@ -341,4 +341,5 @@ def test_compiled_and_plain_memory_agree() -> None:
             answers.append(way(plausibility.is_confirmed)(as_array(state).view(np.recarray), 0, at, 50, 0.002))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
-        assert compiled["doubts"].tobytes() == plain["doubts"].tobytes()
+        for name in ("jump_first_tick", "jump_newest_tick", "jump_count", "jump_is_swap"):
+            assert compiled[name].tobytes() == plain[name].tobytes()

@@ -20,6 +20,7 @@ from service.cli.main import main
 from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
 from service.contract import cdr, channels, requests, ros2, ros2msg
 from service.contract.messages import PoseStamped
+from service.core.frame import definitions
 from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.wam import JOINT_NAMES
@@ -157,7 +158,7 @@ def ros(lab: Lab) -> Iterator[dict[str, Any]]:
 
 def typed(kind: str) -> dict[str, str]:
     """What a ROS 2 node knows of a message type."""
-    definition = ros2msg.schema(kind, joints=len(JOINT_NAMES))
+    definition = ros2msg.schema(kind, definitions(len(JOINT_NAMES)))
     return {"msg_type": kind, "msg_definition": definition, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
 
 

@@ -45,7 +45,7 @@ def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, f
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
-        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type, joints=7).encode())
+        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type).encode())
         other = writer.register_channel("/chatter", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(other, 0, b"{}", 0)
         for topic, (stamps, poses) in streams.items():

@@ -22,7 +22,7 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
-from service.core.frame import Event, Tick, encode
+from service.core.frame import Event, Tick, definitions, encode
 from service.core.record import blank
 from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
@@ -206,7 +206,7 @@ def test_the_links_of_the_arm_and_what_matters_around_it_are_one_tree_of_frames(
 
 @pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
 def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
-    text = schema(kind, joints=7)
+    text = schema(kind, definitions(7))
     told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
     needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
     assert needed == told

@@ -35,7 +35,7 @@ from sim.script import HandScript
 from sim.sessions import session
 from sim.teach import places_of
 
-PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "deviation")
+PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "gate_m")
 ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
 
 
