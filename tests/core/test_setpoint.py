@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
 from service.core.intake.intake import Intake
-from service.core.record import Vector, blank
+from service.core.record import Vector, blank, copied
 from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
 from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
 from service.core.skill.workspace import Target
@@ -308,7 +308,7 @@ def test_going_on_from_a_copy_of_the_state_gives_the_same_bits() -> None:
     generator.begin(state, at_rest(MIDDLE))
     for target in targets[:30]:
         generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
-    other, copy = SetpointGenerator(Settings()), state.copy()
+    other, copy = SetpointGenerator(Settings()), copied(state)
     for target in targets[30:]:
         generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
         other.step(copy, Target(*target, clamped=False), BOX, FREE, 1.0)

@@ -74,5 +74,5 @@ class Explained(SetpointGenerator):
 def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:
     """A controller whose setpoint generator asserts its bound."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.core.controller.SetpointGenerator", Explained)
+        patch.setattr("service.core.setpoint.stage.SetpointGenerator", Explained)
         return Controller(settings, skill, urdf=urdf)
