@@ -35,7 +35,7 @@ PLANTED = [
     ("service/contract/cdr.py", "import numpy"),
     ("service/contract/channels.py", "from service.core.frame import Tick"),
     ("service/learning/learn.py", "import mcap"),
-    ("service/recording/client.py", "from service.daemon.clock import Deadlines"),
+    ("service/recording/scribe.py", "from service.daemon.clock import Deadlines"),
     ("service/daemon/clock.py", "from service.cli.usage import UsageError"),
     ("service/core/skill/skill.py", "from service.learning.learn import learn"),
     ("kmp/gmm.py", "import msgspec"),

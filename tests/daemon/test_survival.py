@@ -29,7 +29,7 @@ SABOTAGE = """
 import pathlib
 from service.core import controller
 from service.daemon import daemon
-from service.daemon import requests
+from service.daemon import queryables
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
     honest = getattr(owner, name)
@@ -44,8 +44,8 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
 sabotaged(daemon.Daemon, "_survey")
 sabotaged(controller.Controller, "step")
 sabotaged(daemon.Daemon, "_publish")
-sabotaged(requests.Line, "enqueue")
-sabotaged(requests.Requests, "_reply")
+sabotaged(queryables.RequestQueue, "enqueue")
+sabotaged(queryables.Queryables, "_reply")
 """
 
 
