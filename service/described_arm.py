@@ -1,6 +1,4 @@
-"""What an arm's URDF says of its settings: it completes those that are silent, and refuses those
-that contradict it.
-"""
+"""Completes an arm's settings from its URDF, and refuses those that contradict it."""
 
 from __future__ import annotations
 

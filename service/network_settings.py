@@ -1,4 +1,4 @@
-"""How a cell is reached: endpoints, certificates, and who else sees it."""
+"""Network settings of a cell: endpoints, certificates, ROS 2 domain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is shipped beside the code: recordings, demonstrations and the soldering skill."""
+"""The files shipped beside the code: recordings, demonstrations and the soldering skill."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What a URDF says of an arm: its joints along the chain to the tool, their limits, where its links
-are and what shape they have.
+"""Reads an arm's URDF: the joints along the chain to the tool, their limits, the links' poses and
+shapes.
 """
 
 from __future__ import annotations

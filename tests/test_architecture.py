@@ -49,7 +49,7 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
         {
             "service/core/frame.py": "from service.daemon.clock import Deadlines",
             "service/contract/channels.py": "from service.core.frame import Tick",
-            "service/recording/client.py": "from service.daemon.clock import Deadlines",
+            "service/recording/scribe.py": "from service.daemon.clock import Deadlines",
             "service/daemon/clock.py": "from service.cli.usage import UsageError",
             "service/core/skill/skill.py": "from service.learning.learn import learn",
             "kmp/gmm.py": "from service.config import Settings",

@@ -123,7 +123,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if name not in ORDERS:
             return self._respond(404, "There is nothing of this name.")
         if not hmac.compare_digest(self.headers.get("X-Thirdhand-Token", ""), self._page.token):
-            return self._respond(403, "The token of the page is needed: load it anew.")
+            return self._respond(403, "The token of the page is needed: reload it.")
         try:
             return self._respond(200, self._page.order(name))
         except ExplainedError as error:

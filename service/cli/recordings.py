@@ -61,7 +61,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
-    """How many of the poses played reached the daemon's loop, by its own count, in words.
+    """The numbers of played poses that reached the daemon's loop, by its own count, in words.
 
     Raises ExplainedError where none of a hand did.
     """
@@ -75,7 +75,7 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
     counts = ", ".join(f"{max(0, came[side])} of {played[side]} of the {side} hand" for side in played)
     refused = {cause: now.rejected[cause] - before.rejected.get(cause, 0) for cause in now.rejected}
     if any(came[side] <= 0 for side in played):
-        raise ExplainedError(f"of the poses played the daemon counted {counts}: was it started anew, or is it stalled?")
+        raise ExplainedError(f"of the poses played the daemon counted {counts}: was it restarted, or is it stalled?")
     causes = ", ".join(f"{count} {cause}" for cause, count in refused.items() if count > 0)
     return f"{counts} came to the daemon's loop" + f"; rejected meanwhile: {causes}" * bool(causes)
 

@@ -1,5 +1,5 @@
-"""What a client of the daemon needs: sessions, requests as plain calls, hands in and commands out,
-and which daemons there are.
+"""For clients of the daemon: sessions, requests as calls, hands in and commands out, and the cells
+on a network.
 """
 
 from service.client.calls import Client

@@ -44,7 +44,7 @@ class Client:
         return self._typed("reset", None, Reply)
 
     def status(self) -> Status:
-        """What `<cell>/status` carries."""
+        """The daemon's status."""
         return self._typed("status", None, Status)
 
     def places(self) -> tuple[ViaPointInForce, ...]:

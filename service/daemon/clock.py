@@ -93,7 +93,7 @@ class Deadlines:
 
 
 class Granted(NamedTuple):
-    """What the operating system granted of the loop's requests."""
+    """The loop's requests that the operating system granted."""
 
     realtime: bool
     """The thread has real-time scheduling."""

@@ -1,4 +1,4 @@
-"""Captures a demonstration: hands, tool and gripper of a cell, received over Zenoh until somebody
+"""Captures a demonstration: hands, tool and gripper of a cell, received over Zenoh until a person
 ends it or all is at rest, and written as received.
 """
 
@@ -69,7 +69,7 @@ class Capture:
         return lambda sample: waiting.append((time.time_ns(), sample.payload.to_bytes()))
 
     def close(self) -> None:
-        """Hears no more."""
+        """Ends the subscriptions, and collects what came last."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self.collect()
@@ -146,7 +146,7 @@ class Capture:
         return self._moved
 
     def keep_motion(self) -> tuple[float, float]:
-        """How much rest was left out before and after the motion [s]; KEPT_S of each is kept."""
+        """The rest before and after the motion that was left out [s]; KEPT_S of each is kept."""
         times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
         start_ns, end_ns = self.span_of_motion()
         self.keep(start_ns, end_ns)

@@ -56,7 +56,7 @@ class Summary(NamedTuple):
 
     @property
     def lasts_s(self) -> float:
-        """From the first to the last sample that hands and tool have in common [s]."""
+        """The duration that hands and tool have in common [s]."""
         return float(np.ptp(self.demonstration.stamps_ns)) / 1e9
 
 

@@ -135,7 +135,7 @@ def read_demonstration(
 
 
 def _is_pose(poses: Vector) -> NDArray[np.bool_]:
-    """Which of the poses (N, 7) are finite, with a quaternion of norm 1."""
+    """A mask (N,) of the poses (N, 7) that are finite, with a quaternion of norm 1."""
     with np.errstate(all="ignore"):
         return np.asarray(np.isfinite(poses).all(axis=1) & (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) <= 0.01))
 

@@ -339,7 +339,7 @@ def _full(kind: str) -> str:
 
 
 def _decoder(store: str, function: str) -> Callable[[bytes, str], Any]:
-    """What decodes messages; made at the first that needs it."""
+    """A decoder of messages, whose library is loaded at the first message that needs it."""
     made: list[Callable[[bytes, str], Any]] = []
 
     def decode(data: bytes, kind: str) -> Any:

@@ -77,7 +77,7 @@ class _WholeWrites:
         """Does nothing: all data is written already."""
 
     def links(self) -> tuple[int, tuple[int, int]]:
-        """How many names the file has, and which file it is."""
+        """The number of names of the file, and its device and inode."""
         found = os.fstat(self._fd)
         return found.st_nlink, (found.st_dev, found.st_ino)
 

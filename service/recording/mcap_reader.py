@@ -130,7 +130,7 @@ class _Reading:
         return schemas, channels
 
     def _summary(self) -> int:
-        """Where the summary begins if its checksum is right, else 0."""
+        """The first byte of the summary if its checksum is right, else 0."""
         _, _, start, _, checksum = _FOOTER.unpack(self._footer)
         if not 0 < start <= self._footer_at or not checksum:
             return 0
@@ -215,7 +215,7 @@ class _Reading:
         return self._next_chunk(at + 1)
 
     def _next_chunk(self, start: int) -> int | None:
-        """Where the next chunk begins whose content is whole."""
+        """The first byte of the next whole chunk; None where there is none."""
         block_at = start
         while block_at < self._size:
             block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)

@@ -98,5 +98,5 @@ class RecordingPaths:
 
 
 def skills_folder(settings: Settings) -> Path:
-    """Where the skills of a cell are, and the demonstrations that they were learned from."""
+    """The folder of a cell's skills and of the demonstrations that they were learned from."""
     return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()

@@ -88,7 +88,7 @@ def unpack_note(message: bytes) -> tuple[str, str, int] | None:
 
 
 class ScribeSetup(msgspec.Struct, frozen=True):
-    """What a scribe is started with; the skill is sent along as a memory file.
+    """The setup of a scribe; the skill is sent along as a memory file.
 
     Without state it begins with the first message that has one. `recording` and `rrd` are explicit
     paths instead of names in `folder`; `attempt` counts the scribes of one daemon.

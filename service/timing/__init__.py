@@ -1,1 +1,1 @@
-"""What measures the loop: beside an empty loop, under loads, for days."""
+"""Measurements of the loop: beside an empty loop, under loads, over a long time."""

@@ -40,7 +40,8 @@ from service.timing.probe_processes import probe
 from service.viewer.stream import rerun_program
 
 QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
-LARGE_SKILL, LARGE = "large", 100_000  # points
+LARGE_SKILL = "large"
+LARGE = 100_000  # points of it
 SETTLE_S = 2.0
 COLLECTING = f"""
 from service import one_blas_thread

@@ -1,1 +1,1 @@
-"""What Rerun draws of a cell: its frames, its surroundings, its skill."""
+"""The Rerun scene of a cell: its frames, its surroundings, its skill."""

@@ -1,4 +1,4 @@
-"""What changes: frames as Rerun chunks, the scene at about 100 Hz, the curves at the full rate."""
+"""The dynamic part: frames as Rerun chunks, the scene at 100 Hz, the curves at the full rate."""
 
 from __future__ import annotations
 
@@ -277,7 +277,7 @@ class DynamicScene:
         return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
 
     def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
-        """The trails of the last TRAIL_S; each starts anew where its hand was lost meanwhile."""
+        """The trails of the last TRAIL_S; each restarts where its hand was lost meanwhile."""
         tracks = [(name, frames["hands"][:, side], frames["hand_ages"][:, side]) for side, name in enumerate(SIDES)]
         tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1)))
         for name, positions, ages in tracks:

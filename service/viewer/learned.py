@@ -1,5 +1,5 @@
-"""What the viewer draws of a skill: demonstrations and reference as faint lines and points, and
-via-points with the hands' radius within which they hold.
+"""A skill in the scene: demonstrations and reference as faint lines and points, and via-points
+with the hands' radius within which they hold.
 
 It is read from the arrays of the skill's file; what is missing there is not drawn.
 """
@@ -45,8 +45,8 @@ class MarkedViaPoint(NamedTuple):
 
 
 class SkillContents(NamedTuple):
-    """What a skill's file holds: reference points of the tool (N, 3) [m], via-points, the deviation
-    above which it holds [m], the figures of its learning.
+    """The contents of a skill's file: reference points of the tool (N, 3) [m], via-points, the
+    deviation above which it holds [m], the figures of its learning.
     """
 
     name: str
@@ -58,7 +58,7 @@ class SkillContents(NamedTuple):
 
 
 def skill_contents(skill: bytes) -> SkillContents:
-    """What can be drawn of a skill, given the bytes of its .npz file. Raises ValueError."""
+    """The contents of a skill that can be drawn, from its .npz file's bytes. Raises ValueError."""
     try:
         with np.load(io.BytesIO(skill), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}

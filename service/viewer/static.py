@@ -1,4 +1,4 @@
-"""What the viewer shows and never changes: the arm and its ghost, table, reach, names and colours.
+"""The static part of the scene: the arm and its ghost, table, reach, names and colours.
 
 Millimetres, microseconds and degrees of transparency are chosen here, in `dynamic` and
 `blueprint`, and nowhere else.

@@ -1,4 +1,4 @@
-"""Where a Rerun scene goes: into a file, to live viewers, or both.
+"""Sends a Rerun scene into a file, to live viewers, or both.
 
 Frames are sent by columns, a batch at a time. Where a destination fails (full disk, used port) it
 is given up and named in `problems`; the other goes on.
@@ -48,7 +48,7 @@ class ViewerError(ExplainedError, RuntimeError):
 
 
 class _Destination:
-    """Where the scene goes: collects frames, and sends them in batches."""
+    """One destination of the scene: collects frames, and sends them in batches."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class _Destination:
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     def add(self, shown: DrawnFrame) -> None:
-        """Takes in one frame."""
+        """Adds one frame."""
         if not self._repeated_ns:
             self._repeat(shown.time_ns)
         self._pending.append(shown)
@@ -124,7 +124,7 @@ class _Destination:
             self.put(list(scene_objects.object_chunks(objects, (one.name for one in before), self._at(time_ns))))
 
     def log(self, text: str, level: str, time_ns: int) -> None:
-        """Takes in one line of the log."""
+        """Adds one line to the log."""
         self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
 
     def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:

@@ -29,7 +29,7 @@ SABOTAGE = """
 import pathlib
 from service.core import controller
 from service.daemon import daemon
-from service.daemon import requests
+from service.daemon import queryables
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
     honest = getattr(owner, name)
@@ -44,7 +44,7 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
 sabotaged(daemon.CellStatus, "status")
 sabotaged(controller.Controller, "step")
 sabotaged(daemon, "outgoing")
-sabotaged(requests.Line, "enqueue")
+sabotaged(queryables.RequestQueue, "enqueue")
 sabotaged(daemon.Daemon, "note")
 """
 
