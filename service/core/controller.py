@@ -272,7 +272,7 @@ class Controller:
             return Reason.NO_HANDS if min(state["hand_ticks"].tolist()) < 0 else Reason.STALE_HAND
         # what has been found far must come clearly nearer again
         ease = 0.9 if int(state["reason"]) == FAR else 1.0
-        return Reason.FAR_FROM_DEMONSTRATIONS if prediction.deviation > ease * self._skill.threshold else Reason.NONE
+        return Reason.FAR_FROM_DEMONSTRATIONS if prediction.gate_m > ease * self._skill.threshold else Reason.NONE
 
     def _clamp(self, prediction: Prediction) -> Target:
         """The target where it may be, with the motion that stays there."""
@@ -375,7 +375,7 @@ class Controller:
             target.velocity if target else self._nothing[0],
             target.acceleration if target else self._nothing[0],
             prediction.covariance if prediction else self._nothing,
-            prediction.deviation if prediction else 0.0,
+            prediction.gate_m if prediction else 0.0,
             turn.orientation if turn else state["orientation"],
             turn.velocity if turn else self._nothing[0],
             turn.covariance if turn else self._nothing,

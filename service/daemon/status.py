@@ -14,8 +14,8 @@ from service.core.frame import Frame, Record
 from service.core.intake.intake import REST_S
 from service.core.intake.plausibility import SCATTERED_M, SETTLED
 from service.core.rotation import off_target
+from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
-from service.core.skill.skill import standard_deviations
 from service.daemon.input_monitor import KEYS, frames
 
 
@@ -89,8 +89,8 @@ class CellStatus(NamedTuple):
                 return "; ".join(_silence(side, sources[side]) for side in SIDES if not sources[side].fresh)
             case Reason.FAR_FROM_DEMONSTRATIONS:
                 skill = self.controller.skill
-                what = "the target's standard deviation is" if skill.between is None else "a hand is off its places by"
-                return f"{what} {100 * float(frame['deviation']):.1f} cm, {100 * skill.threshold:.1f} accepted"
+                off, most = 100 * float(frame["deviation"]), 100 * skill.threshold
+                return f"{skill.model.measure} is {off:.1f} cm, {most:.1f} accepted"
             case Reason.TWO_SOURCES:
                 return _contest(sources)
             case Reason.ARM_NOT_READY:

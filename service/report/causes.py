@@ -164,9 +164,9 @@ def _far(columns: Columns, begin: int, worst_mm: float) -> str:
     """How far off what is known it was, and what the skill in force at frame `begin` allows."""
     tick = int(columns.frames["tick"][begin])
     at = [skill for since, skill in columns.skills if since <= tick]
-    between = bool(at) and at[-1].between is not None
-    what = "a hand was off its places by up to" if between else "the target's standard deviation came to"
-    return f"{what} {worst_mm:.0f} mm" + (f"; {1000 * at[-1].threshold:.0f} mm are allowed" if at else "")
+    if not at:
+        return f"{worst_mm:.0f} mm off what is known"
+    return f"{at[-1].model.measure} came to {worst_mm:.0f} mm; {1000 * at[-1].threshold:.0f} mm are allowed"
 
 
 def _ticks(columns: Columns) -> int:

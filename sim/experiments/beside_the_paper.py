@@ -87,8 +87,8 @@ def reached(variant: Variant, count: int) -> Reached:
             refused += 1
             continue
         hands, wanted = at_the_events(scene, number)
-        errors.append(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
-        steepness.append([np.linalg.norm(taught.primitive.jacobian(row), ord=2) for row in hands])
+        errors.append(1000 * np.linalg.norm(taught.mean(hands) - wanted, axis=1))
+        steepness.append([np.linalg.norm(taught.model.primitive.jacobian(row), ord=2) for row in hands])
     return Reached(np.array(errors).reshape(-1, 3), np.array(steepness).reshape(-1, 3), refused)
 
 

@@ -20,6 +20,7 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
+from service.core.frame import Record
 from service.core.intake.stillness import RESTING
 from service.core.skill.pose import NO_GRIPPER, Turn
 from service.core.skill.skill import Known, Prediction, Skill
@@ -58,9 +59,10 @@ class Rival(Skill):
         hands: Array,
         velocities: Array,
         accelerations: Array,
-        rest: Array = RESTING,
+        stillness: Array = RESTING,
         *,
         before: Known | None = None,
+        memory: Record | None = None,
     ) -> Prediction:
         """The law's tool, and how it moves by differences along the hands' motion."""
         s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
@@ -82,9 +84,10 @@ class TimeDriven(Skill):
         hands: Array,
         velocities: Array,
         accelerations: Array,
-        rest: Array = RESTING,
+        stillness: Array = RESTING,
         *,
         before: Known | None = None,
+        memory: Record | None = None,
     ) -> Prediction:
         """The trajectory's tool now; it is told when the hands begin."""
         t = self.bench.time_s
@@ -290,7 +293,7 @@ def _rival(skill: Skill, law: Law) -> Rival:
 def _fields(skill: Skill, known: bytes) -> dict[str, Any]:
     return {
         "name": known.decode(),
-        "primitive": skill.primitive,
+        "model": skill.model,
         "orientation": skill.orientation,
         "workspace": skill.workspace,
         "threshold": skill.threshold,

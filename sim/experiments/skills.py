@@ -70,7 +70,7 @@ class LearnedByService:
 
     def place(self, places: Places) -> PlacedSkill:
         """The skill adapted to the places."""
-        points = via_points(places, start=self.skill.between is not None)
+        points = via_points(places, start="start" in self.skill.model.names)
         return PlacedSkill(adapted(self.skill, points, tolerance=TOLERANCE_M))
 
 
@@ -87,9 +87,9 @@ class PlacedSkill:
 
     def predict(self, hands: Array, rest: Array) -> Predicted:
         """As `trials.Placed`; far is what the service's gate says."""
-        some = self.skill.covariances(hands[::COVARIANCE_EVERY], rest[::COVARIANCE_EVERY])
+        some = self.skill.model.covariances(hands[::COVARIANCE_EVERY], rest[::COVARIANCE_EVERY])
         covariance = np.repeat(some, COVARIANCE_EVERY, axis=0)[: len(hands)] + 1e-12 * np.eye(3)
-        far = self.skill.deviations(hands) > self.skill.threshold
+        far = self.skill.model.gates_m(hands) > self.skill.threshold
         return Predicted(self.mean(hands, rest), covariance, far)
 
 

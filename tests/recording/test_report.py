@@ -97,7 +97,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden:
     assert held[Reason.STALE_HAND].why.startswith("the left hand was not seen for 0.5")
     assert held[Reason.OPERATOR].why == "`hold` was asked for"
     far = held[Reason.FAR_FROM_DEMONSTRATIONS].why
-    assert far.startswith("a hand was off its places by up to ")
+    assert far.startswith("a hand's distance from its via-points came to ")
     assert far.endswith(" mm; 104 mm are allowed")
     assert golden.seconds(Mode.FOLLOW) + golden.seconds(Mode.HOLD) == pytest.approx(golden.lasts_s)
     assert (golden.faults, golden.lacks) == ((), ())
