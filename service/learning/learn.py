@@ -18,14 +18,13 @@ from service.config import Reach
 from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import standard_deviations
-from service.core.skill.skill import Skill
 from service.core.skill.task import Task
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
 from service.learning.gate import gate
 from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.pose import learned_pose
-from service.learning.skill_file import SkillError, with_file
+from service.learning.skill_file import SkillError, StoredSkill, with_file
 from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
@@ -37,7 +36,7 @@ class Evidence(NamedTuple):
     the others' primitive predicts of it.
     """
 
-    skill: Skill
+    skill: StoredSkill
     figures: Figures
     paths: Sequence[tuple[Vector, Vector]]
     held_out: Sequence[HeldOut]
@@ -61,7 +60,7 @@ def learn(
     reach: Reach | None = None,
     progress: Callable[[str], None] = lambda line: None,
     show: Callable[[Evidence], None] = lambda evidence: None,
-) -> Skill:
+) -> StoredSkill:
     """The skill of some demonstrations, with its figures.
 
     `ell` [1/m²] not given is chosen. With `components` a mixture of so many makes the reference,
@@ -132,7 +131,7 @@ def learn(
         unsafe=(*judged.unsafe, *posed.unsafe),
     )
     tools = np.concatenate([pairs[i][1] for i in kept])
-    skill = Skill(
+    skill = StoredSkill(
         name=name,
         model=found.model,
         orientation=posed.orientation,

@@ -8,11 +8,12 @@ motion is never handed out.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import msgspec
@@ -77,7 +78,19 @@ class SkillError(ExplainedError, ValueError):
     """A skill that cannot be read, learned or adapted."""
 
 
-def with_file(skill: Skill) -> Skill:
+@dataclass(frozen=True, eq=False)
+class StoredSkill(Skill):
+    """A skill beside which is what the loop has no use for."""
+
+    figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
+    file: bytes = field(default=b"", repr=False)  # all of it, as it is stored and recorded
+
+    def for_loop(self) -> Skill:
+        """The skill alone."""
+        return Skill(**{part.name: getattr(self, part.name) for part in fields(Skill)})
+
+
+def with_file(skill: StoredSkill) -> StoredSkill:
     """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
@@ -102,10 +115,14 @@ def with_file(skill: Skill) -> Skill:
     if skill.gripper:
         arrays |= {GRIPPER + name: array for name, array in skill.gripper.primitive.to_arrays().items()}
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
-    return replace(skill, file=out.getvalue())
+    return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
 
 
-def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
+def _digest(file: bytes) -> bytes:
+    return hashlib.blake2b(file, digest_size=16).digest()
+
+
+def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError.
 
     One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
@@ -129,7 +146,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
         model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
-        skill = Skill(
+        skill = StoredSkill(
             name=str(arrays["name"]),
             model=model.from_arrays(arrays, via_points),
             orientation=arrays["orientation"],
@@ -143,6 +160,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             gripper=_gripper(_part(arrays, GRIPPER)),
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
+            digest=_digest(data),
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")

@@ -18,14 +18,14 @@ from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
-from service.learning.skill_file import SkillError, with_file
+from service.learning.skill_file import SkillError, StoredSkill, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
 
 
-def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
+def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
     """A new skill that goes through these via-points and no others. Raises SkillError.
 
     Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the

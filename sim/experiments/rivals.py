@@ -26,6 +26,7 @@ from service.core.skill.pose import NO_GRIPPER, Turn
 from service.core.skill.skill import Known, Prediction, Skill
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
+from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from sim.bench import Bench
 from sim.experiments.results import Array, ExperimentError
@@ -115,7 +116,7 @@ Adapt: TypeAlias = Callable[[Scene], Callable[[Bench], Skill]]
 """From a scene to the skill that is told its places, once there is a bench."""
 
 
-def ours(skill: Skill) -> Adapt:
+def ours(skill: StoredSkill) -> Adapt:
     """The service's own: the shipped skill, taught the three places as the demo teaches them."""
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:
@@ -298,5 +299,5 @@ def _fields(skill: Skill, known: bytes) -> dict[str, Any]:
         "workspace": skill.workspace,
         "threshold": skill.threshold,
         "learned_from": skill.learned_from,
-        "file": known,  # its digest: nothing is recorded that would need the rest
+        "digest": known.ljust(16),  # nothing is recorded that would need more
     }

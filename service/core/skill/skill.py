@@ -4,8 +4,7 @@ moves, and how sure it is.
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
@@ -59,8 +58,7 @@ class Skill:
     turn: LearnedOrientation | None = None
     gripper: LearnedGripper | None = None
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
-    figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
-    file: bytes = field(default=b"", repr=False)  # all of the above, as it is stored and recorded
+    digest: bytes = bytes(16)  # 16 bytes of its file that tell it from any other
 
     def predict(
         self,
@@ -117,8 +115,3 @@ class Skill:
         """Least and greatest corner (2, 2, 3) of where it knows the left and the right hand [m]."""
         hands = self.hands.reshape(-1, 2, 3)
         return np.stack([hands.min(axis=0), hands.max(axis=0)])
-
-    @cached_property
-    def digest(self) -> bytes:
-        """16 bytes that tell this skill from any other."""
-        return hashlib.blake2b(self.file, digest_size=16).digest()
