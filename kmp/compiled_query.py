@@ -17,8 +17,11 @@ from kmp.compiled import AVAILABLE, compiled
 from kmp.dense import Dense
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel
+from kmp.kernel_row import kernel_value
 from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.query import MotionPrediction, Query
+
+MEANS = 4  # rows of a motion's output before its Jacobian: mean, velocity, acceleration, curvature
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,6 +29,8 @@ class CompiledQuery(Immutable):
     """A query's arrays for compiled loops. R centres, O outputs."""
 
     query: Query
+    rows: Array
+    """(R, I + O) of each centre, in the kernel's coordinates, and its weights."""
     along: Array
     """(R, I) the directions of the derivatives, in the kernel's coordinates, zero for a value; or
     (0, I), where all are values."""
@@ -42,9 +47,10 @@ class CompiledQuery(Immutable):
             return None
         solution = query.solution
         along = solution.functionals.along * query.stretch if query.derivatives else np.empty((0, len(query.stretch)))
+        rows = frozen(np.hstack([query.centres, query.weights]))
         if not isinstance(solution, Dense):
-            return cls(query, frozen(along), None, 0)
-        return cls(query, frozen(along), _packed(solution), solution.apart)
+            return cls(query, rows, frozen(along), None, 0)
+        return cls(query, rows, frozen(along), _packed(solution), solution.apart)
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -53,30 +59,13 @@ class CompiledQuery(Immutable):
         finite.
         """
         q = self.query
-        outputs, inputs = len(q.prior_mean), len(query)
-        mean, jacobian, curvature = np.empty(outputs), np.empty((outputs, inputs)), np.empty(outputs)
-        moved, pushed, values = np.empty(outputs), np.empty(outputs), np.empty(len(q.centres))
-        finite = _motion(
-            query,
-            velocity,
-            acceleration,
-            q.stretch,
-            q.scale,
-            q.centres,
-            self.along,
-            q.weights,
-            q.prior_mean,
-            values,
-            mean,
-            jacobian,
-            curvature,
-            moved,
-            pushed,
-        )
-        if not finite:
+        moving, values = np.empty((3, len(query))), np.empty(len(self.rows))
+        moving[0], moving[1], moving[2] = query, velocity, acceleration
+        out = np.empty((MEANS + len(query), len(q.prior_mean)))
+        if not _motion(moving, self.rows, self.along, q.stretch, q.scale, q.prior_mean, values, out):
             return None
         found = self.covariance(values) if covariance else None
-        return MotionPrediction(mean, moved, pushed, found, jacobian, curvature)
+        return MotionPrediction(out[0], out[1], out[2], found, out[MEANS:].reshape(-1, len(query)), out[3])
 
     def covariance(self, values: Array) -> Array:
         """As `Query.covariance`, but for rounding."""
@@ -98,41 +87,31 @@ def _packed(solution: Dense) -> Array:
 
 @compiled
 def _motion(
-    query: Array,
-    velocity: Array,
-    acceleration: Array,
-    stretch: Array,
-    scale: float,
-    centres: Array,
-    along: Array,
-    weights: Array,
-    prior: Array,
-    values: Array,
-    mean: Array,
-    jacobian: Array,
-    curvature: Array,
-    moved: Array,
-    pushed: Array,
+    moving: Array, rows: Array, along: Array, stretch: Array, scale: float, prior: Array, values: Array, out: Array
 ) -> bool:
     """Equation (8), and its first and second derivatives along the motion, from one pass over the
     centres, of which some may stand for derivatives; whether all is finite.
+
+    `moving` (3, I) is the query, its velocity and its acceleration; the kernel row goes into
+    `values` (R,); mean, velocity, acceleration, curvature and Jacobian into `out` (4 + I, O).
     """
-    inputs, outputs, derivatives = len(query), len(prior), len(along) > 0
-    offset, direction = np.empty(inputs), np.empty(inputs)
+    inputs, outputs, derivatives = len(stretch), len(prior), len(along) > 0
+    query, offset, direction = np.empty(inputs), np.empty(inputs), np.empty(inputs)
+    mean, moved, pushed, curvature = out[0], out[1], out[2], out[3]
+    jacobian = out[MEANS:].reshape(outputs, inputs)
     square = 0.0
     for i in range(inputs):
-        direction[i] = velocity[i] * stretch[i]
+        query[i] = moving[0, i] * stretch[i]
+        direction[i] = moving[1, i] * stretch[i]
         square += direction[i] * direction[i]
     mean[:] = prior
     jacobian[:] = 0.0
     curvature[:] = 0.0
-    for r in range(len(centres)):
-        distance = to_it = 0.0
+    for r in range(len(rows)):
+        value = kernel_value(query, rows[r], scale, offset)
+        to_it = 0.0
         for i in range(inputs):
-            offset[i] = query[i] * stretch[i] - centres[r, i]
-            distance += offset[i] * offset[i]
             to_it += offset[i] * direction[i]
-        value = math.exp(-scale * distance)
         slope = 2.0 * scale * to_it
         bend = value * (slope * slope - 2.0 * scale * square)
         if derivatives:
@@ -145,12 +124,12 @@ def _motion(
                 pull = 2.0 * scale * value
                 for o in range(outputs):
                     for i in range(inputs):
-                        jacobian[o, i] += pull * weights[r, o] * along[r, i]
+                        jacobian[o, i] += pull * rows[r, inputs + o] * along[r, i]
                 bend = 2.0 * scale * (away * bend - 2.0 * turn * slope * value)
                 value *= 2.0 * scale * away
         values[r] = value
         for o in range(outputs):
-            weight = weights[r, o]
+            weight = rows[r, inputs + o]
             mean[o] += value * weight
             curvature[o] += bend * weight
             pull = -2.0 * scale * value * weight
@@ -161,8 +140,8 @@ def _motion(
         moved[o], pushed[o] = 0.0, curvature[o]
         for i in range(inputs):
             jacobian[o, i] *= stretch[i]
-            moved[o] += jacobian[o, i] * velocity[i]
-            pushed[o] += jacobian[o, i] * acceleration[i]
+            moved[o] += jacobian[o, i] * moving[1, i]
+            pushed[o] += jacobian[o, i] * moving[2, i]
         total += mean[o] + moved[o] + pushed[o]
     return math.isfinite(total)
 

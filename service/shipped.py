@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from service.core.skill.skill import Skill
+    from service.learning.skill_file import StoredSkill
 
 SHIPPED_SKILL = "soldering.npz"
 
@@ -18,7 +18,7 @@ def recordings() -> Path:
     return next((folder for folder in folders if folder.is_dir()), folders[1])
 
 
-def shipped_skill() -> Skill:
+def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
     from service.learning.skill_file import decoded  # heavy, and most commands do without
 

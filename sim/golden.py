@@ -24,8 +24,7 @@ from service.contract import cdr
 from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, run
 from service.core.frame import Event, Frame, Tick, differences, order
-from service.core.skill.skill import Skill
-from service.learning.skill_file import SkillError, decoded
+from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
 from service.recording.mcap_file import RecordingError
 from service.recording.recording import Recorder, Recording
@@ -53,7 +52,7 @@ TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
 class Session:
     """The golden session: a bench in closed loop with all that happens to it, at its times."""
 
-    def __init__(self, bench: Bench, skill: Skill) -> None:
+    def __init__(self, bench: Bench, skill: StoredSkill) -> None:
         self._bench = bench
         self._adopted = {
             self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=TOLERANCE_M),
@@ -71,7 +70,7 @@ class Session:
         for tick in itertools.islice(self.loop.ticks(), self._tick(SECONDS)):
             events, k = list(tick.inbox), tick.index
             if k in self._adopted:
-                events.append(Event("skill", self._adopted[k].file, self._adopted[k]))
+                events.append(Event("skill", self._adopted[k].file, self._adopted[k].for_loop()))
             if k in self._orders:
                 events.append(order(self._orders[k]))
             if k % 1777 == 1776:
@@ -107,11 +106,16 @@ class Session:
 
 
 def record(
-    path: Path, settings: Settings, skill: Skill, source: Iterable[Tick], *, follow: Tap = lambda tick, frame: None
+    path: Path,
+    settings: Settings,
+    skill: StoredSkill,
+    source: Iterable[Tick],
+    *,
+    follow: Tap = lambda tick, frame: None,
 ) -> list[Frame]:
     """The frames of the core run on ticks, which are recorded and shown to `follow`."""
     frames: list[Frame] = []
-    controller = Controller(settings, skill, urdf=robot_description(settings))
+    controller = Controller(settings, skill.for_loop(), urdf=robot_description(settings))
     with Recorder(path, settings=settings, skill=skill.file, state=controller.state) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
@@ -124,7 +128,7 @@ def record(
     return frames
 
 
-def make(path: Path, skill: Skill) -> None:
+def make(path: Path, skill: StoredSkill) -> None:
     """Writes a new golden session."""
     settings, scene = Settings(), Scene()
     with Bench(HandScript(scene, seed=scene.seed), rate_hz=settings.rate_hz) as bench:

@@ -132,8 +132,7 @@ def learn(args: argparse.Namespace) -> int:
         raise ExplainedError(f"{args.output} is not written: {'; '.join(figures.unsafe)}")
     args.output.write_bytes(skill.file)
     print(
-        f"{args.output}: {len(skill.primitive.inputs)} reference points; it holds as far_from_demonstrations where "
-        f"{'a hand is farther off its places than' if skill.between else 'the prediction is less sure than'} "
-        f"{1000 * skill.threshold:.0f} mm"
+        f"{args.output}: {len(skill.model.primitive.inputs)} reference points; it holds as far_from_demonstrations "
+        f"where {skill.model.measure} is above {1000 * skill.threshold:.0f} mm"
     )
     return 0

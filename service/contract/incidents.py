@@ -59,8 +59,8 @@ class Evidence(NamedTuple):
     sources: Mapping[str, Source] = MappingProxyType({})
     contested: float = 0.0  # accepted share of samples that contradict the rest
     scatter_mm: float = 0.0  # accepted of a hand's samples
-    deviation_m: Excess | None = None  # from what the skill knows
-    between_places: bool = False  # that is a hand's distance; else the target's standard deviation
+    gate_m: Excess | None = None  # what the skill's threshold is for
+    measure: str = ""  # what that is, in words
     outside: Outside | None = None
     error_rad: Excess | None = None  # of a joint from its command, at the fault
     worst_joint: tuple[str, float] | None = None  # the one farthest from its command now [rad]
@@ -129,10 +129,9 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
         case Reason.FAR_FROM_DEMONSTRATIONS:
             about = "the skill is not sure where the tool belongs with the hands as they are"
             remedy = "bring the hands back to where it was demonstrated, or demonstrate this too"
-            if seen.deviation_m is not None:
-                value_cm, accepted_cm = (100 * value for value in seen.deviation_m)
-                what = "a hand is off its places by" if seen.between_places else "the target's standard deviation is"
-                found = f"{what} {value_cm:.1f} cm, {accepted_cm:.1f} accepted"
+            if seen.gate_m is not None:
+                value_cm, accepted_cm = (100 * value for value in seen.gate_m)
+                found = f"{seen.measure} is {value_cm:.1f} cm, {accepted_cm:.1f} accepted"
         case Reason.TWO_SOURCES:
             about = "a quarter of what came in the last second says that a hand, or the arm, is somewhere else; or "
             about += "a hand's samples scatter by more than 12 mm"

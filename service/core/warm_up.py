@@ -69,6 +69,6 @@ def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
 
 def _flat(skill: Skill, outputs: int) -> KMP:
     """A primitive of the skill's input that says 0 everywhere."""
-    inputs = skill.primitive.inputs[:1]
+    inputs = skill.model.primitive.inputs[:1]
     nothing = Gaussians(np.zeros((1, outputs)), np.eye(outputs)[None])
     return KMP.fit(inputs, nothing, kernel=GaussianKernel(1.0), lambda_mean=1.0)

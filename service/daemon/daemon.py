@@ -28,7 +28,6 @@ from service.core.frame import STAGES, Event, Frame, Tick, frame_layout, order, 
 from service.core.outputs import outgoing
 from service.core.record import blank
 from service.core.separation.separation import FARTHEST
-from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
 from service.daemon.cell_streams import CellStreams
@@ -50,7 +49,7 @@ from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import CellStatus
-from service.learning.skill_file import SkillError
+from service.learning.skill_file import SkillError, StoredSkill
 from service.recording.scribe import Scribe
 
 log = logging.getLogger("thirdhand")
@@ -73,8 +72,18 @@ class Daemon:
     """
 
     def __init__(
-        self, settings: Settings, skill: Skill, *, skill_worker: SkillWorker, skills: Path, scribe: Scribe, lock: Lock
+        self,
+        settings: Settings,
+        stored: StoredSkill,
+        *,
+        skill_worker: SkillWorker,
+        skills: Path,
+        scribe: Scribe,
+        lock: Lock,
     ) -> None:
+        skill = stored.for_loop()
+        # of the skill in force, and of one on its way into the loop
+        self._files: dict[bytes, bytes] = {stored.digest: stored.file}
         self._settings = settings
         self._scribe = scribe
         self._stop = threading.Event()
@@ -126,7 +135,7 @@ class Daemon:
         self._queryables = Queryables(
             self._session,
             settings,
-            skill,
+            stored,
             skill_worker=skill_worker,
             skills=skills,
             status=lambda: self._status,
@@ -162,7 +171,7 @@ class Daemon:
         """
         reporter: threading.Thread | None = None
         try:
-            self._scribe.start(skill=self._controller.skill.file, state=self._controller.state)
+            self._scribe.start(skill=self._file, state=self._controller.state)
             reporter = supervised_thread.start("status thread", self._report, self._fail)
             self._granted = ask_for_real_time()
             announce(self)
@@ -214,6 +223,8 @@ class Daemon:
             while self._queryables.inbox:
                 if (event := self._queryables.inbox.popleft().claimed(index)) is not None:
                     inbox.append(event)
+                    if event.kind == "skill":
+                        self._files = {self._controller.skill.digest: self._file, event.value.digest: event.payload}
             while self._faults:
                 inbox.append(self._faults.popleft())
             if self._stop.is_set():
@@ -258,7 +269,12 @@ class Daemon:
         timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
         self._lateness.add(late_us)
         self._work.add(work_us)
-        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._controller.skill.file)
+        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._file)
+
+    @property
+    def _file(self) -> bytes:
+        """The file of the skill in force."""
+        return self._files[self._controller.skill.digest]
 
     # --- beside the loop ---
 
@@ -310,7 +326,7 @@ class Daemon:
         )
 
 
-def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> Skill:
+def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> StoredSkill:
     """The skill in a file, with the via-points taught to it before. Raises SkillError."""
     skill, saved = skill_worker.load(path, timeout_s=SLOWEST_START_S), SavedViaPoints(settings)
     try:

@@ -30,14 +30,13 @@ from service.contract.requests import (
     encode_json,
 )
 from service.core.frame import Event, Frame, order
-from service.core.skill.skill import Skill
 from service.core.skill.workspace import is_reachable
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import outcome
-from service.learning.skill_file import SkillError
+from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
 
 ADOPTION_TIMEOUT_S = 2.0
@@ -119,7 +118,7 @@ class Queryables:
         self,
         session: zenoh.Session,
         settings: Settings,
-        skill: Skill,
+        skill: StoredSkill,
         *,
         skill_worker: SkillWorker,
         skills: Path,
@@ -232,11 +231,11 @@ class Queryables:
         self.inbox.append(pending)
         return pending.wait()
 
-    def _adopt(self, skill: Skill) -> Reply:
+    def _adopt(self, skill: StoredSkill) -> Reply:
         self._keep(skill.file)
         draft = self._saved.draft(skill)  # first: what cannot be saved is not taught
         try:
-            tick = self._through_the_loop(Event("skill", skill.file, skill))
+            tick = self._through_the_loop(Event("skill", skill.file, skill.for_loop()))
             draft.replace(self._saved.path(skill))
         finally:
             draft.unlink(missing_ok=True)

@@ -22,8 +22,7 @@ from typing import Any
 
 from service import child
 from service.contract.requests import ViaPoint
-from service.core.skill.skill import Skill
-from service.learning.skill_file import SkillError, decoded
+from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
 
 TIMEOUT_S = 8.0  # shorter than a client waits
@@ -39,13 +38,13 @@ class SkillWorker:
         self._busy = threading.Lock()
         self._child: child.Child | None = None
 
-    def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> Skill:
+    def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
         return self._ask(timeout_s, "load", path, None, 0.0)
 
     def adapt(
-        self, skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
-    ) -> Skill:
+        self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
+    ) -> StoredSkill:
         """The skill that goes through these via-points and no others.
 
         Raises SkillError, also after `timeout_s` [s].
@@ -66,7 +65,7 @@ class SkillWorker:
             self._child.process.wait()
             self._child = None
 
-    def _ask(self, timeout_s: float, *request: Any) -> Skill:
+    def _ask(self, timeout_s: float, *request: Any) -> StoredSkill:
         with self._busy:
             if self._child is None or self._child.process.poll() is not None:
                 self._end()
@@ -83,7 +82,7 @@ class SkillWorker:
             except (OSError, EOFError):
                 self._end()
                 raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
-        if isinstance(answer, Skill):
+        if isinstance(answer, StoredSkill):
             return answer
         raise SkillError(answer)
 
@@ -106,7 +105,7 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, tolerance: float) -> Skill:
+def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, tolerance: float) -> StoredSkill:
     if kind == "load":
         try:
             data = Path(source).read_bytes()
@@ -118,8 +117,7 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
     if via_points is not None:
         skill = adapted(skill, via_points, tolerance=tolerance)
     hands = skill.hands[0].reshape(2, 3)
-    skill.predict(hands, 0 * hands, 0 * hands)  # fills what is computed once
-    skill.digest  # noqa: B018
+    skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
     return skill
 
 
@@ -136,7 +134,7 @@ def _main(descriptor: int) -> None:
                 return
             buffers: list[pickle.PickleBuffer] = []
             try:
-                answer: Skill | str = _work(*request)
+                answer: StoredSkill | str = _work(*request)
             except Exception as error:  # any failure is an answer to the client
                 answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
             skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)

@@ -18,8 +18,8 @@ from service.core.frame import Frame
 from service.core.intake.plausibility import SCATTERED_M, SETTLED
 from service.core.record import Record
 from service.core.rotation import off_target
+from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
-from service.core.skill.skill import standard_deviations
 from service.daemon.input_monitor import KEYS, frames
 
 
@@ -88,8 +88,8 @@ class CellStatus(NamedTuple):
             sources=self.sources,
             contested=SETTLED,
             scatter_mm=1e3 * SCATTERED_M,
-            deviation_m=(float(self.frame["gate_m"]), skill.threshold),
-            between_places=skill.between is not None,
+            gate_m=(float(self.frame["gate_m"]), skill.threshold),
+            measure=skill.model.measure,
             outside=self._outside(),
             error_rad=(error_rad, settings.arm.fault_error_rad),
             worst_joint=(settings.joints.names[int(errors.argmax())], float(errors.max())),

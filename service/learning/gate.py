@@ -1,4 +1,5 @@
-"""The gate: the deviation above which hands are far from the demonstrations, and what it catches.
+"""The gate: above which value of `gate_m` hands are far from the demonstrations, and what it
+catches.
 
 Chosen between what held-out demonstrations reach and what planted nonsense reaches.
 """
@@ -10,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kmp import KMP, Gaussians
+from kmp import KMP
 from service.core.record import Vector
-from service.core.skill.skill import standard_deviations
+from service.core.skill.model import standard_deviations
 from service.learning.skill_file import HIGHEST_GATE_M
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
@@ -31,7 +32,7 @@ class Caught(NamedTuple):
 
 
 class Gate(NamedTuple):
-    """A threshold [m] on a prediction's deviation, and what it catches."""
+    """A threshold [m] on a prediction's `gate_m`, and what it catches."""
 
     threshold: float
     caught: Caught
@@ -45,11 +46,11 @@ def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float)
     `calibration`: by how much deviations are greater than errors; 1 where they were made alike. The
     ceiling holds for errors.
     """
-    wrong = [deviations(primitive.predict(x)) for x in nonsense(hands)]
-    return between(held_out, wrong, ceiling=min(CEILING_M * calibration, HIGHEST_GATE_M))
+    wrong = [standard_deviations(primitive.predict(x).covariance) for x in nonsense(hands)]
+    return gate_between(held_out, wrong, ceiling=min(CEILING_M * calibration, HIGHEST_GATE_M))
 
 
-def between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
+def gate_between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
     """The gate between what held-out demonstrations reach (T,) [m] and what each kind of planted
     nonsense does.
     """
@@ -70,8 +71,3 @@ def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
     both, one = np.hstack([ways, ways]), np.concatenate([np.hstack([ways, none]), np.hstack([none, ways])])
     moved = ((hands[:, None] + steps).reshape(-1, 6) for steps in (both, one))
     return (np.roll(hands, 3, axis=1), *moved)  # type: ignore[return-value]
-
-
-def deviations(predicted: Gaussians) -> Vector:
-    """Standard deviations (M,) [m] of M predictions, root mean square over the axes."""
-    return standard_deviations(predicted.covariance)

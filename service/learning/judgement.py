@@ -32,12 +32,12 @@ COVERAGE = ((30.0, 80.0), (88.0, 100.0))  # [%] beyond these a region is not wha
 
 class HeldOut(NamedTuple):
     """What the others' primitive predicts of a demonstration: errors (T, 3) [m], tool less mean,
-    covariances (T, 3, 3) [m²], and what the gate is for, `Skill.deviations` (T,) [m].
+    covariances (T, 3, 3) [m²], and what the gate compares (T,) [m], see `Model.measure`.
     """
 
     errors: Vector
     covariance: Vector
-    deviations: Vector
+    gate_m: Vector
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
@@ -147,7 +147,7 @@ def _row(name: str, one: HeldOut, threshold: float) -> Row:
         predicted_mm=1000 * float(np.sqrt(np.trace(one.covariance, axis1=1, axis2=2).mean())),
         within_50=100 * float((distances <= REGIONS[0]).mean()),
         within_95=100 * float((distances <= REGIONS[1]).mean()),
-        held=100 * float((one.deviations > threshold).mean()),
+        held=100 * float((one.gate_m > threshold).mean()),
     )
 
 

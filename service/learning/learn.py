@@ -16,15 +16,16 @@ import numpy as np
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
 from service.core.record import Vector
-from service.core.skill.places import Task
-from service.core.skill.skill import LearnedBetween, Skill
-from service.learning.between import Told, learned, places_never_reached, task_of
+from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.model import standard_deviations
+from service.core.skill.task import Task
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
-from service.learning.gate import deviations, gate
+from service.learning.gate import gate
 from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.pose import learned_pose
-from service.learning.skill_file import SkillError, with_file
+from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
 ELL, PENALTY = 5.0, 2.0  # of the paper's way, in metres
@@ -35,7 +36,7 @@ class Evidence(NamedTuple):
     the others' primitive predicts of it.
     """
 
-    skill: Skill
+    skill: StoredSkill
     figures: Figures
     paths: Sequence[tuple[Vector, Vector]]
     held_out: Sequence[HeldOut]
@@ -59,7 +60,7 @@ def learn(
     reach: Reach | None = None,
     progress: Callable[[str], None] = lambda line: None,
     show: Callable[[Evidence], None] = lambda evidence: None,
-) -> Skill:
+) -> StoredSkill:
     """The skill of some demonstrations, with its figures.
 
     `ell` [1/m²] not given is chosen. With `components` a mixture of so many makes the reference,
@@ -88,12 +89,11 @@ def learn(
     task = task_of(demonstrations) if components is None and ell is None else ""
     if isinstance(task, str):
         remarks += [task] if task else []
-    by_places: LearnedBetween | None = None
     try:
         if isinstance(task, Task):
-            remarks += places_never_reached(task, demonstrations, names)
-            progress(f"learning between the places {', '.join(task.names)}")
-            primitive, by_places, held_out, found = learned(task, demonstrations, paths, progress)
+            remarks += via_points_never_reached(task, demonstrations, names)
+            progress(f"learning between the via-points {', '.join(task.names)}")
+            found = learned(task, demonstrations, paths, progress)
         else:
             if components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
@@ -108,29 +108,21 @@ def learn(
                     spread_m=spread_m,
                     seed=seed,
                 )
-            progress(f"learning from all {len(paths)}")
-            primitive = fit(range(len(paths)))
-            held_out = list(_held_out(paths, fit, progress))
-            found = gate(
-                primitive,
-                np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in paths]),
-                np.concatenate([one.deviations for one in held_out]),
-                calibration=_calibration(held_out) if components else 1.0,
-            )
+            found = _learned(paths, fit, progress, calibrated=bool(components))
         posed = learned_pose(
-            _inputs(by_places, demonstrations, paths),
+            found.inputs,
             [hands for hands, _ in paths],
             [pairs[i][1][:, 3:] for i in kept],
             closures,
             names,
             points=points,
-            between_places=by_places is not None,
+            gripper_ell=found.model.gripper_ell,
         )
     except ValueError as error:
         if isinstance(error, SkillError):
             raise SkillError(f"{error}{left_out}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
-    judged = figures(demonstrations, paths, names, held_out, found, reach=reach or Reach(), remarks=remarks)
+    judged = figures(demonstrations, paths, names, found.held_out, found.gate, reach=reach or Reach(), remarks=remarks)
     judged = msgspec.structs.replace(
         judged,
         orientation_error_deg=posed.turn_error_deg,
@@ -139,21 +131,20 @@ def learn(
         unsafe=(*judged.unsafe, *posed.unsafe),
     )
     tools = np.concatenate([pairs[i][1] for i in kept])
-    skill = Skill(
+    skill = StoredSkill(
         name=name,
-        primitive=primitive,
+        model=found.model,
         orientation=posed.orientation,
         turn=posed.turn,
         gripper=posed.gripper,
         workspace=np.stack([tools[:, :3].min(axis=0) - MARGIN_M, tools[:, :3].max(axis=0) + MARGIN_M]),
-        threshold=found.threshold,
+        threshold=found.gate.threshold,
         learned_from=fingerprint(demonstrations),
         components=components or 0,
-        between=by_places,
         figures=msgspec.json.encode(judged).decode(),
     )
     skill = with_file(skill)
-    show(Evidence(skill, judged, paths, held_out))
+    show(Evidence(skill, judged, paths, found.held_out))
     return skill
 
 
@@ -170,15 +161,20 @@ def _of_each(
     return out
 
 
-def _inputs(
-    by_places: LearnedBetween | None,
-    demonstrations: Sequence[Demonstration],
-    paths: Sequence[tuple[Vector, Vector]],
-) -> list[Vector]:
-    """The inputs (T, I) of the position's primitive along demonstrations in phase."""
-    if by_places is None:
-        return [hands for hands, _ in paths]
-    return [Told.of(by_places.task, one, *path).inputs for one, path in zip(demonstrations, paths, strict=True)]
+def _learned(
+    paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callable[[str], None], *, calibrated: bool
+) -> Learned:
+    """What demonstrations tell where they name no via-points."""
+    progress(f"learning from all {len(paths)}")
+    primitive, hands = fit(range(len(paths))), [hands for hands, _ in paths]
+    held_out = list(_held_out(paths, fit, progress))
+    found = gate(
+        primitive,
+        np.concatenate([some[:: max(1, len(some) // 50)] for some in hands]),
+        np.concatenate([one.gate_m for one in held_out]),
+        calibration=_calibration(held_out) if calibrated else 1.0,
+    )
+    return Learned(HandsKMP(primitive), held_out, found, hands)
 
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
@@ -225,11 +221,11 @@ def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callab
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
         primitive = fit([i for i in range(len(paths)) if i != h] or [h])
         predicted = primitive.predict(hands)
-        yield HeldOut(tool - predicted.mean, predicted.covariance, deviations(predicted))
+        yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
 
 
 def _calibration(held_out: Sequence[HeldOut]) -> float:
     """By how much predicted deviations are greater than errors, at least 1."""
     errors = np.concatenate([one.errors for one in held_out])
-    predicted = np.concatenate([one.deviations for one in held_out])
+    predicted = np.concatenate([one.gate_m for one in held_out])
     return max(1.0, float(np.sqrt((predicted**2).mean() / max(float((errors**2).mean()), 1e-12))))

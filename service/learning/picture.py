@@ -38,7 +38,7 @@ def draw(evidence: Evidence, path: Path) -> None:
 
     grid = np.linspace(0.0, 1.0, 200)
     lengths = np.array([_along(np.linalg.norm(one.errors, axis=1), grid) for one in held_out])
-    expected = np.array([_along(np.sqrt(3.0) * one.deviations, grid) for one in held_out])
+    expected = np.array([_along(np.sqrt(3.0) * one.gate_m, grid) for one in held_out])
     errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
     errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
     errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square")
@@ -55,18 +55,18 @@ def draw(evidence: Evidence, path: Path) -> None:
     regions.legend(frameon=False)
 
     hands = np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in evidence.paths])
-    shown = {"held-out demonstrations": (np.concatenate([one.deviations for one in held_out]), OFF)}
+    shown = {"held-out demonstrations": (np.concatenate([one.gate_m for one in held_out]), OFF)}
     for name, colour, wrong in zip(
         ("hands swapped", "both 30 cm beside", "one 30 cm beside"),
         NONSENSE,
         nonsense(hands),
         strict=True,
     ):
-        shown[name] = skill.deviations(wrong), colour
+        shown[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
     gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
-    gate.set(title="deviation: what is held lies to the right of the gate", xlabel="[mm]", ylabel="of the samples [%]")
+    gate.set(title=f"{skill.model.measure}: what is held lies to the right", xlabel="[mm]", ylabel="of the samples [%]")
     gate.set(xscale="log", ylim=(0, 100))
     gate.legend(frameon=False, fontsize=8)
 

@@ -28,11 +28,7 @@ COMPARED = 100  # samples of a demonstration, of which each is compared with eac
 NOTED, UNSAFE = 0.01, 0.10  # shares of the samples that contradict others
 NOTED_DEG = 15.0  # error of demonstrations that were held out
 ALONE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # of a single demonstration, which tells nothing of others
-# The gripper's is short, 2 cm, as it opens and closes where the hands arrive; off all data it is
-# undecided and stays as it is.
-GRIPPER_ELL = 1000.0  # [1/m²]
-GRIPPER_ELL_BETWEEN = 60.0  # the same of a skill between places, whose inputs are shares
-UNDECIDED = 0.5
+UNDECIDED = 0.5  # closure off all data, where a gripper stays as it is
 POINT_NOISE = 0.1  # a point's variance over the kernel's
 DEVIATION = 0.2  # [rad, half the angle], or of the closure
 GRIPPER_WRONG = 0.15  # share of the held-out time that is noted
@@ -58,7 +54,7 @@ def learned_pose(
     names: Sequence[str],
     *,
     points: int,
-    between_places: bool = False,
+    gripper_ell: float,
 ) -> Posed:
     """What demonstrations with these inputs (T, I) of the position's primitive, hands (T, 6) [m],
     orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell.
@@ -66,9 +62,7 @@ def learned_pose(
     mean = mean_orientation(np.concatenate(quaternions))
     turn, turn_error = _learned_turn(mean, inputs, quaternions, points)
     turn_warnings, unsafe = ((), ()) if turn is None else _verdicts(turn_error, *_ambiguity(hands, quaternions, names))
-    gripper, right, gripper_warnings = _learned_gripper(
-        inputs, closures, names, points=points, ell=GRIPPER_ELL_BETWEEN if between_places else GRIPPER_ELL
-    )
+    gripper, right, gripper_warnings = _learned_gripper(inputs, closures, names, points=points, ell=gripper_ell)
     return Posed(mean, turn, gripper, turn_error, right, (*turn_warnings, *gripper_warnings), unsafe)
 
 
@@ -79,11 +73,10 @@ def flat_orientation(skill_inputs: Vector, kernel: Kernel, orientation: Vector) 
     return LearnedOrientation(_fitted(inputs, zeta, kernel, np.zeros(3)), np.asarray(orientation, np.float64))
 
 
-def flat_gripper(skill_inputs: Vector, *, between_places: bool) -> LearnedGripper:
+def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
     """A gripper that is undecided everywhere, to be taught places."""
     prior = np.array([UNDECIDED])
-    kernel = GaussianKernel(GRIPPER_ELL_BETWEEN if between_places else GRIPPER_ELL)
-    return LearnedGripper(_fitted(skill_inputs[:1], prior[None], kernel, prior))
+    return LearnedGripper(_fitted(skill_inputs[:1], prior[None], GaussianKernel(ell), prior))
 
 
 def is_flat(primitive: KMP) -> bool:

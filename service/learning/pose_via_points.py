@@ -38,7 +38,8 @@ def turn_through(
     if not told:
         return None if base is None or is_flat(base.primitive) else base
     if base is None:
-        base = flat_orientation(skill.primitive.base.inputs, skill.primitive.base.kernel, skill.orientation)
+        learned = skill.model.primitive.base
+        base = flat_orientation(learned.inputs, learned.kernel, skill.orientation)
     at, quaternions = inputs[list(told)], np.array(list(told.values()))
     quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
     now = OrientationKMP(base.primitive, base.auxiliary).mean(at)
@@ -55,7 +56,7 @@ def gripper_through(
     base = skill.gripper.primitive.base if skill.gripper else None
     if not told:
         return None if base is None or is_flat(base) else LearnedGripper(base)
-    base = base or flat_gripper(skill.primitive.base.inputs, between_places=skill.between is not None).primitive
+    base = base or flat_gripper(skill.model.primitive.base.inputs, ell=skill.model.gripper_ell).primitive
     closures = np.array(list(told.values()))[:, None]
     return LearnedGripper(_through(base, inputs[list(told)], closures, STD_CLOSURE, tolerance))
 
@@ -81,7 +82,7 @@ def missed_by_rad(skill: Skill, point: ViaPoint) -> float | None:
     """The angle by which the skill misses the orientation of a via-point."""
     if point.orientation is None or skill.turn is None:
         return None
-    at = skill.inputs(np.array([[*point.left, *point.right]]))
+    at = skill.model.inputs(np.array([[*point.left, *point.right]]))
     x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(at)[0].tolist()
     return _angle(point.orientation, (x, y, z, w))
 

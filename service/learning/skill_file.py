@@ -8,11 +8,12 @@ motion is never handed out.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import msgspec
@@ -22,21 +23,16 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
-from service.contract.requests import Name, ViaPoint
-from service.core.skill.places import MOST_CORNERS, Places, Task
+from service.contract.requests import ViaPoint
+from service.core.skill.model import FARTHEST_M, Model
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
-from service.core.skill.skill import LearnedBetween, Skill
+from service.core.skill.skill import MODELS, Skill
 
-# The second holds what was found in learning, the third is of a skill between places, the fourth
-# has orientation or gripper, and may be one between places; a skill of the first stays one, to the
-# byte.
-PLAIN, JUDGED, BETWEEN, POSED = FORMATS = (1, 2, 3, 4)
-INPUTS, OUTPUTS = 6, 3
-MOST_PLACES = 100
+POSED = 4  # the format of a skill that has orientation or gripper; of others it is the model's
+FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
 TURN, GRIPPER = "turn.", "gripper."  # before the names of their primitives' arrays
 LARGEST_FILE = 100_000_000  # bytes, unpacked
 MOST_POINTS = 2500  # of the reference: a tick takes as long
-FARTHEST_M = 10.0  # of anything from the base plate
 HIGHEST_GATE_M = 1.0  # a skill that is as unsure as that is not followed
 LONGEST_TEXT = 200  # letters
 LONGEST_FIGURES = 1_000_000
@@ -55,19 +51,12 @@ RANGES = {  # of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-RANGES_BETWEEN = {  # of those that a skill between places has besides
-    "corners": (0, MOST_CORNERS - 1, ""),
-    "shares": (-1, MOST_CORNERS * 2 - 1, ""),
-    "follow": (-1, 1, ""),
-    "nominal": (-FARTHEST_M, FARTHEST_M, "m"),
-    "seen": (-0.001, 1.001, ""),
-    "errors": (-FARTHEST_M, FARTHEST_M, "m"),
-}
+ALL_RANGES = RANGES | {name: found for model in MODELS for name, found in model.ranges.items()}
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
 KNOWN = {
-    *RANGES,
+    *ALL_RANGES,
     "format",
     "units",
     "name",
@@ -77,15 +66,9 @@ KNOWN = {
     "figures",
     "checksum",
     "names",
-    *RANGES_BETWEEN,
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
     TURN + "auxiliary",
 }
-UNITS = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
-UNITS_BETWEEN = (
-    "inputs: shares of the left hand's places, of the right hand's; outputs: the tool's shares of all named places but "
-    "the first, deviation x y z [m]; frame base"
-)
 MARGIN_M = 0.25  # by which a skill may leave its box where it was learned: targets are held in it
 STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'; also of its turn [rad/m], half the angle
 FARTHEST_TURN = 2.0 * np.pi  # [rad, half the angle] of an orientation from the auxiliary one; also of a closure
@@ -95,14 +78,24 @@ class SkillError(ExplainedError, ValueError):
     """A skill that cannot be read, learned or adapted."""
 
 
-def with_file(skill: Skill) -> Skill:
+@dataclass(frozen=True, eq=False)
+class StoredSkill(Skill):
+    """A skill beside which is what the loop has no use for."""
+
+    figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
+    file: bytes = field(default=b"", repr=False)  # all of it, as it is stored and recorded
+
+    def for_loop(self) -> Skill:
+        """The skill alone."""
+        return Skill(**{part.name: getattr(self, part.name) for part in fields(Skill)})
+
+
+def with_file(skill: StoredSkill) -> StoredSkill:
     """A copy of the skill that holds the bytes of its file, made anew."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
-        format=np.array(
-            POSED if skill.turn or skill.gripper else BETWEEN if skill.between else JUDGED if skill.figures else PLAIN
-        ),
-        units=np.array(UNITS_BETWEEN if skill.between else UNITS),
+        format=np.array(POSED if skill.turn or skill.gripper else skill.model.formats[-1 if skill.figures else 0]),
+        units=np.array(skill.model.units),
         name=np.array(skill.name),
         orientation=skill.orientation,
         box=skill.workspace,
@@ -111,31 +104,25 @@ def with_file(skill: Skill) -> Skill:
         components=np.array(skill.components),
         places=np.array(msgspec.json.encode(skill.via_points).decode()),
         tolerance=np.array(skill.tolerance),
-        **skill.primitive.to_arrays(),
+        **skill.model.primitive.to_arrays(),
     )
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
-    if skill.between:
-        task, nominal, seen, errors = skill.between
-        arrays |= {
-            "names": np.array(msgspec.json.encode(task.names).decode()),
-            "corners": task.corners,
-            "shares": task.inputs,
-            "follow": task.follow,
-            "nominal": nominal.at,
-            "seen": seen,
-            "errors": errors,
-        }
+    arrays |= skill.model.own_arrays()
     if skill.turn:
         arrays |= {TURN + name: array for name, array in skill.turn.primitive.to_arrays().items()}
         arrays[TURN + "auxiliary"] = skill.turn.auxiliary
     if skill.gripper:
         arrays |= {GRIPPER + name: array for name, array in skill.gripper.primitive.to_arrays().items()}
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
-    return replace(skill, file=out.getvalue())
+    return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
 
 
-def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
+def _digest(file: bytes) -> bytes:
+    return hashlib.blake2b(file, digest_size=16).digest()
+
+
+def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError.
 
     One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
@@ -154,25 +141,26 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> Skill:
             arrays = dict(archive)
         if (kind := arrays["format"].item()) not in FORMATS:
             raise SkillError(
-                f"{origin}: skill of format {kind}, {PLAIN} to {POSED} needed: written by a later version?"
+                f"{origin}: skill of format {kind}, {min(FORMATS)} to {POSED} needed: written by a later version?"
             )
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
-        skill = Skill(
+        model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
+        skill = StoredSkill(
             name=str(arrays["name"]),
-            primitive=KMP.from_arrays(arrays),
+            model=model.from_arrays(arrays, via_points),
             orientation=arrays["orientation"],
             workspace=arrays["box"],
             threshold=float(arrays["threshold"]),
             learned_from=str(arrays["learned_from"]),
             components=int(arrays["components"]),
-            via_points=msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...]),
+            via_points=via_points,
             tolerance=float(arrays["tolerance"]),
             turn=_turn(_part(arrays, TURN)),
             gripper=_gripper(_part(arrays, GRIPPER)),
-            between=_between(arrays) if _is_between(arrays) else None,
-            figures=str(arrays["figures"]) if kind in {JUDGED, BETWEEN} or "figures" in arrays else "",
+            figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
+            digest=_digest(data),
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
@@ -192,10 +180,11 @@ def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
-def _is_between(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    """Whether it is a skill between places."""
+def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
+    """Of what kind the skill's model is: by its format or, where that is of any, by its arrays."""
     kind = arrays["format"].item()
-    return bool(kind == BETWEEN or (kind == POSED and "corners" in arrays))
+    own = [model for model in MODELS if model.ranges.keys() & arrays.keys() and kind == POSED]
+    return next((model for model in MODELS if kind in model.formats), (*own, MODELS[0])[0])
 
 
 def _turn(arrays: Mapping[str, NDArray[Any]]) -> LearnedOrientation | None:
@@ -210,7 +199,7 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     """What in the arrays is not what was written, or not what any skill has."""
     for name in sorted(set(arrays) - KNOWN):  # what kmp can hold besides, and the loop was never tried with
         yield f"an array {name!r}, which no skill has"
-    yield from _beyond(arrays, RANGES | RANGES_BETWEEN if _is_between(arrays) else RANGES, "")
+    yield from _beyond(arrays, [*RANGES, *_model(arrays).ranges], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
             yield from _beyond(part, RANGES.keys() & part.keys(), prefix)
@@ -233,7 +222,7 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
     """Which arrays hold what is in no range."""
     for name in names:
-        array, (low, high, unit) = arrays[name], (RANGES | RANGES_BETWEEN)[name]
+        array, (low, high, unit) = arrays[name], ALL_RANGES[name]
         if array.dtype.kind not in "iuf":
             yield f"{prefix}{name} has numbers of type {array.dtype}, real ones needed"
         elif array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
@@ -249,40 +238,10 @@ def _is_json(array: NDArray[Any]) -> bool:
     return array.dtype.kind == "U" and len(str(array)) <= LONGEST_FIGURES
 
 
-def _between(arrays: Mapping[str, NDArray[Any]]) -> LearnedBetween:
-    """What belongs to a skill between places. Raises ValueError where its arrays do not fit."""
-    names = msgspec.json.decode(str(arrays["names"]), type=tuple[Name, ...])
-    count, width = len(names), int(arrays["shares"].max()) + 1
-    shapes = {
-        "corners": (count, 2),
-        "shares": (2, MOST_CORNERS),
-        "follow": (count,),
-        "nominal": (count, 9),
-        "seen": (len(arrays["errors"]), width),
-        "errors": (len(arrays["seen"]), 3),
-    }
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape or not shape[0]:
-            raise ValueError(f"{name} has shape {arrays[name].shape}, {shape} needed")
-    if not 2 <= count <= MOST_PLACES or len(set(names)) < count:
-        raise ValueError(f"places {', '.join(names)}: 2 to {MOST_PLACES} different names needed")
-    corners, shares = (np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "shares"))
-    for side in (0, 1):
-        has = int((shares[side] >= 0).sum())
-        if not has or (shares[side, :has] < 0).any() or not np.array_equal(np.unique(corners[:, side]), np.arange(has)):
-            raise ValueError(f"the hands' places {corners.tolist()} and inputs {shares.tolist()} do not fit each other")
-    if not np.array_equal(np.unique(shares[shares >= 0]), np.arange(width)):
-        raise ValueError(f"the inputs {shares.tolist()} are not numbered through")
-    task = Task(names, corners, shares, np.ascontiguousarray(arrays["follow"], np.int64))
-    return LearnedBetween(task, Places(names, arrays["nominal"]), arrays["seen"], arrays["errors"])
-
-
 def _faults(skill: Skill) -> Iterator[str]:
     """What in the file would harm the motion."""
-    inputs, outputs = skill.primitive.inputs.shape[1], skill.primitive.outputs
-    needed = (INPUTS, OUTPUTS)
-    if skill.between:
-        needed = (skill.between.task.width, len(skill.between.task.names) + OUTPUTS - 1)
+    primitive, needed = skill.model.primitive, skill.model.shape
+    inputs, outputs = primitive.inputs.shape[1], primitive.outputs
     if (inputs, outputs) != needed:
         yield f"{inputs} inputs and {outputs} outputs, {needed[0]} and {needed[1]} needed"
         return
@@ -302,7 +261,7 @@ def _faults(skill: Skill) -> Iterator[str]:
 
 def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
     """What is wrong with a primitive beside the position's, where it was learned and taught."""
-    wanted, given = (skill.primitive.inputs.shape[1], outputs), (primitive.inputs.shape[1], primitive.outputs)
+    wanted, given = (skill.model.shape[0], outputs), (primitive.inputs.shape[1], primitive.outputs)
     if given != wanted:
         yield f"{name} has {given[0]} inputs and {given[1]} outputs, {wanted[0]} and {wanted[1]} needed"
         return
@@ -317,9 +276,8 @@ def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> I
 
 def _tried(skill: Skill) -> Iterator[str]:
     """What the skill does wrong where it was learned and taught: its weights are not its own."""
-    both = dict.fromkeys((replace(skill, primitive=skill.primitive.base), skill)) if not skill.between else [skill]
     with np.errstate(all="ignore"):
-        tried = [(one.hands, one.mean(one.hands)) for one in both]
+        tried = [(one.hands, one.mean(one.hands)) for one in (skill.model.unadapted(), skill.model)]
     low, high = skill.workspace
     for where, found in tried:
         beyond = np.maximum(np.maximum(low - found, found - high), 0.0).max(axis=1)
@@ -329,7 +287,8 @@ def _tried(skill: Skill) -> Iterator[str]:
                 f"with the hands at {np.round(where[worst], 3).tolist()}, where it was learned, the tool is at "
                 f"{found[worst].tolist()}; its box and {MARGIN_M} m around it accepted"
             )
-    for place in skill.primitive.inputs[:: max(1, len(skill.primitive.inputs) // 5)]:
-        steep = float(np.linalg.norm(skill.primitive.jacobian(place)))
+    primitive = skill.model.primitive
+    for at in primitive.inputs[:: max(1, len(primitive.inputs) // 5)]:
+        steep = float(np.linalg.norm(primitive.jacobian(at)))
         if not steep <= STEEPEST:
-            yield f"with the hands at {np.round(place, 3).tolist()} the tool moves {steep:g} times as far as they do"
+            yield f"with the hands at {np.round(at, 3).tolist()} the tool moves {steep:g} times as far as they do"

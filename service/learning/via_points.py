@@ -12,20 +12,20 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from kmp import Gaussians, ViaPointMissed
+from kmp import ViaPointMissed
 from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
-from service.learning.skill_file import SkillError, with_file
+from service.learning.skill_file import SkillError, StoredSkill, with_file
 
 STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
 
 
-def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -> Skill:
+def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
     """A new skill that goes through these via-points and no others. Raises SkillError.
 
     Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
@@ -43,10 +43,8 @@ def adapted(skill: Skill, via_points: Sequence[ViaPoint], *, tolerance: float) -
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
-            if skill.between is None:
-                desired = Gaussians(outputs, _weight(skill) * deviations[:, None, None] ** 2 * np.eye(3))
-                skill = replace(skill, primitive=skill.primitive.base.adapt(inputs, desired, tolerance=tolerance))
-            at = skill.inputs(inputs)
+            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=_weight(skill)))
+            at = skill.model.inputs(inputs)
             turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
@@ -59,7 +57,7 @@ def _weight(skill: Skill) -> float:
     The covariance of IJRR 2019 is N times that of a point that stands alone. Where the reference
     was scaled to that, so that predicted deviations are true, a via-point's must be too.
     """
-    return 1.0 if skill.components else 1.0 / len(skill.primitive.base.inputs)
+    return 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
 
 
 def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:

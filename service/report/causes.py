@@ -42,8 +42,8 @@ def _by_frame(columns: Columns, row: int) -> Incident:
     skill = next((one.skill for one in reversed(columns.skills) if one.tick <= tick), None)
     seen = Evidence(
         sources=sources,
-        deviation_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
-        between_places=skill is not None and skill.between is not None,
+        gate_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
+        measure="" if skill is None else skill.model.measure,
         failure=next((one.text for one in reversed(columns.orders) if one.kind == "fault" and one.tick <= tick), ""),
     )
     return explained(Reason(int(frame["reason"])), seen)

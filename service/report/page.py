@@ -106,9 +106,9 @@ def _over_time(report: Report) -> Figure:
     following = frames["mode"] == Mode.FOLLOW
     lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
     _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
-    between = any(skill.between is not None for _, skill in report.columns.skills)
-    look = (OFF, "hands off what is known") if between else (TARGET, "the target's deviation")
-    _curve(errors, times, np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan), *look)
+    measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
+    gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
+    _curve(errors, times, gate_m, OFF, " / ".join(measures))
     errors.set(ylabel="[mm]", yscale="log")
 
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):

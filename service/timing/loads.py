@@ -160,9 +160,8 @@ def _status(client: Client, session: Any) -> None:
 def _teaching(client: Client, session: Any) -> None:
     """Teaches one via-point over and over, alternating by a millimetre."""
     skill = shipped_skill()
-    primitive = skill.primitive
-    x = primitive.inputs[0].tolist()
-    left, right, tool = tuple(x[:3]), tuple(x[3:]), primitive.reference.mean[0].tolist()
+    x, tool = skill.hands[0].tolist(), skill.mean(skill.hands[:1])[0].tolist()
+    left, right = tuple(x[:3]), tuple(x[3:])
     _asked(TEACHING_HZ, lambda k: client.add([ViaPoint("here", left, right, (*tool[:2], tool[2] + 0.001 * (k % 2)))]))
 
 
@@ -278,19 +277,21 @@ def until_following(client: Client) -> None:
 def large_skill() -> bytes:
     """The file of a skill of many points: the shipped one's over and over, a little beside."""
     skill = shipped_skill()
-    inputs, reference = skill.primitive.inputs, skill.primitive.reference
+    model: Any = skill.model  # whichever it is
+    inputs, reference = model.primitive.inputs, model.primitive.reference
     pick = np.arange(LARGE) % len(inputs)
     beside = np.random.default_rng(0).normal(scale=0.01, size=(LARGE, inputs.shape[1]))
     moved = inputs[pick] + beside
     primitive = KMP.fit(
         moved,
-        Gaussians(skill.primitive.mean(moved), reference.covariance[pick]),
+        Gaussians(model.primitive.mean(moved), reference.covariance[pick]),
         kernel=GaussianKernel(5.0),
         rank_tolerance=1e-6,
-        lambda_mean=skill.primitive.lambda_mean,
-        prior_mean=skill.primitive.prior_mean,
+        lambda_mean=model.primitive.lambda_mean,
+        prior_mean=model.primitive.prior_mean,
     )
-    return with_file(replace(skill, name=LARGE_SKILL, primitive=primitive, via_points=())).file
+    large = replace(model, primitive=primitive)
+    return with_file(replace(skill, name=LARGE_SKILL, model=large, via_points=())).file
 
 
 @contextlib.contextmanager

@@ -20,8 +20,8 @@ from service.core.rotation import off_target
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import FARTHEST
+from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
-from service.core.skill.skill import standard_deviations
 from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import ArmModels

@@ -17,7 +17,7 @@ import numpy as np
 from service.contract.requests import TOLERANCE_M
 from service.core.skill.skill import Skill
 from service.learning.learn import learn
-from service.learning.skill_file import SkillError
+from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import adapted
 from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
@@ -34,7 +34,7 @@ SCENES = 40
 class Variant(NamedTuple):
     """A skill as learned, and whether a place is one point (the paper) or a neighbourhood."""
 
-    skill: Skill
+    skill: StoredSkill
     bare: bool
 
 

@@ -13,6 +13,7 @@ from service.contract.requests import TOLERANCE_M
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
+from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from sim.experiments.beside_the_paper import at_the_events
 from sim.experiments.open_loop import targets
@@ -87,7 +88,7 @@ def _floor_mm(known: list[Demonstration], held_out: list[Demonstration]) -> floa
     return float(1000 * np.sqrt(np.mean([np.sum((one.tool[:, :3] - mean) ** 2, axis=1) for one in held_out])))
 
 
-def _events_mm(skill: Skill, number: int) -> Array:
+def _events_mm(skill: StoredSkill, number: int) -> Array:
     """Of the skill taught the places of a random scene: how far its target is at each event (3,),
     hands off by 8 mm per axis.
     """

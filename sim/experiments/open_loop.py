@@ -19,9 +19,11 @@ from service.config import Settings, robot_description
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.intake.stillness import STILL
+from service.core.record import Record
+from service.core.skill.barycentric import STEP_S
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Known, Prediction, Skill
-from service.core.skill.task_parameterized import CALM_MPS, LARGEST_MPS2, STEP_S
+from service.core.skill.task_instance import CALM_MPS, MAX_MPS2
 from service.core.skill.workspace import clamp
 from sim.experiments.results import Array
 
@@ -61,7 +63,7 @@ def along_hands(law: Law, hands: Array, velocities: Array, accelerations: Array)
 def differences(behind: Array, now: Array, ahead: Array) -> Array:
     """Positions (..., 3) [m] that are STEP_S apart as the middle one's motion (..., 3, 3)."""
     acceleration = (ahead - 2.0 * now + behind) / STEP_S**2
-    motion = [now, (ahead - behind) / (2.0 * STEP_S), np.clip(acceleration, -LARGEST_MPS2, LARGEST_MPS2)]
+    motion = [now, (ahead - behind) / (2.0 * STEP_S), np.clip(acceleration, -MAX_MPS2, MAX_MPS2)]
     return np.stack(motion, axis=-2)
 
 
@@ -88,22 +90,23 @@ class Rival(Skill):
         hands: Array,
         velocities: Array,
         accelerations: Array,
-        rest: Array = STILL,
+        stillness: Array = STILL,
         *,
         before: Known | None = None,
+        memory: Record | None = None,
     ) -> Prediction:
-        """The law's tool, rounded as the service does; the deviation is 1 where hands are far."""
+        """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
         said = self.says(hands.reshape(6), velocities.reshape(6), accelerations.reshape(6))
         position, velocity, acceleration = np.round(said.motion, 6)
-        turn, deviation = self.constant_turn, float(said.far)
-        return Prediction(position, velocity, acceleration, said.covariance, deviation, turn, NO_GRIPPER)
+        turn, gate_m = self.constant_turn, float(said.far)
+        return Prediction(position, velocity, acceleration, said.covariance, gate_m, turn, NO_GRIPPER)
 
 
 def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:
     """The skill with another law, and what else is changed."""
-    own = {one.name: getattr(skill, one.name) for one in fields(skill)}
+    own = {one.name: getattr(skill, one.name) for one in fields(Skill)}
     # its digest is of its name: nothing is recorded that would need the rest
-    return Rival(**{**own, "name": "rival", "threshold": 0.5, "file": b"rival", **changed}, says=says)
+    return Rival(**{**own, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed}, says=says)
 
 
 def by_law(skill: Skill, law: Law) -> Skill:

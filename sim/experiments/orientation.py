@@ -15,8 +15,8 @@ import rerun as rr
 
 from kmp.orientation import exp, log, multiplied
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.skill.skill import Skill
 from service.learning.learn import learn
+from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from service.shipped import shipped_skill
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
@@ -73,7 +73,7 @@ def facing(scene: Scene) -> Array:
     return multiplied(turn / np.linalg.norm(turn), np.array(TOOL_ORIENTATION))
 
 
-def learn_turning() -> Skill:
+def learn_turning() -> StoredSkill:
     """The skill of five demonstrations in which the tool turns to the eyes on the way from the
     glass to the board.
     """

@@ -19,10 +19,11 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
+from service.core.skill.barycentric import STEP_S
 from service.core.skill.skill import Skill
-from service.core.skill.task_parameterized import STEP_S
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
+from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from sim.bench import Bench
 from sim.experiments.open_loop import Law, Said, by_law, differences, rival
@@ -43,7 +44,7 @@ Adapt: TypeAlias = Callable[[Scene], Callable[[Bench], Skill]]
 """From a scene to the skill that is told its places, once there is a bench."""
 
 
-def ours(skill: Skill) -> Adapt:
+def ours(skill: StoredSkill) -> Adapt:
     """The service's own: the shipped skill, taught the three places as the demo teaches them."""
 
     def adapt(scene: Scene) -> Callable[[Bench], Skill]:

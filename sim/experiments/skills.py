@@ -20,6 +20,7 @@ from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import neighbourhoods
 from service.learning.learn import learn
+from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from sim.experiments.results import Array
 from sim.experiments.trials import Predicted
@@ -67,7 +68,7 @@ class ServiceAsPaper:
 class LearnedByService:
     """A skill of the service, and whether the start is among its places."""
 
-    skill: Skill
+    skill: StoredSkill
     start: bool
 
     def place(self, places: Places) -> Skill:

@@ -31,7 +31,7 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
     assert "gate " in done.stdout
     assert plot.stat().st_size > 10_000
     skill = decoded(out.read_bytes(), origin="skill")
-    assert f"less sure than {1000 * skill.threshold:.0f} mm" in done.stdout
+    assert f"the target's standard deviation is above {1000 * skill.threshold:.0f} mm" in done.stdout
 
 
 def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:

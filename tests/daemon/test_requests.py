@@ -25,7 +25,7 @@ from service.core.skill.skill import Skill
 from service.daemon.queryables import PendingEvent, Queryables, SavedViaPoints
 from service.daemon.saved_via_points import state_folder
 from service.daemon.skill_worker import SkillWorker
-from service.learning.skill_file import with_file
+from service.learning.skill_file import StoredSkill, with_file
 from service.learning.via_points import adapted
 from sim.scene import Scene
 
@@ -211,15 +211,18 @@ def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> No
     assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
 
 
-def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Skill) -> None:
+def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: StoredSkill) -> None:
     cell.client.add(PLACES, tolerance=0.04)
     (event,) = cell.taken
-    assert event.payload == cell.kept[0] == adapted(skill, PLACES, tolerance=0.04).file
+    wanted = adapted(skill, PLACES, tolerance=0.04)
+    assert event.payload == cell.kept[0] == wanted.file
+    assert type(event.value) is Skill  # without its file, which a recording has beside it
+    assert event.value.digest == wanted.digest
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
 def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
-    cell: Cell, skill: Skill, name: str
+    cell: Cell, skill: StoredSkill, name: str
 ) -> None:
     cell.client.add(PLACES)
     assert len(cell.client.load_skill(name).points or ()) == len(PLACES)

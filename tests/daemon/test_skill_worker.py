@@ -82,7 +82,7 @@ def test_a_skill_that_came_back_is_adapted_again(skill_worker: SkillWorker, skil
 def test_arrays_that_came_back_cannot_be_changed(skill_worker: SkillWorker, skill: Skill) -> None:
     there = skill_worker.adapt(skill, PLACES, tolerance=0.05)
     with pytest.raises(ValueError, match="read-only"):
-        there.primitive.inputs[0, 0] = 1.0
+        there.model.primitive.inputs[0, 0] = 1.0
 
 
 def test_errors_come_back_with_their_words(skill_worker: SkillWorker, skill: Skill, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from service.contract.requests import RequestError, ViaPoint, decode_request
 from service.core.record import Vector
+from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
@@ -71,6 +72,7 @@ def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demons
         [None] * 4,
         list("abcd"),
         points=80,
+        gripper_ell=HandsKMP.gripper_ell,
     )
     assert "contradicts itself" in found.unsafe[0]
     assert "a (sample" in found.unsafe[0]

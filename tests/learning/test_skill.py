@@ -20,9 +20,7 @@ def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:
 @pytest.mark.parametrize("t", [0.7, 1.5, 2.6, 4.4, 5.9, 7.6, 8.8])
 def test_velocity_and_acceleration_are_those_of_the_predicted_motion(aimed: Skill, t: float) -> None:
     script, h = HandScript(SCENE, seed=11), 1e-3
-    before, now, after = (
-        aimed.primitive.mean(stacked(script.truth(at))[0].reshape(1, 6))[0] for at in (t - h, t, t + h)
-    )
+    before, now, after = (aimed.mean(stacked(script.truth(at))[0].reshape(1, 6))[0] for at in (t - h, t, t + h))
     prediction = aimed.predict(*stacked(script.truth(t)))
     np.testing.assert_allclose(prediction.position, now, atol=1e-6)
     np.testing.assert_allclose(prediction.velocity, (after - before) / (2 * h), atol=1e-5)
@@ -44,4 +42,4 @@ def test_a_prediction_is_rounded_and_its_covariance_is_one(learned: Skill, taugh
         np.testing.assert_array_equal(value, np.round(value, 6))
     np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)
     assert np.linalg.eigvalsh(prediction.covariance).min() > 0
-    assert prediction.deviation == pytest.approx(np.sqrt(np.trace(prediction.covariance) / 3))
+    assert prediction.gate_m == pytest.approx(np.sqrt(np.trace(prediction.covariance) / 3))

@@ -15,12 +15,18 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import SkillError, decoded, with_file
 from service.learning.via_points import adapted
 from support.taught_scene import PLACES
+
+
+def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:
+    primitive = skill.model.primitive
+    return skill.mean(hands), skill.model.covariances(hands), primitive.jacobian(hands[3])
 
 
 @pytest.mark.parametrize("places", [(), PLACES])
@@ -38,11 +44,7 @@ def test_a_trip_through_a_file_changes_no_bit(
         sent.threshold,
     )
     queries = taught[5].hands[::50]
-    for one, other in zip(
-        (sent.primitive.mean(queries), sent.primitive.predict(queries).covariance, sent.primitive.jacobian(queries[3])),
-        (back.primitive.mean(queries), back.primitive.predict(queries).covariance, back.primitive.jacobian(queries[3])),
-        strict=True,
-    ):
+    for one, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
         assert one.tobytes() == other.tobytes()
 
 

@@ -31,14 +31,14 @@ def test_a_place_without_neighbours_is_met(learned: Skill) -> None:
 @pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02), (-0.01, 0.01, 0.01)])
 def test_a_neighbourhood_follows_the_left_hand(aimed: Skill, step: tuple[float, ...]) -> None:
     np.testing.assert_allclose(
-        aimed.primitive.mean([with_hands(HANDOVER, left=step)])[0], np.add(HANDOVER.tool, step), atol=0.006
+        aimed.mean([with_hands(HANDOVER, left=step)])[0], np.add(HANDOVER.tool, step), atol=0.006
     )
 
 
 @pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02)])
 def test_a_flat_neighbourhood_stays_where_it_is(aimed: Skill, step: tuple[float, ...]) -> None:
     glass = PLACES[1]
-    np.testing.assert_allclose(aimed.primitive.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006)
+    np.testing.assert_allclose(aimed.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006)
 
 
 def test_forgetting_all_places_gives_the_skill_as_it_was_learned(learned: Skill, aimed: Skill) -> None:
@@ -76,7 +76,7 @@ def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, han
     assert f"at most {steep:.4f} m accepted, 4 times the hands' distance" in str(caught.value)
     allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
     here = np.array([*EXACT.left, *EXACT.right])
-    assert np.linalg.norm(allowed.primitive.jacobian(here), 2) < 10.0
+    assert np.linalg.norm(allowed.model.primitive.jacobian(here), 2) < 10.0
 
 
 def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill: Skill) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from service.contract.records import Field
+from service.contract.records import Field, Layout
+
+MODEL_STATE: Layout = ()  # what a model that remembers declares
 
 STATE = (
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
     Field("orientation_covariance", "float64", (3, 3)),
     Field("closure", "float64"),
     Field("skill", "uint8", (16,)),  # digest of the skill in force, which is recorded apart
+    *MODEL_STATE,
 )
 FRAME = (
     Field("target", "float64", (3,)),  # what the skill predicts, clamped [m]

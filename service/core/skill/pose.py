@@ -15,7 +15,9 @@ from kmp.compiled import compiled
 from service.core.record import Vector
 from service.core.rotation import turn_on
 
-TURN_STEPS, COVARIANCE_STEPS, CLOSURE_STEPS = 1e6, 1e10, 1e6  # [1/rad], [1/rad²] to which predictions are rounded
+TURN_ROUND_TO = 1e6  # [1/rad] microradians, to which orientations and angular velocities are rounded
+COVARIANCE_ROUND_TO = 1e10  # [1/rad²] the same for covariances
+CLOSURE_ROUND_TO = 1e6  # the same for closures
 NO_GRIPPER = -1.0  # the closure that a skill without a gripper predicts
 UNKNOWN, OPEN, CLOSED = 0, 1, 2  # of a gripper
 OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
@@ -64,7 +66,7 @@ class LearnedGripper:
     def predict(self, at: Vector) -> float:
         """How far it should be closed at an input (I,), 0 (open) to 1 (closed)."""
         found = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
-        return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_STEPS) / CLOSURE_STEPS
+        return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
@@ -98,7 +100,7 @@ def _turned(
     vector, per_zeta, part = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     square = 0.0
     for i in range(3):
-        vector[i] = 2.0 * np.rint(zeta[i] * TURN_STEPS) / TURN_STEPS
+        vector[i] = 2.0 * np.rint(zeta[i] * TURN_ROUND_TO) / TURN_ROUND_TO
         square += vector[i] * vector[i]
     angle = math.sqrt(square)
     first, second = 0.5, 1.0 / 6.0
@@ -119,11 +121,11 @@ def _turned(
             part[i, j] = 0.0
             for k in range(3):
                 part[i, j] += per_zeta[i, k] * covariance[k, j]
-        turning[i] = np.rint(turning[i] * TURN_STEPS) / TURN_STEPS
+        turning[i] = np.rint(turning[i] * TURN_ROUND_TO) / TURN_ROUND_TO
     for i in range(3):
         for j in range(3):
             turned[i, j] = 0.0
             for k in range(3):
                 turned[i, j] += part[i, k] * per_zeta[j, k]
-            turned[i, j] = np.rint(turned[i, j] * COVARIANCE_STEPS) / COVARIANCE_STEPS
+            turned[i, j] = np.rint(turned[i, j] * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
     turn_on(quaternion, vector)

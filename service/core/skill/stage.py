@@ -42,14 +42,16 @@ class SkillStage:
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
         is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
         before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
-        found = self.skill.predict(hands[:, 0], hands[:, 1], hands[:, 2], state["hand_stillness"], before=before)
+        found = self.skill.predict(
+            hands[:, 0], hands[:, 1], hands[:, 2], state["hand_stillness"], before=before, memory=state
+        )
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
             state["closure"] = found.closure
         target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
         _write(frame, found, target)
         frame["closure"] = state["closure"]
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.deviation)
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m)
 
     def nothing(self, state: Record, frame: Record) -> None:
         """Into the frame that nothing is predicted: the target is the setpoint."""
@@ -62,5 +64,5 @@ class SkillStage:
 
 def _write(frame: Record, found: Prediction, target: Target) -> None:
     frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-    frame["covariance"], frame["gate_m"] = found.covariance, found.deviation
+    frame["covariance"], frame["gate_m"] = found.covariance, found.gate_m
     frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn

@@ -1,7 +1,7 @@
-"""Learning between places: what demonstrations tell of a task whose places they name.
+"""Learning of a task: what demonstrations that name its via-points tell of it.
 
-A KMP from the hands' shares of their places to the tool's, and how it errs in demonstrations that
-were left out.
+A KMP from the hands' barycentric weights to the tool's, and how it errs in demonstrations that were
+left out.
 """
 
 from __future__ import annotations
@@ -18,34 +18,36 @@ from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint
 from service.core.intake.stillness import stillness_of
 from service.core.record import Vector
-from service.core.skill.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
-from service.core.skill.skill import LearnedBetween
-from service.core.skill.task_parameterized import Placed, with_hands
+from service.core.skill.model import Model
+from service.core.skill.task import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, NamedViaPoints, Task, TaskParameters
+from service.core.skill.task_instance import TaskInstance
+from service.core.skill.task_parameterized import TaskParameterized
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
-from service.learning.gate import CEILING_M, Gate, between, nonsense
+from service.learning.gate import CEILING_M, Gate, gate_between, nonsense
 from service.learning.judgement import HeldOut
 from service.learning.skill_file import SkillError
 
-EACH = 30  # samples of a demonstration that are learned from, and
-ERRORS_OF_EACH = 40  # that its errors are kept of
-SMOOTHED_S = 0.28  # of the hands in demonstrations
-SAME_M = 0.05  # places of a hand that are no farther apart, in any demonstration, are one
-AT, ALIKE = 0.9, 0.85  # share from which on hands are at a place; and the tool, in the median
-LEAST_SAMPLES_S = 0.4  # there, for a pair of places to be known
-UNSEEN = (0.15, 0.3, 0.45)  # of the way to a pair that was not: the tool stays
-TAUGHT = 1e-4  # deviation of the share at a known pair
-FALSE = 0.005  # of the time may the gate hold: hands that start elsewhere come nearer, and are to be followed
-BETTER = 0.98  # by which share of the error other parameters must be better than the usual ones
-FAR_M = 0.10  # a place that the tool never came so near is told wrong
+SAMPLES_LEARNED = 30  # of a demonstration, at most
+ERRORS_KEPT = 40  # of a demonstration, at most
+SMOOTHED_S = 0.28  # width of the window over the hands in demonstrations
+SAME_M = 0.05  # positions of a hand that are no farther apart, in any demonstration, are one
+HAND_THERE = 0.9  # weight from which on a hand is at a via-point
+TOOL_THERE = 0.85  # the same of the tool, in the median
+LEAST_SAMPLES_S = 0.4  # both hands must have been so long at a pair of positions for it to be known
+UNSEEN = (0.15, 0.3, 0.45)  # shares of the way to a pair that nobody was at, where the tool stays
+KNOWN_STD = 1e-4  # of the weight at a known pair
+FALSE_HOLDS = 0.005  # share of the time the gate may hold: hands that start elsewhere come nearer, and are followed
+BETTER = 0.98  # other parameters must have less than this share of the usual ones' error
+FAR_M = 0.10  # a via-point that the tool never came so near is given wrong
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
 class Parameters(NamedTuple):
-    """What a KMP between places is fitted with."""
+    """What a task's KMP is fitted with."""
 
-    ell: float  # of the kernel, whose inputs are shares
-    deviation: float  # of a demonstration's sample, in shares and metres
+    ell: float  # of the kernel, whose inputs are weights
+    deviation: float  # of a demonstration's sample, in weights and metres
 
 
 USUAL = Parameters(4.0, 0.05)
@@ -55,37 +57,38 @@ OTHERS = [
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """A demonstration (T samples) in shares: inputs (T, F), the tool's shares (T, N), and what is
+class Encoded:
+    """A demonstration (T samples) in weights: the hands' (T, F), the tool's (T, N), and what is
     learned of them at some rows.
     """
 
-    layout: Layout
+    parameters: TaskParameters
     hands: Vector
-    rest: Vector  # (T, 2) how much each hand rests
+    stillness: Vector  # (T, 2) of each hand
     tool: Vector
     inputs: Vector
-    off: Vector  # (T, 2) [m] of each hand from its places
-    shares: Vector
+    gate_m: Vector  # (T,) [m] of the farther hand from its via-points
+    weights: Vector
     rows: Vector
     wanted: Vector  # (T, N + 2)
     period_s: float
 
     @staticmethod
-    def of(task: Task, demonstration: Demonstration, hands: Vector, tool: Vector) -> Told:
+    def of(task: Task, demonstration: Demonstration, hands: Vector, tool: Vector) -> Encoded:
         """The demonstration whose hands (T, 6) and tool (T, 3) are in phase."""
         period_s = demonstration.period_s
         hands = _smoothed(hands, round(SMOOTHED_S / period_s))
-        rest = stillness_of(np.gradient(hands, period_s, axis=0), period_s)
-        layout = task.layout(Places.of(demonstration.places))
-        inputs, off = Placed.of(task, layout).inputs(hands, rest)
-        shares = _along(tool, layout.tool)
-        deviation = tool - shares @ layout.tool - with_hands(hands, shares, task, layout)
+        stillness = stillness_of(np.gradient(hands, period_s, axis=0), period_s)
+        parameters = task.parameters(NamedViaPoints.of(demonstration.places))
+        instance = TaskInstance.of(task, parameters)
+        inputs, gate_m = instance.inputs(hands, stillness)
+        weights = _along(tool, parameters.tool)
+        offset = tool - weights @ parameters.tool - instance.followed(hands, weights)
         steps = np.linalg.norm(np.diff(np.hstack([inputs, 3.0 * tool]), axis=0), axis=1) + 0.05 * period_s
         way = np.concatenate([[0.0], np.cumsum(steps)])
-        rows = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], EACH)).clip(0, len(way) - 1))
-        wanted = np.hstack([shares[:, 1:], deviation])
-        return Told(layout, hands, rest, tool, inputs, off, shares, rows, wanted, period_s)
+        rows = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], SAMPLES_LEARNED)).clip(0, len(way) - 1))
+        wanted = np.hstack([weights[:, 1:], offset])
+        return Encoded(parameters, hands, stillness, tool, inputs, gate_m, weights, rows, wanted, period_s)
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
@@ -115,7 +118,7 @@ def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
     return Task(names, corners, inputs, follow)
 
 
-def places_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
+def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
     """In words, which places the tool never came near in which demonstrations, by their names.
 
     Raises SkillError for one that it came near in none.
@@ -145,23 +148,23 @@ def _nearest(demonstration: Demonstration, place: ViaPoint, follow: int) -> floa
     return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
 
 
-def merged(task: Task, told_of: Callable[[Task], list[Told]]) -> tuple[Task, list[Told], list[Vector]]:
-    """The task with places of a hand as one input, as long as that predicts demonstrations that are
-    left out better; the demonstrations, which `told_of` a task says in its inputs; and their errors
-    then, with the usual parameters.
+def merged(task: Task, encode: Callable[[Task], list[Encoded]]) -> tuple[Task, list[Encoded], list[Vector]]:
+    """The task with positions of a hand as one input, as long as that predicts demonstrations that
+    are left out better; the demonstrations, encoded in that task; and their errors then, with the
+    usual parameters.
     """
 
-    def judged(task: Task) -> tuple[Task, list[Told], list[Vector]]:
-        told = told_of(task)
-        return task, told, _left_out(task, told, USUAL)
+    def judged(task: Task) -> tuple[Task, list[Encoded], list[Vector]]:
+        encoded = encode(task)
+        return task, encoded, _left_out(task, encoded, USUAL)
 
     best = judged(task)
     while True:
-        task, told, errors = best
-        for pair in _alike(task, _known(told, task)):
+        task, encoded, errors = best
+        for pair in _alike(task, _known(encoded, task)):
             best = min(best, judged(_as_one(task, *pair)), key=lambda one: rms(np.concatenate(one[2])))
         if best[0] is task:
-            return task, told, errors
+            return task, encoded, errors
 
 
 def _alike(task: Task, known: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
@@ -185,10 +188,10 @@ def _as_one(task: Task, side: int, a: int, b: int) -> Task:
     return task._replace(inputs=inputs)
 
 
-def fitted(task: Task, told: Sequence[Told], parameters: Parameters = USUAL) -> KMP:
+def fitted(task: Task, encoded: Sequence[Encoded], parameters: Parameters = USUAL) -> KMP:
     """The KMP, with the tool at its place wherever both hands were found to be at theirs."""
-    inputs = np.concatenate([one.inputs[one.rows] for one in told])
-    outputs = np.concatenate([one.wanted[one.rows] for one in told])
+    inputs = np.concatenate([one.inputs[one.rows] for one in encoded])
+    outputs = np.concatenate([one.wanted[one.rows] for one in encoded])
     width = outputs.shape[1]
     reference = Gaussians(outputs, np.tile(parameters.deviation**2 * np.eye(width), (len(inputs), 1, 1)))
     primitive = KMP.fit(
@@ -199,13 +202,13 @@ def fitted(task: Task, told: Sequence[Told], parameters: Parameters = USUAL) -> 
         prior_mean=outputs.mean(axis=0),
         representation="dense",
     )
-    at, wanted = _pairs(task, _known(told, task))
+    at, wanted = _pairs(task, _known(encoded, task))
     if not len(at):
         return primitive
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ViaPointMissed)
-        taught = Gaussians(wanted, np.tile(TAUGHT**2 * np.eye(width), (len(at), 1, 1)))
-        return primitive.adapt(at, taught, tolerance=0.05)
+        known = Gaussians(wanted, np.tile(KNOWN_STD**2 * np.eye(width), (len(at), 1, 1)))
+        return primitive.adapt(at, known, tolerance=0.05)
 
 
 def _smoothed(hands: Vector, samples: int) -> Vector:
@@ -230,7 +233,7 @@ def _corners(at: Vector) -> Indices:
 
 
 def _along(tool: Vector, places: Vector) -> Vector:
-    """Shares (T, N) of the point nearest to the tool (T, 3) on the way from place to place."""
+    """Weights (T, N) of the point nearest to the tool (T, 3) on the way from place to place."""
     out, least = np.zeros((len(tool), len(places))), np.full(len(tool), np.inf)
     for i in range(len(places) - 1):
         way = places[i + 1] - places[i]
@@ -243,20 +246,20 @@ def _along(tool: Vector, places: Vector) -> Vector:
     return out
 
 
-def _known(told: Sequence[Told], task: Task) -> dict[tuple[int, int], int]:
+def _known(encoded: Sequence[Encoded], task: Task) -> dict[tuple[int, int], int]:
     """At which place the tool always was while both hands were at these of theirs: inputs of the
     left and the right hand.
     """
-    inputs = np.concatenate([one.inputs for one in told])
-    shares = np.concatenate([one.shares for one in told])
-    periods = np.concatenate([np.full(len(one.inputs), one.period_s) for one in told])
+    inputs = np.concatenate([one.inputs for one in encoded])
+    weights = np.concatenate([one.weights for one in encoded])
+    periods = np.concatenate([np.full(len(one.inputs), one.period_s) for one in encoded])
     out: dict[tuple[int, int], int] = {}
     for left in np.unique(task.inputs[0][task.inputs[0] >= 0]).tolist():
         for right in np.unique(task.inputs[1][task.inputs[1] >= 0]).tolist():
-            there = (inputs[:, left] > AT) & (inputs[:, right] > AT)
+            there = (inputs[:, left] > HAND_THERE) & (inputs[:, right] > HAND_THERE)
             if periods[there].sum() >= LEAST_SAMPLES_S:
-                usual = np.median(shares[there], axis=0)
-                if usual.max() > ALIKE:
+                usual = np.median(weights[there], axis=0)
+                if usual.max() > TOOL_THERE:
                     out[left, right] = int(np.argmax(usual))
     return out
 
@@ -288,14 +291,14 @@ def _corner(task: Task, left: int, right: int) -> Vector:
 
 
 class Learned(NamedTuple):
-    """A task's KMP, what belongs to it, what was predicted of each demonstration when it was left
-    out, and the gate.
+    """What demonstrations tell: a model, what was predicted of each when it was left out, the gate,
+    and the inputs (T, I) of the primitives along each.
     """
 
-    primitive: KMP
-    between: LearnedBetween
+    model: Model
     held_out: list[HeldOut]
     gate: Gate
+    inputs: list[Vector]
 
 
 def learned(
@@ -306,53 +309,49 @@ def learned(
 ) -> Learned:
     """What demonstrations, whose hands (T, 6) and tool (T, 3) are in phase, tell of their task."""
     pairs = list(zip(demonstrations, paths, strict=True))
-    progress("which places make a difference")
-    task, told, errors = merged(task, lambda of: [Told.of(of, one, *path) for one, path in pairs])
+    progress("which via-points make a difference")
+    task, encoded, errors = merged(task, lambda of: [Encoded.of(of, one, *path) for one, path in pairs])
     parameters, least = USUAL, BETTER * rms(np.concatenate(errors))
     for i, tried in enumerate(OTHERS):
-        progress(f"holding out each of {len(told)} demonstrations, parameters {i + 1} of {len(OTHERS)}")
-        found = _left_out(task, told, tried)
+        progress(f"holding out each of {len(encoded)} demonstrations, parameters {i + 1} of {len(OTHERS)}")
+        found = _left_out(task, encoded, tried)
         error = rms(np.concatenate(found))
         if error < least:
             parameters, errors, least = tried, found, error
-    progress(f"learning from all {len(told)}")
-    primitive = fitted(task, told, parameters)
-    rows = [
-        np.linspace(0, len(one.inputs) - 1, min(ERRORS_OF_EACH, len(one.inputs))).round().astype(int) for one in told
-    ]
-    seen = [one.inputs[some] for one, some in zip(told, rows, strict=True)]
-    kept = [some_errors[some] for some_errors, some in zip(errors, rows, strict=True)]
+    progress(f"learning from all {len(encoded)}")
+    primitive = fitted(task, encoded, parameters)
+    kept = []
+    for one, some_errors in zip(encoded, errors, strict=True):
+        rows = np.linspace(0, len(one.inputs) - 1, min(ERRORS_KEPT, len(one.inputs))).round().astype(int)
+        kept.append(np.hstack([one.inputs[rows], some_errors[rows]]))
     held_out = []
-    for i, one in enumerate(told):
-        others = [j for j in range(len(told)) if j != i] or [0]
-        judge = Placed.of(
-            task, one.layout, None, np.concatenate([seen[j] for j in others]), np.concatenate([kept[j] for j in others])
-        )
-        covariance = np.array([judge.covariance(row) for row in one.inputs])
-        held_out.append(HeldOut(errors[i], covariance, one.off.max(axis=1)))
-    nominal = Places(
-        task.names, np.mean([Places.of(list(_ordered(d.places, task.names))).at for d in demonstrations], axis=0)
-    )
-    known = LearnedBetween(task, nominal, np.concatenate(seen), np.concatenate(kept))
-    return Learned(primitive, known, held_out, _gate(task, told))
+    for i, one in enumerate(encoded):
+        others = np.concatenate([*kept[:i], *kept[i + 1 :]] or kept)
+        covariance = TaskInstance.of(task, one.parameters, None, others).covariances(one.inputs)
+        held_out.append(HeldOut(errors[i], covariance, one.gate_m))
+    at = [NamedViaPoints.of(list(_ordered(one.places, task.names))).at for one in demonstrations]
+    nominal = NamedViaPoints(task.names, np.mean(at, axis=0))
+    model = TaskParameterized(primitive, task, nominal, np.concatenate(kept))
+    return Learned(model, held_out, _gate(task, encoded), [one.inputs for one in encoded])
 
 
-def _left_out(task: Task, told: Sequence[Told], parameters: Parameters) -> list[Vector]:
+def _left_out(task: Task, encoded: Sequence[Encoded], parameters: Parameters) -> list[Vector]:
     """The tool's errors (T, 3) [m] in each demonstration, as predicted from the others; of a single
     one, from itself.
     """
     out = []
-    for i, one in enumerate(told):
-        without = fitted(task, [*told[:i], *told[i + 1 :]] or told, parameters)
-        out.append(one.tool - Placed.of(task, one.layout, without).mean(one.hands, one.rest))
+    for i, one in enumerate(encoded):
+        without = fitted(task, [*encoded[:i], *encoded[i + 1 :]] or encoded, parameters)
+        out.append(one.tool - TaskInstance.of(task, one.parameters, without).mean(one.hands, one.stillness))
     return out
 
 
-def _gate(task: Task, told: Sequence[Told]) -> Gate:
-    """The gate on how far a hand is off its places."""
+def _gate(task: Task, encoded: Sequence[Encoded]) -> Gate:
+    """The gate on how far a hand is off its via-points."""
     wrong: list[list[Vector]] = [[], [], []]
-    for one in told:
+    for one in encoded:
+        instance = TaskInstance.of(task, one.parameters)
         for off, hands in zip(wrong, nonsense(one.hands[:: max(1, len(one.hands) // 50)]), strict=True):
-            off.append(Placed.of(task, one.layout).inputs(hands)[1].max(axis=1))
-    held_out = np.concatenate([one.off.max(axis=1) for one in told])
-    return between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M, false=FALSE)
+            off.append(instance.inputs(hands)[1])
+    held_out = np.concatenate([one.gate_m for one in encoded])
+    return gate_between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M, false=FALSE_HOLDS)

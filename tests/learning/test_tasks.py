@@ -14,13 +14,14 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.skill.places import MOST_CORNERS
+from service.core.skill.barycentric import nearest_between
 from service.core.skill.skill import Skill
-from service.core.skill.task_parameterized import barycentric_weights
-from service.learning.between import places_never_reached, task_of
+from service.core.skill.task import MOST_CORNERS
+from service.core.skill.task_parameterized import TaskParameterized
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
+from service.learning.tasks import task_of, via_points_never_reached
 from service.learning.via_points import adapted, in_force, warnings_of
 from sim.teach import by_people
 
@@ -49,8 +50,8 @@ def moved(places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]
 
 
 def test_places_of_a_hand_that_are_one_and_that_make_no_difference_are_found(between: Skill) -> None:
-    assert between.between is not None
-    task = between.between.task
+    assert isinstance(between.model, TaskParameterized)
+    task = between.model.task
     assert task.names == ("start", "handover", "glass", "soldering")
     assert task.corners.tolist() == [[0, 0], [1, 0], [2, 1], [2, 2]]
     assert task.inputs.tolist() == [[0, 1, 2], [3, 3, 4]]  # the right hand at rest or at the iron
@@ -61,9 +62,9 @@ def test_what_makes_no_difference_is_found_by_demonstrations_that_are_left_out(
     shown: list[Demonstration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where nobody waited at any pair of places for long."""
-    monkeypatch.setattr("service.learning.between.LEAST_SAMPLES_S", np.inf)
-    found = learn(shown, name="hasty").between
-    assert found is not None
+    monkeypatch.setattr("service.learning.tasks.LEAST_SAMPLES_S", np.inf)
+    found = learn(shown, name="hasty").model
+    assert isinstance(found, TaskParameterized)
     assert found.task.inputs.tolist() == [[0, 1, 2], [3, 3, 4]]
 
 
@@ -76,14 +77,13 @@ def test_the_tool_goes_to_the_places_that_are_told_and_with_the_hand_where_it_fo
         for place in places:
             near = aimed.mean(hands_at(place, 0.02))[0] - (0.02 if place.follow == "left" else 0.0)
             assert np.linalg.norm(near - place.tool) < 0.015
-        assert (
-            aimed.deviations(hands_at(places[2], 0.3))[0] > aimed.threshold > aimed.deviations(hands_at(places[2]))[0]
-        )
+        far, near = (aimed.model.gates_m(hands_at(places[2], off))[0] for off in (0.3, 0.0))
+        assert far > aimed.threshold > near
 
 
 def test_a_moving_hand_is_on_its_way_and_a_trembling_one_moves_nothing(between: Skill) -> None:
-    assert between.placed is not None
-    left, right = between.placed.layout.hands
+    assert isinstance(between.model, TaskParameterized)
+    left, right = between.model.instance.tasks["corners"][0]
     handover, board, rest = left[1], left[2], right[0]
     half = np.concatenate([0.7 * handover + 0.3 * board, rest])
     way = np.concatenate([(board - handover) / np.linalg.norm(board - handover), np.zeros(3)])
@@ -117,7 +117,7 @@ def test_shares_are_those_of_the_nearest_point_between_the_places() -> None:
         for _ in range(5):
             corners, found = random.standard_normal((MOST_CORNERS, 3)), np.empty(3)
             for point in 2.0 * random.standard_normal((20, 3)):
-                off = barycentric_weights(point, corners, count, found)
+                off = nearest_between(point, corners, count, found)
                 assert found.min() >= 0.0
                 assert found.sum() == pytest.approx(1.0)
                 assert off == pytest.approx(np.linalg.norm(point - found @ corners), abs=1e-5)
@@ -140,9 +140,9 @@ def test_a_place_that_the_tool_never_came_near_is_named(shown: list[Demonstratio
     names = [f"take-{i}" for i in range(len(shown))]
     task = task_of(shown)
     assert not isinstance(task, str)
-    assert places_never_reached(task, shown, names) == []
+    assert via_points_never_reached(task, shown, names) == []
     wrong = [one._replace(places=moved(one.places, {"glass": (0.0, 0.4, 0.3)})) for one in shown]
-    (said,) = places_never_reached(task, [*shown[:-1], wrong[-1]], names)
+    (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
     assert re.fullmatch(r"place 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said)
     with pytest.raises(SkillError, match=r"place 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"):
         learn(wrong, names=names)

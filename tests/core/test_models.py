@@ -1,0 +1,131 @@
+"""What every model of a skill does, whichever it is; and that one which remembers has its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from service.contract.records import Field
+from service.core.record import Record, Vector
+from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.model import Model, Motion
+from service.core.skill.skill import MODELS, STATE_FIELDS, Skill
+from service.learning.skill_file import decoded, with_file
+from service.learning.via_points import adapted
+from sim.scene import Scene
+from support.paths import RECORDINGS
+
+FILES = {"HandsKMP": "experiments/as-paper.npz", "TaskParameterized": "soldering.npz"}
+STILL = np.array([[1.0, 1.0]])
+H = 0.02
+
+
+@pytest.fixture(params=MODELS, ids=lambda model: model.__name__)
+def skill(request: pytest.FixtureRequest) -> Skill:
+    """A skill with such a model, which goes through the scene's via-points."""
+    learned = decoded((RECORDINGS / FILES[request.param.__name__]).read_bytes(), origin="a recording")
+    assert type(learned.model) is request.param
+    return adapted(learned, Scene().via_points(), tolerance=0.05)
+
+
+@pytest.fixture
+def hands(skill: Skill) -> Vector:
+    """Hands (6,) between two that the skill knows."""
+    return 0.6 * skill.hands[0] + 0.4 * skill.hands[-1]
+
+
+def predicted(skill: Skill, hands: Vector, velocity: Vector, **more: object) -> Motion:
+    found = skill.predict(hands.reshape(2, 3), velocity.reshape(2, 3), np.zeros((2, 3)), STILL[0], **more)  # type: ignore[arg-type]
+    return Motion(*found[:5])
+
+
+def test_a_prediction_is_the_mean_rounded_with_its_derivative_along_the_motion(skill: Skill, hands: Vector) -> None:
+    velocity = np.array([0.3, -0.4, 0.2, 0.4, 0.3, 0.1])
+    found = predicted(skill, hands, velocity)
+    np.testing.assert_allclose(found.position, skill.mean(hands[None], STILL)[0], rtol=0, atol=0.51e-6)
+    behind, ahead = skill.mean(hands + H * np.array([[-1.0], [1.0]]) * velocity, np.tile(STILL, (2, 1)))
+    np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * H), atol=0.01)
+    assert not predicted(skill, hands, np.zeros(6)).velocity.any()
+
+
+def test_how_sure_it_is_and_what_the_gate_sees_are_those_of_many_hands(skill: Skill, hands: Vector) -> None:
+    found = predicted(skill, hands, np.zeros(6))
+    np.testing.assert_allclose(found.covariance, skill.model.covariances(hands[None])[0], rtol=0, atol=0.6e-10)
+    assert found.gate_m == pytest.approx(skill.model.gates_m(hands[None])[0], abs=1e-6)
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+    apart = hands + np.array([0.0, 0.0, 0.5, 0.0, 0.0, -0.5])
+    assert predicted(skill, apart, np.zeros(6)).gate_m > skill.threshold
+
+
+def test_a_covariance_that_is_known_is_handed_back_and_changes_nothing_else(skill: Skill, hands: Vector) -> None:
+    whole = predicted(skill, hands, np.ones(6))
+    again = predicted(skill, hands, np.ones(6), before=(whole.covariance, np.zeros((3, 3)), -1.0))
+    assert [np.asarray(part).tobytes() for part in again] == [np.asarray(part).tobytes() for part in whole]
+
+
+def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
+    model, velocity = skill.model, np.array([0.1, 0.2, 0.0, 0.0, -0.1, 0.2])
+    at, moves = model.moving_inputs(np.stack([hands, velocity, np.zeros(6)]), STILL[0])
+    assert at.shape == (model.shape[0],)
+    np.testing.assert_array_equal(at, model.inputs(hands[None])[0])
+    behind, ahead = model.inputs(hands + H * np.array([[-1.0], [1.0]]) * velocity)
+    np.testing.assert_allclose(moves, (ahead - behind) / (2 * H), atol=1e-9)
+
+
+def test_stored_and_read_back_it_says_the_same(skill: Skill) -> None:
+    model = skill.model
+    assert set(model.own_arrays()) - {"names"} == set(model.ranges)
+    back = decoded(skill.file, origin="a file")
+    assert type(back.model) is type(model)
+    assert back.model.mean(model.hands).tobytes() == model.mean(model.hands).tobytes()
+    assert back.model.covariances(model.hands).tobytes() == model.covariances(model.hands).tobytes()
+    assert with_file(replace(back, file=b"")).file == skill.file
+
+
+def test_without_its_via_points_it_is_as_it_was_learned(skill: Skill) -> None:
+    learned = adapted(skill, (), tolerance=0.05).model
+    assert skill.model.unadapted().mean(learned.hands).tobytes() == learned.mean(learned.hands).tobytes()
+    assert skill.model.mean(learned.hands).tobytes() != learned.mean(learned.hands).tobytes()
+
+
+def test_models_are_told_apart_by_their_words_and_formats() -> None:
+    assert all(len({words(model) for model in MODELS}) == len(MODELS) for words in (measure, units))
+    formats = [number for model in MODELS for number in model.formats]
+    assert len(set(formats)) == len(formats)
+    assert STATE_FIELDS == ()  # none remembers yet
+
+
+def measure(model: type[Model]) -> str:
+    assert len(model.measure) > 10
+    return model.measure
+
+
+def units(model: type[Model]) -> str:
+    assert "[m]" in model.units
+    return model.units
+
+
+@dataclass(frozen=True, eq=False)
+class Lagging(HandsKMP):
+    """Says what the mean was when it was asked last."""
+
+    state_fields = (Field("lagged", "float64", (3,)),)
+
+    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
+        assert memory is not None
+        found = super().predict(moving, stillness, known, memory)
+        before = memory["lagged"].copy()
+        memory["lagged"] = found.position
+        return found._replace(position=before)
+
+
+def test_a_model_may_remember_in_fields_of_the_state_that_it_owns() -> None:
+    learned = decoded((RECORDINGS / FILES["HandsKMP"]).read_bytes(), origin="a recording")
+    lagging, layout = replace(learned, model=Lagging(learned.model.primitive)), Lagging.state_fields
+    state: Record = np.zeros(1, [(field.name, field.type, field.shape) for field in layout])[0]
+    one, other = learned.hands[0], learned.hands[1]
+    assert not predicted(lagging, one, np.zeros(6), memory=state).position.any()
+    was = predicted(lagging, other, np.zeros(6), memory=state).position
+    np.testing.assert_array_equal(was, predicted(learned, one, np.zeros(6)).position)
