@@ -154,7 +154,7 @@ class Chunks:
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(told), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        other = known & (np.abs(frames["deviation"] - std_m) > SAME_M)  # of a skill between places
+        other = known & (np.abs(frames["deviation"] - std_m) > SAME_M)  # where the gate compares something else
         yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["deviation"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
