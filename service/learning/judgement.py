@@ -176,8 +176,8 @@ def _verdicts(
         )
     if overall.error_mm > NOTED_MM:
         say(
-            f"held-out demonstrations are missed by {overall.error_mm:.0f} mm: the hands' places tell little of the "
-            f"tool's; up to {UNSAFE_MM:.0f} mm accepted",
+            f"held-out demonstrations are missed by {overall.error_mm:.0f} mm: where the hands are tells little of "
+            f"where the tool is; up to {UNSAFE_MM:.0f} mm accepted",
             bad=overall.error_mm > UNSAFE_MM,
         )
     usual = float(np.median([row.error_mm for row in found.demonstrations]))

@@ -67,14 +67,14 @@ def learned_pose(
 
 
 def flat_orientation(skill_inputs: Vector, kernel: Kernel, orientation: Vector) -> LearnedOrientation:
-    """The constant orientation (4,) as a primitive over inputs (N, I), to be taught places."""
+    """The constant orientation (4,) as a primitive over inputs (N, I), to be taught via-points."""
     inputs = skill_inputs[:: max(1, len(skill_inputs) // 200)]
     zeta = np.zeros((len(inputs), 3))
     return LearnedOrientation(_fitted(inputs, zeta, kernel, np.zeros(3)), np.asarray(orientation, np.float64))
 
 
 def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
-    """A gripper that is undecided everywhere, to be taught places."""
+    """A gripper that is undecided everywhere, to be taught via-points."""
     prior = np.array([UNDECIDED])
     return LearnedGripper(_fitted(skill_inputs[:1], prior[None], GaussianKernel(ell), prior))
 
@@ -134,16 +134,16 @@ def _ambiguity(hands: Sequence[Vector], quaternions: Sequence[Vector], names: Se
     the worst such pair in words.
     """
     at = [np.linspace(0, len(h) - 1, min(COMPARED, len(h))).round().astype(int) for h in hands]
-    places = np.concatenate([h[i] for h, i in zip(hands, at, strict=True)])
+    known = np.concatenate([h[i] for h, i in zip(hands, at, strict=True)])
     turns = np.concatenate([q[i] / np.linalg.norm(q[i], axis=1)[:, None] for q, i in zip(quaternions, at, strict=True)])
     owner = [(name, int(i)) for name, some in zip(names, at, strict=True) for i in some]
     apart = angles(turns[:, None], turns)
-    squares = (places**2).sum(axis=1)
-    apart *= squares[:, None] + squares - 2.0 * places @ places.T < NEAR_M**2
+    squares = (known**2).sum(axis=1)
+    apart *= squares[:, None] + squares - 2.0 * known @ known.T < NEAR_M**2
     i, j = np.unravel_index(int(apart.argmax()), apart.shape)
     worst = (
         f"{owner[i][0]} (sample {owner[i][1]}) and {owner[j][0]} (sample {owner[j][1]}) have the hands "
-        f"{1000 * np.linalg.norm(places[i] - places[j]):.0f} mm from each other and the tools turned by "
+        f"{1000 * np.linalg.norm(known[i] - known[j]):.0f} mm from each other and the tools turned by "
         f"{math.degrees(apart[i, j]):.0f}°"
     )
     return float((apart.max(axis=1) > APART_RAD).mean()), worst
@@ -167,7 +167,7 @@ def _learned_gripper(
             np.concatenate([_right(choice, held_out, prior, ell) for held_out in range(len(told))]).mean()
         )
         if right < 100.0 * (1.0 - GRIPPER_WRONG):
-            warnings.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it places")
+            warnings.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it via-points")
     primitive = _fitted(choice.inputs, choice.outputs, GaussianKernel(ell), prior)
     return LearnedGripper(primitive), right, tuple(warnings)
 

@@ -1,5 +1,5 @@
 """Via-points of orientation and gripper: the primitives beside the position's made to go through
-what was taught with a place.
+what was taught with each.
 """
 
 from __future__ import annotations

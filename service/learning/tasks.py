@@ -92,24 +92,24 @@ class Encoded:
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
-    """The task of demonstrations that name its places; or why there is none, empty where no places
+    """The task of demonstrations that name its via-points; or why there is none, empty where none
     are named.
     """
     named = [tuple(point.name for point in one.places) for one in demonstrations]
     if not any(named):
         return ""
     if len(set(map(frozenset, named))) > 1:
-        return "not all demonstrations name the same places, so it is learned where the hands are, not between places"
+        return "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
     names = named[0]
     if len(names) < 2:
-        return "two named places are the least to learn between"
+        return "two named via-points are the least to learn between"
     at = np.array([[[*p.left, *p.right] for p in _ordered(one.places, names)] for one in demonstrations])
     corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
     for side, word in enumerate(("left", "right")):
         if corners[:, side].max() >= MOST_CORNERS:
             return (
-                f"the {word} hand has {corners[:, side].max() + 1} places, {MOST_CORNERS} at most are learned between, "
-                "so it is learned where the hands are"
+                f"the {word} hand has {corners[:, side].max() + 1} positions, {MOST_CORNERS} at most are learned "
+                "between, so it is learned where the hands are"
             )
     inputs = np.full((2, MOST_CORNERS), -1)
     left, right = (int(corners[:, side].max()) + 1 for side in (0, 1))
@@ -119,32 +119,32 @@ def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
 
 
 def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
-    """In words, which places the tool never came near in which demonstrations, by their names.
+    """In words, which via-points the tool never came near in which demonstrations, by their names.
 
     Raises SkillError for one that it came near in none.
     """
     warned = []
-    for place, follow in zip(task.names, task.follow.tolist(), strict=True):
-        off = [_nearest(one, next(_ordered(one.places, (place,))), follow) for one in demonstrations]
+    for named, follow in zip(task.names, task.follow.tolist(), strict=True):
+        off = [_nearest(one, next(_ordered(one.places, (named,))), follow) for one in demonstrations]
         if min(off) > FAR_M:
             raise SkillError(
-                f"place {place!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
-                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it told in metres, in frame base, "
+                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
+                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
                 "where it was in these demonstrations?"
             )
         missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M]
         if missed:
-            warned.append(f"place {place!r}: the tool never came near it in {', '.join(missed)}")
+            warned.append(f"via-point {named!r}: the tool never came near it in {', '.join(missed)}")
     return warned
 
 
-def _nearest(demonstration: Demonstration, place: ViaPoint, follow: int) -> float:
-    """The tool's least distance from a place [m], there or where it is with the hand it follows."""
-    off = demonstration.tool[:, :3] - place.tool
+def _nearest(demonstration: Demonstration, point: ViaPoint, follow: int) -> float:
+    """The tool's least distance from a via-point [m], there or with the hand that it follows."""
+    off = demonstration.tool[:, :3] - point.tool
     out = float(np.linalg.norm(off, axis=1).min())
     if follow == NONE:
         return out
-    hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (place.left, place.right)[follow]
+    hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (point.left, point.right)[follow]
     return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
 
 
@@ -168,13 +168,13 @@ def merged(task: Task, encode: Callable[[Task], list[Encoded]]) -> tuple[Task, l
 
 
 def _alike(task: Task, known: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
-    """Side and two inputs, for places of a hand of which nothing shows that the tool tells them
+    """Side and two inputs, for positions of a hand of which nothing shows that the tool tells them
     apart.
     """
     out = []
     for side in (0, 1):
         for a, b in itertools.combinations(sorted({i for i in task.inputs[side].tolist() if i >= 0}), 2):
-            at = [{pair[1 - side]: place for pair, place in known.items() if pair[side] == i} for i in (a, b)]
+            at = [{pair[1 - side]: n for pair, n in known.items() if pair[side] == i} for i in (a, b)]
             if all(at[0][other] == at[1][other] for other in at[0].keys() & at[1].keys()):
                 out.append((side, a, b))
     return out
@@ -189,7 +189,7 @@ def _as_one(task: Task, side: int, a: int, b: int) -> Task:
 
 
 def fitted(task: Task, encoded: Sequence[Encoded], parameters: Parameters = USUAL) -> KMP:
-    """The KMP, with the tool at its place wherever both hands were found to be at theirs."""
+    """The KMP, with the tool at its via-point wherever both hands were found to be at theirs."""
     inputs = np.concatenate([one.inputs[one.rows] for one in encoded])
     outputs = np.concatenate([one.wanted[one.rows] for one in encoded])
     width = outputs.shape[1]
@@ -218,13 +218,13 @@ def _smoothed(hands: Vector, samples: int) -> Vector:
     return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)
 
 
-def _ordered(places: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
-    by_name = {place.name: place for place in places}
+def _ordered(points: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
+    by_name = {point.name: point for point in points}
     return (by_name[name] for name in names)
 
 
 def _corners(at: Vector) -> Indices:
-    """Which of its own places a hand is at, (N,), for positions (D, N, 3) in D demonstrations."""
+    """Which of its own positions a hand is at, (N,), for those (D, N, 3) in D demonstrations."""
     out: list[int] = []
     for i in range(at.shape[1]):
         alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
@@ -232,13 +232,13 @@ def _corners(at: Vector) -> Indices:
     return np.array(out, np.int64)
 
 
-def _along(tool: Vector, places: Vector) -> Vector:
-    """Weights (T, N) of the point nearest to the tool (T, 3) on the way from place to place."""
-    out, least = np.zeros((len(tool), len(places))), np.full(len(tool), np.inf)
-    for i in range(len(places) - 1):
-        way = places[i + 1] - places[i]
-        along = np.clip((tool - places[i]) @ way / max(float(way @ way), 1e-9), 0.0, 1.0)
-        off = np.sum((tool - places[i] - along[:, None] * way) ** 2, axis=1)
+def _along(tool: Vector, points: Vector) -> Vector:
+    """Weights (T, N) of the point nearest to the tool (T, 3) on the way from point to point."""
+    out, least = np.zeros((len(tool), len(points))), np.full(len(tool), np.inf)
+    for i in range(len(points) - 1):
+        way = points[i + 1] - points[i]
+        along = np.clip((tool - points[i]) @ way / max(float(way @ way), 1e-9), 0.0, 1.0)
+        off = np.sum((tool - points[i] - along[:, None] * way) ** 2, axis=1)
         nearer = off < least
         least[nearer] = off[nearer]
         out[nearer] = 0.0
@@ -247,8 +247,8 @@ def _along(tool: Vector, places: Vector) -> Vector:
 
 
 def _known(encoded: Sequence[Encoded], task: Task) -> dict[tuple[int, int], int]:
-    """At which place the tool always was while both hands were at these of theirs: inputs of the
-    left and the right hand.
+    """At which via-point the tool always was while both hands were at these positions: inputs of
+    the left and the right hand.
     """
     inputs = np.concatenate([one.inputs for one in encoded])
     weights = np.concatenate([one.weights for one in encoded])
@@ -265,14 +265,14 @@ def _known(encoded: Sequence[Encoded], task: Task) -> dict[tuple[int, int], int]
 
 
 def _pairs(task: Task, known: dict[tuple[int, int], int]) -> tuple[Vector, Vector]:
-    """Inputs (V, F) and outputs (V, N + 2) of the known pairs of places, and of some of the way
+    """Inputs (V, F) and outputs (V, N + 2) of the known pairs of positions, and of some of the way
     toward pairs at which nobody was: there the tool stays.
     """
     lefts, rights = (sorted({i for i in task.inputs[side].tolist() if i >= 0}) for side in (0, 1))
     count, at, wanted = len(task.names), [], []
-    for (left, right), place in known.items():
+    for (left, right), at_point in known.items():
         here = _corner(task, left, right)
-        tool = np.append(np.eye(count)[place, 1:], np.zeros(3))
+        tool = np.append(np.eye(count)[at_point, 1:], np.zeros(3))
         at.append(here)
         wanted.append(tool)
         beside = [(other, right) for other in lefts if other != left]

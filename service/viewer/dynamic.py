@@ -158,8 +158,8 @@ class DynamicScene:
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        differs = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)
-        yield from scalars("/deviation/hands", np.flatnonzero(differs), 1e3 * frames["gate_m"], "/deviation")
+        other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # where the gate compares something else
+        yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
         measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]

@@ -1,4 +1,4 @@
-"""Skills between places: what demonstrations tell of a task, that it holds wherever its places are,
+"""Tasks between via-points: what demonstrations tell of one, that it holds wherever these are,
 and what its file may hold.
 """
 
@@ -127,13 +127,13 @@ def test_shares_are_those_of_the_nearest_point_between_the_places() -> None:
 def test_what_cannot_be_learned_between_places_says_why(shown: list[Demonstration]) -> None:
     assert task_of([one._replace(places=()) for one in shown]) == ""
     fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
-    assert "not all demonstrations name the same places" in str(task_of(fewer))
-    assert "two named places" in str(task_of([one._replace(places=one.places[:1]) for one in shown]))
+    assert "not all demonstrations name the same via-points" in str(task_of(fewer))
+    assert "two named via-points" in str(task_of([one._replace(places=one.places[:1]) for one in shown]))
     fourth = [
         one._replace(places=(*one.places, ViaPoint("shelf", (0.2, 0.6, 0.5), one.places[0].right, (0.5, 0.0, 0.3))))
         for one in shown
     ]
-    assert "the left hand has 4 places, 3 at most" in str(task_of(fourth))
+    assert "the left hand has 4 positions, 3 at most" in str(task_of(fourth))
 
 
 def test_a_place_that_the_tool_never_came_near_is_named(shown: list[Demonstration]) -> None:
@@ -143,8 +143,10 @@ def test_a_place_that_the_tool_never_came_near_is_named(shown: list[Demonstratio
     assert via_points_never_reached(task, shown, names) == []
     wrong = [one._replace(places=moved(one.places, {"glass": (0.0, 0.4, 0.3)})) for one in shown]
     (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
-    assert re.fullmatch(r"place 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said)
-    with pytest.raises(SkillError, match=r"place 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"):
+    assert re.fullmatch(r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said)
+    with pytest.raises(
+        SkillError, match=r"via-point 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"
+    ):
         learn(wrong, names=names)
 
 

@@ -139,7 +139,7 @@ class TaskParameterized:
             if arrays[name].shape != shape or not shape[0]:
                 raise ValueError(f"{name} has shape {arrays[name].shape}, {shape} needed")
         if not 2 <= count <= MOST_NAMES or len(set(names)) < count:
-            raise ValueError(f"places {', '.join(names)}: 2 to {MOST_NAMES} different names needed")
+            raise ValueError(f"via-points {', '.join(names)}: 2 to {MOST_NAMES} different names needed")
         corners, inputs, follow = (
             np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "shares", "follow")
         )
@@ -148,7 +148,7 @@ class TaskParameterized:
             numbered = np.array_equal(np.unique(corners[:, side]), np.arange(has))
             if not has or (inputs[side, :has] < 0).any() or not numbered:
                 raise ValueError(
-                    f"the hands' places {corners.tolist()} and inputs {inputs.tolist()} do not fit each other"
+                    f"the hands' positions {corners.tolist()} and inputs {inputs.tolist()} do not fit each other"
                 )
         if not np.array_equal(np.unique(inputs[inputs >= 0]), np.arange(width)):
             raise ValueError(f"the inputs {inputs.tolist()} are not numbered through")
