@@ -91,7 +91,7 @@ class CompiledQuery(Immutable):
 
 
 def _packed(solution: Dense) -> Array:
-    inverse, _ = lapack.dtrtri(solution._covariance_factor, lower=1)
+    inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
     a = solution.apart
     return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
 

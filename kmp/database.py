@@ -15,7 +15,7 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 
-_DISTANCES = 10_000_000  # from via-points to reference points, at once
+DISTANCES = 10_000_000  # from via-points to reference points, at once
 _MISSED = 3.0  # of a via-point's deviations: more is a miss
 _WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
 
@@ -74,7 +74,7 @@ class Database(Immutable):
         A derivative neither replaces a point nor is replaced.
         """
         values, near = via.inputs[via.values], np.zeros(len(self), dtype=bool)
-        step = max(1, _DISTANCES // len(self))
+        step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):
             distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
             if self.functionals.directions is not None:

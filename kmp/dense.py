@@ -35,7 +35,7 @@ class Dense(Immutable):
     """
 
     # A copy in another process predicts at once; only `adapted` would need the factors again.
-    _not_pickled = frozenset({"_factor", "_covariance_factor"})
+    _not_pickled = frozenset({"mean_factor", "covariance_factor"})
 
     hyperparameters: Hyperparameters
     database: Database
@@ -63,21 +63,21 @@ class Dense(Immutable):
 
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
-        solution, _ = lapack.dpotrs(self._factor, right.reshape(len(self._factor), -1), lower=1)
+        solution, _ = lapack.dpotrs(self.mean_factor, right.reshape(len(self.mean_factor), -1), lower=1)
         return np.ascontiguousarray(solution).reshape(right.shape)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
-        self._covariance_factor  # noqa: B018
+        self.covariance_factor  # noqa: B018
         return self
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        root = self._inverse_factor.times_one(row.T)
+        root = self.inverse_factor.times_one(row.T)
         own = self._prior_covariance if prior is None else kron_identity(prior, self.apart)
         return self._of_all(np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1)))
 
     def posterior_covariance(self, rows: Array) -> Array:
-        roots = self._inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
+        roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
         return self._of_all(np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots))
 
     def adapted(self, changes: Changes) -> Dense:
@@ -110,20 +110,20 @@ class Dense(Immutable):
         return frozen(kron_identity(self.hyperparameters.kernel.prior_variance, self.apart))
 
     @cached_property
-    def _inverse_factor(self) -> InverseCholeskyFactor:
-        return InverseCholeskyFactor.of(self._covariance_factor, self.apart)
+    def inverse_factor(self) -> InverseCholeskyFactor:
+        return InverseCholeskyFactor.of(self.covariance_factor, self.apart)
 
     @cached_property
-    def _factor(self) -> Array:
-        return self._factorised(self.hyperparameters.lambda_mean, self.base._factor if self.base else None)
+    def mean_factor(self) -> Array:
+        return self._factorised(self.hyperparameters.lambda_mean, self.base.mean_factor if self.base else None)
 
     @cached_property
-    def _covariance_factor(self) -> Array:
+    def covariance_factor(self) -> Array:
         parameters = self.hyperparameters
         self._check_resolved()
         if parameters.lambda_covariance == parameters.lambda_mean:
-            return self._factor
-        return self._factorised(parameters.lambda_covariance, self.base._covariance_factor if self.base else None)
+            return self.mean_factor
+        return self._factorised(parameters.lambda_covariance, self.base.covariance_factor if self.base else None)
 
     def _check_resolved(self) -> None:
         """Raises ValueError where rounding, some 1e-15 of k(s, s), would hide the covariance."""

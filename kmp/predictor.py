@@ -41,7 +41,7 @@ class Uncertainty(Immutable):
 class Predictor(Immutable):
     """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
 
-    _solution: Solution
+    solution: Solution
 
     @property
     @abstractmethod
@@ -56,8 +56,8 @@ class Predictor(Immutable):
         """
         s = self._checked_many(queries)
         if len(s) == 1:
-            return self._query.mean(self._query.row(s[0]))[None]
-        return mean_at(self._solution, s)
+            return self.query.mean(self.query.row(s[0]))[None]
+        return mean_at(self.solution, s)
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -69,13 +69,13 @@ class Predictor(Immutable):
         """
         s = self._checked_many(queries)
         if len(s) == 1:
-            row = self._query.row(s[0])
-            by = self._compiled_query or self._query
-            return unchecked(self._query.mean(row)[None], by.covariance(row.kernel)[None])
+            row = self.query.row(s[0])
+            by = self.compiled_query or self.query
+            return unchecked(self.query.mean(row)[None], by.covariance(row.kernel)[None])
         batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
-        posterior = [self._solution.posterior_covariance(self._rows(one)) for one in batches]
+        posterior = [self.solution.posterior_covariance(self._rows(one)) for one in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
-        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self._query.covariance_scale)
+        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.query.covariance_scale)
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -86,8 +86,8 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
-        posterior = self._solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        covariance = nearest_positive_semidefinite(posterior[None]) * self._query.covariance_scale
+        posterior = self.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
+        covariance = nearest_positive_semidefinite(posterior[None]) * self.query.covariance_scale
         return unchecked(self.mean(s).reshape(1, -1), covariance)
 
     def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
@@ -120,20 +120,20 @@ class Predictor(Immutable):
         Raises ValueError if a shape is another or a number is not finite.
         """
         s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
-        compiled = self._compiled_query
+        compiled = self.compiled_query
         if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
             found = compiled.motion(s, v, a, covariance=covariance)
             if found is not None:
                 return found
         checked = self._checked("velocity", v), self._checked("acceleration", a)
-        return self._query.motion(self._one_query(s), *checked, covariance=covariance)
+        return self.query.motion(self._one_query(s), *checked, covariance=covariance)
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
 
         Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
         """
-        return self._query.jacobian(self._query.row(self._one_query(query)))
+        return self.query.jacobian(self.query.row(self._one_query(query)))
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). The numbers are `jacobian`'s, but for rounding.
@@ -157,7 +157,7 @@ class Predictor(Immutable):
         makes. Raises ValueError if a shape is another or a number is not finite.
         """
         s, v = self._one_query(query), self._checked("direction", direction)
-        return self._query.curvature(self._query.row(s), v)
+        return self.query.curvature(self.query.row(s), v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), split: how demonstrations vary, how far they are.
@@ -170,48 +170,48 @@ class Predictor(Immutable):
         c = self.kernel.channels
         z = self._spanned(Functionals(s)).T.reshape(len(s), c, -1)
         residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
-        distance = nearest_positive_semidefinite(residual) * self._query.covariance_scale
+        distance = nearest_positive_semidefinite(residual) * self.query.covariance_scale
         return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
 
     @property
     def kernel(self) -> Kernel:
         """The kernel k."""
-        return self._solution.hyperparameters.kernel
+        return self.solution.hyperparameters.kernel
 
     @property
     def lambda_mean(self) -> float:
         """lambda of equation (9) [1 / (unit of the outputs)^2]."""
-        return self._solution.hyperparameters.lambda_mean
+        return self.solution.hyperparameters.lambda_mean
 
     @property
     def lambda_covariance(self) -> float:
         """lambda of the covariance [1 / (unit of the outputs)^2]."""
-        return self._solution.hyperparameters.lambda_covariance
+        return self.solution.hyperparameters.lambda_covariance
 
     @property
     def prior_mean(self) -> Array:
         """(O,) [unit of the outputs] what the mean returns to far from the inputs."""
-        return self._solution.hyperparameters.prior_mean
+        return self.solution.hyperparameters.prior_mean
 
     @property
     def outputs(self) -> int:
         """O, the number of outputs."""
-        return self._solution.hyperparameters.outputs
+        return self.solution.hyperparameters.outputs
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
         """How the primitive is solved."""
-        return self._solution.representation
+        return self.solution.representation
 
     @property
     def weights(self) -> Array:
         """Those of equation (8): alpha (N, O) of equation (9), or those of the low rank centres."""
-        return self._solution.weights
+        return self.solution.weights
 
     @property
     def centres(self) -> Array:
         """(N, I) what the weights belong to: reference points that stay, and via-points."""
-        return self._solution.centres
+        return self.solution.centres
 
     @property
     def error_bound(self) -> float:
@@ -220,28 +220,30 @@ class Predictor(Immutable):
         An upper bound: 0 for the dense solution; for the low rank one rigorous but for rounding,
         and pessimistic by one to three orders.
         """
-        return self._solution.error_bound
+        return self.solution.error_bound
 
     @cached_property
-    def _query(self) -> Query:
-        return Query.of(self._solution, self._count)
+    def query(self) -> Query:
+        """What a single query reads, laid out for it."""
+        return Query.of(self.solution, self._count)
 
     @cached_property
-    def _compiled_query(self) -> CompiledQuery | None:
-        return CompiledQuery.of(self._query)
+    def compiled_query(self) -> CompiledQuery | None:
+        """The same as compiled loops, where Numba is installed and knows the kernel; else None."""
+        return CompiledQuery.of(self.query)
 
     @cached_property
     def _spanned(self) -> Features:
-        known = self._solution.functionals
+        known = self.solution.functionals
         return Features.of(self.kernel, known, rank=len(known), tolerance=_RESIDUAL)[0]
 
     @cached_property
     def _dimensions(self) -> int:
-        return int(self._solution.database.inputs.shape[1])
+        return int(self.solution.database.inputs.shape[1])
 
     def _rows(self, queries: Array, directions: Array | None = None) -> Array:
         """k of M queries, or their derivatives, and what is known: (M C, R C)."""
-        return between(self.kernel, Functionals(queries, directions), self._solution.functionals)
+        return between(self.kernel, Functionals(queries, directions), self.solution.functionals)
 
     def _wrapped(self, queries: Array) -> Array:
         """The queries, within the period where there is one: no seam, not even rounding's."""

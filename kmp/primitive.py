@@ -37,8 +37,8 @@ class KMP(Predictor):
     for bit, however the primitive came about.
     """
 
-    _solution: Solution
-    _changes: Changes
+    solution: Solution
+    changes: Changes
     _base: KMP | None = None
 
     def __repr__(self) -> str:
@@ -133,7 +133,7 @@ class KMP(Predictor):
             raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
         points = Functionals.checked(via, directions)
         adapted = self._through(points, desired, tolerance)
-        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
         return adapted
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
@@ -153,7 +153,7 @@ class KMP(Predictor):
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
         adapted = self._through(points, desired, 0.0)
-        warn_of_missed(desired, mean_of(adapted._solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
         return adapted
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
@@ -172,34 +172,34 @@ class KMP(Predictor):
         ):
             if given != needed:
                 raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
-        solution: Solution = self._solution
+        solution: Solution = self.solution
         if isinstance(solution, Constrained):
             constraints = solution.constraints.joined(constraints)
             solution = solution.solution
         if not isinstance(solution, Dense):
             raise ValueError('constraints: representation "low_rank" given, "dense" needed; fit the primitive so.')
-        return KMP(Constrained(solution, constraints).solved(), self._changes, self.base)
+        return KMP(Constrained(solution, constraints).solved(), self.changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        points = self.base._solution.database.functionals
+        points = self.base.solution.database.functionals
         check_pairs(points.inputs, reference, self.outputs)
-        database, parameters = Database(points, reference), self._solution.hyperparameters
+        database, parameters = Database(points, reference), self.solution.hyperparameters
         fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         if self is self.base:
             return fitted
-        changed: Solution = fitted._solution.adapted(self._changes) if len(self.via_inputs) else fitted._solution
-        before: Solution = self._solution
+        changed: Solution = fitted.solution.adapted(self.changes) if len(self.via_inputs) else fitted.solution
+        before: Solution = self.solution
         if isinstance(before, Constrained) and isinstance(changed, Dense):
             changed = Constrained(changed, before.constraints)
-        return KMP(changed.solved(), self._changes, fitted)
+        return KMP(changed.solved(), self.changes, fitted)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
-        return named_arrays.to_arrays(self.base._solution, self._changes, self._solution)
+        return named_arrays.to_arrays(self.base.solution, self.changes, self.solution)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> KMP:
@@ -216,14 +216,14 @@ class KMP(Predictor):
     def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
         if len(points) == 0:
             return self
-        before = self._changes
-        nearest = self.base._solution.database.nearest(points, tolerance, self.kernel.period)
+        before = self.changes
+        nearest = self.base.solution.database.nearest(points, tolerance, self.kernel.period)
         changes = Changes(
             frozen(np.union1d(before.replaced, nearest)),
             Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )
-        return KMP(self._solution.adapted(changes).solved(), changes, self.base)
+        return KMP(self.solution.adapted(changes).solved(), changes, self.base)
 
     @property
     def _count(self) -> int:
@@ -237,24 +237,24 @@ class KMP(Predictor):
     @property
     def inputs(self) -> Array:
         """(N, I) the reference points: the base's that were not replaced, then the via-points."""
-        return self._solution.database.inputs
+        return self.solution.database.inputs
 
     @property
     def reference(self) -> Gaussians:
         """The N reference points."""
-        return self._solution.database.reference
+        return self.solution.database.reference
 
     @property
     def via_inputs(self) -> Array:
         """(V, I) where the via-points are."""
-        return self._changes.inputs
+        return self.changes.inputs
 
     @property
     def via_directions(self) -> Array:
         """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
-        return self._changes.functionals.along
+        return self.changes.functionals.along
 
     @property
     def via_points(self) -> Gaussians:
         """The V via-points."""
-        return self._changes.points
+        return self.changes.points

@@ -6,12 +6,12 @@ from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from tests_paths import RECORDINGS
 
 from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
@@ -19,6 +19,8 @@ from service.core import warm_up
 from service.core.skill.skill import Skill
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import decoded
+from support import vulkan
+from support.paths import RECORDINGS
 
 
 class _NoBench:
@@ -57,3 +59,15 @@ def skill() -> Skill:
     """The shipped soldering skill, without places."""
     path = RECORDINGS / "soldering.npz"
     return decoded(path.read_bytes(), origin=str(path))
+
+
+@pytest.fixture(scope="session")
+def drawing() -> None:
+    """That the viewer can draw without a screen: whoever asks for it is skipped where it cannot.
+
+    Asked in a process of its own, as a driver brings libraries of its own.
+    """
+    if sys.platform == "linux":
+        found = subprocess.run([sys.executable, vulkan.__file__], capture_output=True, text=True, check=False)
+        if found.stdout.strip() in {"", "0"}:
+            pytest.skip("drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers")

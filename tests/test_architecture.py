@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests_paths import ROOT
 
 import kmp
+from support.paths import ROOT
 
 PACKAGES = ("kmp", "service", "sim")
 OUTSIDE = {
@@ -22,6 +22,7 @@ OUTSIDE = {
 }
 VAGUE = {"utils", "util", "common", "base", "manager", "helper", "helpers", "node", "interface", "misc"}
 MOST_LINES, MORE_IN_TESTS = 400, 100
+PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
 MODULES = sorted(path for package in (*PACKAGES, "tests") for path in (ROOT / package).rglob("*.py"))
 PURE = sorted(path for room in ("core", "contract") for path in (ROOT / "service" / room).rglob("*.py"))
 ENTRY_POINTS = [
@@ -29,20 +30,41 @@ ENTRY_POINTS = [
     for path in MODULES
     if not path.is_relative_to(ROOT / "tests") and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
 ]
-PLANTED = [
-    ("service/core/intake/intake.py", "import time"),
-    ("service/core/frame.py", "from service.daemon.clock import Deadlines"),
-    ("service/contract/cdr.py", "import numpy"),
-    ("service/contract/channels.py", "from service.core.frame import Tick"),
-    ("service/learning/learn.py", "import mcap"),
-    ("service/recording/scribe.py", "from service.daemon.clock import Deadlines"),
-    ("service/daemon/clock.py", "from service.cli.usage import UsageError"),
-    ("service/core/skill/skill.py", "from service.learning.learn import learn"),
-    ("kmp/gmm.py", "import msgspec"),
-    ("kmp/gmm.py", "from service.config import Settings"),
-    ("service/config.py", "from sim.scene import Scene"),
-    ("service/somewhere_else.py", '"""A module outside of every room."""'),
-]
+PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
+    "what comes from outside": (
+        {
+            "service/core/intake/intake.py": "import time",
+            "service/contract/cdr.py": "import numpy",
+            "service/learning/learn.py": "import mcap",
+            "kmp/gmm.py": "import msgspec",
+        },
+        {
+            "the core has no clock and no input or output",
+            "the contract imports the standard library and msgspec only",
+            "learning opens no network and no recording",
+            "the mathematics stands alone",
+        },
+    ),
+    "the order of rooms": (
+        {
+            "service/core/frame.py": "from service.daemon.clock import Deadlines",
+            "service/contract/channels.py": "from service.core.frame import Tick",
+            "service/recording/scribe.py": "from service.daemon.clock import Deadlines",
+            "service/daemon/clock.py": "from service.cli.usage import UsageError",
+            "service/core/skill/skill.py": "from service.learning.learn import learn",
+            "kmp/gmm.py": "from service.config import Settings",
+            "service/config.py": "from sim.scene import Scene",
+        },
+        {
+            "sim may use service and kmp, service may use kmp, never back",
+            "inside the service, the commands use the processes, these the core, the core the contract",
+        },
+    ),
+    "a module outside of every room": (
+        {"service/somewhere_else.py": '"""A module."""'},
+        {"inside the service, the commands use the processes, these the core, the core the contract"},
+    ),
+}
 
 
 def named(path: Path) -> str:
@@ -71,7 +93,7 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
         timeout=120,
         check=False,
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder)},
+        env=os.environ | {"PYTHONPATH": str(folder), "COLUMNS": "200"},
     )
 
 
@@ -81,15 +103,23 @@ def test_import_contracts_hold() -> None:
     assert "0 broken" in done.stdout
 
 
-@pytest.mark.parametrize(("path", "line"), PLANTED, ids=[f"{path}: {line}" for path, line in PLANTED])
-def test_an_import_that_breaks_a_contract_is_found(path: str, line: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("lines", "broken"), PLANTED.values(), ids=PLANTED)
+def test_lines_that_break_a_contract_are_found_and_named(
+    lines: dict[str, str], broken: set[str], tmp_path: Path
+) -> None:
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for package in PACKAGES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    with (tmp_path / path).open("a", encoding="utf-8") as file:
-        file.write(f"\n{line}\n")
+    for path, line in lines.items():
+        with (tmp_path / path).open("a", encoding="utf-8") as file:
+            file.write(f"\n{line}\n")
     done = contracts(tmp_path)
     assert done.returncode == 1, done.stdout
+    assert broken <= set(re.findall(r"^(.*) BROKEN$", done.stdout, re.MULTILINE)), done.stdout
+    for path, line in lines.items():
+        module = path.removesuffix(".py").replace("/", ".")
+        brought = f" -> {line.split()[1]} (l." if "import" in line else "\n"
+        assert f"- {module}{brought}" in re.sub("-  +", "- ", done.stdout), done.stdout
 
 
 @pytest.mark.parametrize("path", PURE, ids=named)
@@ -130,6 +160,24 @@ def test_a_module_is_short_enough_to_be_read(path: Path) -> None:
 
 def test_no_module_has_a_name_that_says_nothing() -> None:
     assert [named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE] == []
+
+
+def test_tests_share_what_stands_in_support_and_never_import_each_other() -> None:
+    tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
+    theirs = {path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")} | {"tests"}
+    assert [named(path) for path in tests if imported(path) & theirs] == []
+
+
+def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
+    """Nor as an attribute, which the linter finds."""
+    found = []
+    for path in (path for path in MODULES if path.is_relative_to(ROOT / "tests")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+                found += [f"{named(path)}: {name.name}" for name in node.names if re.match("_[a-z]", name.name)]
+            elif isinstance(node, ast.Constant) and re.search(PRIVATE, str(node.value)):
+                found.append(f"{named(path)}: {node.value}")
+    assert found == []
 
 
 def test_everything_that_the_mathematics_offers_is_there_and_sorted() -> None:

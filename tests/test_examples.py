@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cell import serving
-from tests_paths import ROOT
+
+from support.cell import serving
+from support.paths import ROOT
 
 EXAMPLES = ROOT / "examples"
 

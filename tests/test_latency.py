@@ -21,18 +21,18 @@ PLANTED = """
 from service import one_blas_thread
 import sys, threading, time
 from service.cli.main import main
-from service.daemon.daemon import Daemon
+from service.daemon.streams import Streams
 
 def busy(seconds):
     until = time.perf_counter() + seconds
     while time.perf_counter() < until:
         pass
 
-publish = Daemon._publish
+receive = Streams.receive
 if {thread}:
     threading.Thread(target=busy, args=(1e3,), daemon=True).start()
 else:
-    Daemon._publish = lambda self, tick, frame: (busy(0.001), publish(self, tick, frame))
+    Streams.receive = lambda self: (busy(0.001), receive(self))[1]
 sys.exit(main(sys.argv[1:]))
 """
 

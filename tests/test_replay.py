@@ -11,9 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_process import ASSUMED, ticks_of
-from tests_paths import RECORDINGS
-from wam import URDF
 
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, run
@@ -25,6 +22,9 @@ from service.recording.replay import replay
 from sim.golden import refresh
 from sim.scene import Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, ticks_of
+from support.paths import RECORDINGS
+from support.wam import URDF
 
 GOLDEN = RECORDINGS / "golden.mcap"
 

@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests_paths import ROOT
+
+from support.paths import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings") for path in folder.glob("*.md"))

@@ -6,7 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from tests_paths import ROOT
+
+from support.paths import ROOT
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests_paths import ROOT
 
 from service.contract import cdr
 from service.contract.messages import PoseStamped
+from support.paths import ROOT
 
 
 def example(name: str) -> ModuleType:

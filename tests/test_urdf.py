@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from wam import JOINT_NAMES, URDF
 
 from service.urdf import Urdf, UrdfError, multiply
+from support.wam import JOINT_NAMES, URDF
 
 
 def test_the_chain_to_the_tool_has_the_joints_in_order_with_their_limits() -> None:

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 from hatchling.builders.wheel import WheelBuilder
-from tests_paths import ROOT
+
+from support.paths import ROOT
+
+EXPERIMENTS = ROOT / "sim" / "experiments"
 
 
 @pytest.fixture(scope="module")
@@ -23,12 +26,23 @@ def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(
     with zipfile.ZipFile(wheel) as archive:
         held = set(archive.namelist())
     sources = {
-        str(path.relative_to(ROOT)) for name in ("kmp", "service", "sim") for path in (ROOT / name).rglob("*.py")
+        str(path.relative_to(ROOT))
+        for name in ("kmp", "service", "sim")
+        for path in (ROOT / name).rglob("*.py")
+        if not path.is_relative_to(EXPERIMENTS)
     }
     assert sources <= held
     assert {"service/arms/wam.urdf", "service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
     assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"kmp", "service", "sim"}
     assert "kmp/pyproject.toml" not in held
+
+
+def test_it_does_without_the_experiments(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+    assert [name for name in held if name.startswith("sim/experiments")] == []
+    assert [name for name, text in held.items() if re.search(r"(from|import) sim(\.| import )experiments", text)] == []
+    assert EXPERIMENTS.is_dir()
 
 
 def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(wheel: Path) -> None:

@@ -24,7 +24,7 @@ from kmp.low_rank.features import BLOCK, Features
 
 RANK = 400
 TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
-_KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are made again for each pass
+KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are made again for each pass
 _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
@@ -63,7 +63,7 @@ class LowRank(Immutable):
         def lifted(start: int) -> Array:
             return features(points.take(slice(start, start + BLOCK))).T.reshape(-1, c, r)
 
-        z = cache(lifted) if len(points) * c * r <= _KEPT else lifted
+        z = cache(lifted) if len(points) * c * r <= KEPT else lifted
         total = np.zeros((r, d, r, d))
         for block in blocks:
             _add_information(total, z(block.start), precision[block])
@@ -157,13 +157,13 @@ class LowRank(Immutable):
         """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(row[..., : len(self.centres) * c : c].T)
-        return z.reshape(len(self.centres), -1), self._inverse_factor.times_one(z)
+        return z.reshape(len(self.centres), -1), self.inverse_factor.times_one(z)
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(rows[:, : len(self.centres) * c : c].T)
-        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self._inverse_factor.times_many(z, c)
+        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.inverse_factor.times_many(z, c)
 
     def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
         """k(s, s) less what the features explain (..., C, C), for each output: (..., O, O)."""
@@ -184,7 +184,7 @@ class LowRank(Immutable):
         return _factorised(self.information, parameters.lambda_covariance)
 
     @cached_property
-    def _inverse_factor(self) -> InverseCholeskyFactor:
+    def inverse_factor(self) -> InverseCholeskyFactor:
         return InverseCholeskyFactor.of(self.covariance_factor, self.w.shape[1])
 
 

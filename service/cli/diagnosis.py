@@ -9,9 +9,9 @@ import msgspec
 
 from service.cli.status import AHEAD_MS
 from service.contract.channels import BY_KEY, key
-from service.contract.incidents import SOURCE_NAMES, in_brief, remedy
+from service.contract.incidents import SOURCE_NAMES, Evidence, explained, in_brief, remedy
 from service.contract.messages import Vector3
-from service.contract.records import SIDES
+from service.contract.records import SIDES, Reason
 from service.contract.requests import Source, Status
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
@@ -126,14 +126,12 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > OFTEN * came else "note"
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", remedy(cause))
-    if share > OFTEN:
-        wanted = f"one publisher of {key(now.cell, KEYS[name])}"
-        yield wrong(what, f"{share:.0%} of what comes contradicts the rest", wanted, remedy("two_sources"))
-    if source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM:
-        wanted = (
-            f"less than {NOISY_MM:g} mm: one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
-        )
-        yield wrong(what, f"its samples scatter by {source.scatter_mm:.0f} mm an axis", wanted, remedy("two_sources"))
+    noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM
+    if share > OFTEN or noisy:
+        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, OFTEN, NOISY_MM)
+        found = explained(Reason.TWO_SOURCES, seen)
+        wanted = f"one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
+        yield wrong(what, found.why, wanted, found.what_to_do)
 
 
 def _driver(now: Status) -> Finding:

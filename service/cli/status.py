@@ -113,7 +113,7 @@ def rows(now: Status) -> dict[str, str]:
     )
     found = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
-        "because": now.because,
+        "why": now.because,
         "what to do": now.remedy,
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
@@ -165,13 +165,16 @@ def _at(point: tuple[float, float, float] | None) -> str:
 
 def _where(now: Status, side: str) -> str:
     source = now.sources.get(side, Source())
+    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _coming(source)
+
+
+def _coming(source: Source) -> str:
+    """How often something comes of a source and how old it is, or since when nothing does."""
     why = f" as {source.cause}" if source.cause else ""
     refused = f"; {source.rate_hz:.0f} messages/s are rejected{why}" if source.rate_hz else ""
-    if source.age_ms is None:
-        return f"not seen yet{refused}"
-    if not source.fresh:
-        return f"not seen for {source.age_ms / 1000:.1f} s{refused}"
-    return f"{_at(now.hands_m.get(side))}, {source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
+    if source.fresh:
+        return f"{source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
+    return ("not seen yet" if source.age_ms is None else f"not seen for {source.age_ms / 1000:.1f} s") + refused
 
 
 def _nearest(now: Status) -> str:
@@ -184,14 +187,11 @@ def _nearest(now: Status) -> str:
 
 
 def _arm(now: Status) -> str:
-    source = now.sources.get("arm")
-    if source is None:
+    if "arm" not in now.sources:
         return "assumed, not measured"
-    heard = "commands are heard" if now.command_heard else "nobody listens to commands"
-    if source.age_ms is None:
-        return "nothing came yet" + (f"; {source.rate_hz:.0f} messages/s are rejected" if source.rate_hz else "")
-    age = f"{source.age_ms:.0f} ms old" if source.fresh else f"silent for {source.age_ms / 1000:.1f} s"
-    return f"{source.rate_hz:.0f} Hz, {age}, {heard}"
+    return (
+        f"{_coming(now.sources['arm'])}; {'commands are heard' if now.command_heard else 'nobody listens to commands'}"
+    )
 
 
 def _off(now: Status) -> str:

@@ -1,137 +1,321 @@
-"""What each word of a status means and what to do about it: the one table of modes, reasons, flags
-and causes of rejection.
+"""Why the arm does what it does, in words: the one place where a mode, a reason, a flag or a cause
+of rejection is explained, with the figures known at the time, and what to do about it.
 
-`status`, `doctor`, the daemon's log and docs/incidents.md all take their words from here.
+Status, `doctor`, log, viewer, report and docs/incidents.md take their words from here. A new reason
+is a member in records.py, its words here, and the stage that decides it.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, Literal, NamedTuple, TypeAlias, assert_never
+
+from service.contract.messages import JointState, PoseStamped
+from service.contract.records import SIDES, Cause, Flag, Mode, Reason
+from service.contract.requests import Source
 
 SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
+MALFORMED: Final = "malformed"  # bytes that could not be decoded: counted beside the causes
+FAULTS = (Reason.ARM_ERROR, Reason.ARM_SILENT, Reason.TOOL_SPEED, Reason.SETPOINT, Reason.SERVICE)  # all others: holds
+LONGEST_NAME = 64  # of a frame
+FULL_TURN_RAD = 7.0  # no joint is farther from its zero
+
+Excess: TypeAlias = tuple[float, float]  # a value, and the greatest that is accepted
+Member: TypeAlias = Mode | Reason | Flag | Cause | Literal["malformed"]
 
 
 class Incident(NamedTuple):
-    """One word of a status: what happened, and what to do."""
+    """What a member means, what to do about it, and what was found, where figures were known."""
 
     about: str
     remedy: str
+    found: str = ""
+
+    @property
+    def why(self) -> str:
+        """The sentence for people."""
+        return (self.found or self.about).replace("`", "")
+
+    @property
+    def what_to_do(self) -> str:
+        """The remedy for people."""
+        return self.remedy.replace("`", "")
 
 
-MODES = {
-    "follow": Incident("follows the hands", "with any reason below"),
-    "hold": Incident(
-        "has come to rest, or is on its way there, within its limits",
-        "by itself once the reason is gone; after `hold` by `thirdhand resume`",
-    ),
-    "fault": Incident(
-        "has come to rest; commands are no longer sent", "by `thirdhand reset`, once the cause is mended"
-    ),
-}  # what the arm does; and how the mode ends
+class Outside(NamedTuple):
+    """A joint's value outside of what is accepted."""
 
-HOLDS = {
-    "no_hands": Incident(
-        "a hand has not been seen since the start",
-        "start the tracker; `hand_age_ms` in the status names the hands that are there",
-    ),
-    "stale_hand": Incident(
-        "no accepted sample of a hand for 100 ms",
-        "look at the tracker; growing counters under `rejected` mean that samples come and are refused",
-    ),
-    "far_from_demonstrations": Incident(
-        "the skill is not sure where the tool belongs with the hands as they are",
-        "bring the hands back to where it was demonstrated, or demonstrate this too",
-    ),
-    "two_sources": Incident(
-        "a quarter of what came in the last second says that a hand, or the arm, is somewhere else; or a hand's "
-        "samples scatter by more than 12 mm",
-        "two trackers or drivers publish under one key: stop one; `rejected` counts `older` and `jumped` meanwhile",
-    ),
-    "operator": Incident("somebody asked for it", "`thirdhand resume`"),
-    "arm_not_ready": Incident(
-        "the arm has not told where it is",
-        "start the arm's driver; `joints/state` must name the joints as `joints/command` does",
-    ),
-}
-FAULTS = {
-    "arm_error": Incident(
-        "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`",
-        "see what blocked or pushed it, then `thirdhand reset`",
-    ),
-    "arm_silent": Incident(
-        "the arm told nothing for 100 ms while it was to move",
-        "look at its driver and the network, then `thirdhand reset`",
-    ),
-    "tool_speed": Incident(
-        "the tool was measured faster than `[tool] fault_speed` for 30 ms",
-        "the arm does not do what it is told: check the driver before `thirdhand reset`",
-    ),
-    "setpoint": Incident("a bound of the setpoint was passed, which cannot happen", "keep the recording and report it"),
-    "service": Incident(
-        "a thread or the loop of the service failed; it is begun anew, and the log says which and why",
-        "keep log and recording, report it, then `thirdhand reset`",
-    ),
-}
-REASONS = HOLDS | FAULTS
+    joint: str
+    value: float
+    low: float
+    high: float
+    unit: str = "rad"
 
-FLAGS = {
-    "target_clamped": Incident(
-        "the target lies outside the workspace or the arm's reach; the nearest point inside is taken",
-        "come nearer, or move the place",
-    ),
-    "speed_limited": Incident(
-        "the hands ask for more than the tool's or a joint's limits", "nothing: the tool arrives later"
-    ),
-    "near_joint_limit": Incident(
-        "a joint is close to its position limit; the tool's direction may give way",
-        "work from where the arm is less bent",
-    ),
-    "separation": Incident(
-        "a hand, the table, a configured box or the arm itself is near; the arm goes slower toward it, or stops",
-        "give it room; `hand_distance_m` and `hand_limit_m_s` in the status say how near and how fast",
-    ),
-}
 
-MALFORMED = "malformed"
-REJECTIONS = {
-    "not_finite": Incident(
-        "a NaN, an infinity", "publish nothing while the tracker has lost the hand, or the driver a joint"
-    ),
-    "not_a_rotation": Incident(
-        "a quaternion that is not of norm 1", "send `0 0 0 1` for an orientation that is not measured"
-    ),
-    "out_of_range": Incident(
-        "a position no hand or arm can have",
-        "for a tracker in millimetres set `[hands] unit`; joints are in radians, from the URDF's zero",
-    ),
-    "repeated": Incident("the same stamp again", "stamp each sample when it was measured, and send it once"),
-    "older": Incident(
-        "a stamp before the newest", "stop the second tracker or driver of this key; look for a network that reorders"
-    ),
-    "ahead": Incident(
-        "a stamp farther ahead than the time that has passed",
-        "mend the publisher's clock; it is believed once the source was silent",
-    ),
-    "jumped": Incident(
-        "a hand or a joint that leapt; a hand is believed after three samples over 20 ms that agree",
-        "look for reflections and for a second source",
-    ),
-    "swapped": Incident(
-        "a hand where the other one was, and the other where it was; believed after 2 s",
-        "the tracker takes left for right: let it see both hands apart for a moment",
-    ),
-    "wrong_frame": Incident(
-        "a pose in a frame that is neither `base` nor the configured one",
-        "set `[hands] frame` and `base_from_tracker`, or publish in `base`",
-    ),
-    "incomplete": Incident(
-        "joints that are not all there",
-        "publish all joints under the names that `joints/command` has, one position each",
-    ),
-    MALFORMED: Incident("bytes that are no such message", "publish the type and encoding of the wire's table"),
-}  # what came; under `malformed KEY` the last one in the status
+class Evidence(NamedTuple):
+    """What is known at the time; what is not is left out."""
 
-EVERY = MODES | REASONS | FLAGS | REJECTIONS
+    sources: Mapping[str, Source] = MappingProxyType({})
+    contested: float = 0.0  # accepted share of samples that contradict the rest
+    scatter_mm: float = 0.0  # accepted of a hand's samples
+    deviation_m: Excess | None = None  # from what the skill knows
+    between_places: bool = False  # that is a hand's distance; else the target's standard deviation
+    outside: Outside | None = None
+    error_rad: Excess | None = None  # of a joint from its command, at the fault
+    worst_joint: tuple[str, float] | None = None  # the one farthest from its command now [rad]
+    measured_speed: Excess | None = None  # of the tool [m/s]
+    commanded_speed: Excess | None = None
+    failure: str = ""  # of the service
+    # of a sample that was rejected:
+    sample: PoseStamped | JointState | None = None
+    newest_ns: int = 0  # stamp of the newest one accepted before
+    frames: tuple[str, ...] = ()  # that are accepted
+    mistake: str = ""  # in its unit, its names or its bytes
+
+
+NOTHING = Evidence()
+NO_SAMPLE = PoseStamped(0, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def word(member: Member) -> str:
+    """The word for a member in statuses and recordings; empty for no reason."""
+    return member if isinstance(member, str) else "" if member is Reason.NONE else str(member.name).lower()
+
+
+def explained(member: Member, seen: Evidence = NOTHING) -> Incident:
+    """What a member means, with what was seen; a new one does not type-check until it is told."""
+    match member:
+        case Mode():
+            return Incident(*_mode(member))
+        case Reason():
+            return _reason(member, seen)
+        case Flag():
+            return Incident(*_flag(member))
+        case Cause() | "malformed":
+            return _cause(member, seen)
+        case _:
+            assert_never(member)
+
+
+def _mode(mode: Mode) -> tuple[str, str]:
+    """What the arm does, and how the mode ends."""
+    match mode:
+        case Mode.FOLLOW:
+            return "follows the hands", "with any reason below"
+        case Mode.HOLD:
+            ends = "by itself once the reason is gone; after `hold` by `thirdhand resume`"
+            return "has come to rest, or is on its way there, within its limits", ends
+        case Mode.FAULT:
+            ends = "by `thirdhand reset`, once the cause is mended"
+            return "has come to rest; commands are no longer sent", ends
+        case _:
+            assert_never(mode)
+
+
+def _reason(reason: Reason, seen: Evidence) -> Incident:
+    found = ""
+    match reason:
+        case Reason.NONE:
+            about = remedy = ""
+        case Reason.NO_HANDS:
+            about, found = "a hand has not been seen since the start", _unseen(seen)
+            remedy = "start the tracker; `hand_age_ms` in the status names the hands that are there"
+            remedy = _of_rejected(seen, *SIDES) or remedy
+        case Reason.STALE_HAND:
+            about, found = "no accepted sample of a hand for 100 ms", _unseen(seen)
+            remedy = "look at the tracker; growing counters under `rejected` mean that samples come and are refused"
+            remedy = _of_rejected(seen, *SIDES) or remedy
+        case Reason.FAR_FROM_DEMONSTRATIONS:
+            about = "the skill is not sure where the tool belongs with the hands as they are"
+            remedy = "bring the hands back to where it was demonstrated, or demonstrate this too"
+            if seen.deviation_m is not None:
+                value_cm, accepted_cm = (100 * value for value in seen.deviation_m)
+                what = "a hand is off its places by" if seen.between_places else "the target's standard deviation is"
+                found = f"{what} {value_cm:.1f} cm, {accepted_cm:.1f} accepted"
+        case Reason.TWO_SOURCES:
+            about = "a quarter of what came in the last second says that a hand, or the arm, is somewhere else; or "
+            about += "a hand's samples scatter by more than 12 mm"
+            remedy = "two trackers or drivers publish under one key: stop one; "
+            remedy += "`rejected` counts `older` and `jumped` meanwhile"
+            found = _contest(seen)
+        case Reason.OPERATOR:
+            about, remedy = "somebody asked for it", "`thirdhand resume`"
+        case Reason.ARM_NOT_READY:
+            about, found = "the arm does not say where it is, or does not rest within its limits yet", _not_ready(seen)
+            remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
+            remedy = _of_rejected(seen, "arm") or remedy
+        case Reason.ARM_ERROR:
+            about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
+            remedy = "see what blocked or pushed it, then `thirdhand reset`"
+            if seen.error_rad is not None and seen.worst_joint is not None:
+                found = "a joint was {:.3f} rad off, {:g} accepted; ".format(*seen.error_rad)
+                found += "now {} is off by {:.3f} rad".format(*seen.worst_joint)
+        case Reason.ARM_SILENT:
+            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen.sources.get("arm"))
+            remedy = "look at its driver and the network, then `thirdhand reset`"
+        case Reason.TOOL_SPEED:
+            about = "the tool was measured faster than `[tool] fault_speed` for 30 ms"
+            remedy = "the arm does not do what it is told: check the driver before `thirdhand reset`"
+            if seen.measured_speed is not None:
+                found = "the tool was measured at {:.2f} m/s, {:g} accepted".format(*seen.measured_speed)
+            elif seen.commanded_speed is not None:
+                found = "a command came to {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
+        case Reason.SETPOINT:
+            about = "a bound of the setpoint was passed, which cannot happen"
+            remedy = "keep the recording and report it"
+        case Reason.SERVICE:
+            about = "a thread or the loop of the service failed; it is begun anew, and the log says which and why"
+            remedy, found = "keep log and recording, report it, then `thirdhand reset`", seen.failure
+        case _:
+            assert_never(reason)
+    return Incident(about, remedy, found)
+
+
+def _flag(flag: Flag) -> tuple[str, str]:
+    match flag:
+        case Flag.TARGET_CLAMPED:
+            about = "the target lies outside the workspace or the arm's reach; the nearest point inside is taken"
+            return about, "come nearer, or move the place"
+        case Flag.SPEED_LIMITED:
+            return "the hands ask for more than the tool's or a joint's limits", "nothing: the tool arrives later"
+        case Flag.NEAR_JOINT_LIMIT:
+            about = "a joint is close to its position limit; the tool's direction may give way"
+            return about, "work from where the arm is less bent"
+        case Flag.SEPARATION:
+            about = "a hand, the table, a configured box or the arm itself is near; the arm goes slower toward it, "
+            about += "or stops"
+            remedy = "give it room; `hand_distance_m` and `hand_limit_m_s` in the status say how near and how fast"
+            return about, remedy
+        case _:
+            assert_never(flag)
+
+
+def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
+    came, found = seen.sample or NO_SAMPLE, seen.mistake
+    apart_s, turned = (came.stamp_ns - seen.newest_ns) * 1e-9, getattr(came, "orientation", ())
+    at = f"at {figures(came.position)} in the tracker's frame" if turned else f"joints at {figures(came.position)}"
+    match cause:
+        case Cause.NOT_FINITE:
+            also = f", orientation {figures(turned)}" if turned else ""
+            about, found = "a NaN, an infinity", f"{at}{also}; finite numbers needed"
+            remedy = "publish nothing while the tracker has lost the hand, or the driver a joint"
+        case Cause.NOT_A_ROTATION:
+            norm = sum(v * v for v in turned) ** 0.5
+            about = "a quaternion that is not of norm 1"
+            remedy = "send `0 0 0 1` for an orientation that is not measured"
+            found = f"orientation {figures(turned)} of norm {norm:.3g}; norm 1 needed, x y z w"
+        case Cause.OUT_OF_RANGE:
+            about = "a position no hand or arm can have"
+            remedy = "for a tracker in millimetres set `[hands] unit`; joints are in radians, from the URDF's zero"
+            if (out := seen.outside) is not None:
+                like = ", which looks like degrees" if out.unit == "rad" and abs(out.value) > FULL_TURN_RAD else ""
+                found = f"{out.joint} at {out.value:.4g} {out.unit}{like}; {out.low:g} to {out.high:g} accepted"
+        case Cause.REPEATED:
+            about, remedy = "the same stamp again", "stamp each sample when it was measured, and send it once"
+            found = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
+        case Cause.OLDER:
+            about, found = "a stamp before the newest", f"stamped {-apart_s:.3g} s before the newest accepted one"
+            remedy = "stop the second tracker or driver of this key; look for a network that reorders"
+        case Cause.AHEAD:
+            about = "a stamp farther ahead than the time that has passed"
+            remedy = "mend the publisher's clock; it is believed once the source was silent"
+            found = f"stamped {apart_s:.3g} s after the newest accepted one"
+        case Cause.JUMPED:
+            about = "a hand or a joint that leapt; a hand is believed after three samples over 20 ms that agree"
+            remedy, found = "look for reflections and for a second source", f"{at}, from one sample to the next"
+        case Cause.SWAPPED:
+            about = "a hand where the other one was, and the other where it was; believed after 2 s"
+            remedy = "the tracker takes left for right: let it see both hands apart for a moment"
+            found = f"{at}, where the other hand was; left and right look exchanged"
+        case Cause.WRONG_FRAME:
+            about = "a pose in a frame that is neither `base` nor the configured one"
+            remedy = "set `[hands] frame` and `base_from_tracker`, or publish in `base`"
+            accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
+            found = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
+        case Cause.INCOMPLETE:
+            about = "joints that are not all there"
+            remedy = "publish all joints under the names that `joints/command` has, one position each"
+        case "malformed":
+            about, remedy = "bytes that are no such message", "publish the type and encoding of the wire's table"
+        case _:
+            assert_never(cause)
+    return Incident(about, remedy, found if seen.sample or seen.mistake else "")
+
+
+def _unseen(seen: Evidence) -> str:
+    """Since when which hand is not there, and what of it is rejected instead."""
+    said = []
+    for side in SIDES:
+        if (source := seen.sources.get(side)) is not None and not source.fresh:
+            since = "has not been seen yet" if source.age_ms is None else f"was last seen {_time(source.age_ms)} ago"
+            instead = f", as what comes is rejected as {source.cause}: {source.refused}" if _is_refused(source) else ""
+            said.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
+    return "; ".join(said)
+
+
+def _contest(seen: Evidence) -> str:
+    """Whose samples contradict each other, or scatter, and by how much."""
+    if not seen.sources:
+        return ""
+    name, source = max(seen.sources.items(), key=lambda item: item[1].contested)
+    what = f"{source.contested:.0%} of what came contradicts the rest"
+    if source.contested <= seen.contested:
+        name, source = max(seen.sources.items(), key=lambda item: item[1].scatter_mm or 0.0)
+        if source.scatter_mm is None:
+            return ""
+        what = f"what came scatters by {source.scatter_mm:.0f} mm an axis, {seen.scatter_mm:.0f} accepted"
+    return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
+
+
+def _silence(source: Source | None) -> str:
+    """For how long the arm says nothing; empty where it does."""
+    if source is None or source.fresh:
+        return ""
+    return "no joint states came yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"
+
+
+def _not_ready(seen: Evidence) -> str:
+    """What the arm lacks."""
+    source, out = seen.sources.get("arm"), seen.outside
+    if source is None:
+        return ""
+    if _is_refused(source):
+        return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
+    at = (
+        ""
+        if out is None
+        else f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+    )
+    return _silence(source) or at or "the arm has not told one posture for long enough"
+
+
+def _is_refused(source: Source) -> bool:
+    """Whether something comes of a source, and nothing of it is accepted."""
+    return source.rate_hz > 0 and not source.fresh and bool(source.cause)
+
+
+def _of_rejected(seen: Evidence, *needed: str) -> str:
+    """What to do about the first needed source whose samples are all rejected."""
+    refused = (source for name in needed if (source := seen.sources.get(name)) is not None and _is_refused(source))
+    return next((BY_WORD[source.cause].remedy for source in refused), "")
+
+
+def _time(duration_ms: float) -> str:
+    return f"{duration_ms:.0f} ms" if duration_ms < 1000 else f"{duration_ms / 1000:.1f} s"
+
+
+def figures(values: Sequence[float]) -> str:
+    """Numbers for people: (980, -320, 60)."""
+    return f"({', '.join(f'{v:.4g}' for v in values)})"
+
+
+BY_WORD = {word(member): explained(member) for member in (*Reason, *Flag, *Cause, MALFORMED)}
+
+
+def remedy(named: str) -> str:
+    """What to do about a reason, a flag or a cause by its word; empty for any other."""
+    return BY_WORD[named].what_to_do if named in BY_WORD else ""
 
 
 def in_brief(mode: str, reason: str) -> str:
@@ -139,11 +323,6 @@ def in_brief(mode: str, reason: str) -> str:
     return f"{mode} ({reason})" if reason else mode
 
 
-def in_full(because: str, remedy: str) -> str:
+def in_full(why: str, what_to_do: str) -> str:
     """What follows that term: the reason in words, and what to do; empty where there is none."""
-    return (f": {because}" if because else "") + (f". What to do: {remedy}" if remedy else "")
-
-
-def remedy(word: str) -> str:
-    """What to do about a word of a status, for people; empty where nothing needs to be done."""
-    return EVERY[word].remedy.replace("`", "") if word in EVERY and word not in MODES else ""
+    return (f": {why}" if why else "") + (f". What to do: {what_to_do}" if what_to_do else "")

@@ -1,13 +1,12 @@
 """ROS 2 message definitions as `ros2msg` schemas, with which any MCAP reader decodes what we
 record.
 
-The public ones are reduced to their fields; those of Frame, Timing and State follow the layouts in
-`records`.
+The public ones are reduced to their fields; those of Frame, Timing and State follow their layouts.
 """
 
 from __future__ import annotations
 
-from service.contract import records
+from collections.abc import Mapping
 
 _DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
@@ -46,18 +45,15 @@ _DEFINITIONS = {
 }
 
 
-_LAYOUTS = {"thirdhand/Frame": records.FRAME, "thirdhand/Timing": records.TIMING, "thirdhand/State": records.STATE}
-
-
-def schema(message_type: str, *, joints: int) -> str:
+def schema(message_type: str, own: Mapping[str, str] | None = None) -> str:
     """The `ros2msg` schema of a message type like `geometry_msgs/msg/PoseStamped`, with all that it
     depends on.
 
-    `joints` is how many the arm has: the layouts of Frame and State depend on it.
+    `own` are the definitions of further types, as `core.frame.definitions` has them.
     """
     name = message_type.replace("/msg/", "/")
-    if name in _LAYOUTS:
-        return records.definition(_LAYOUTS[name], joints)
+    if own and name in own:
+        return own[name]
     text, defined, waiting = _DEFINITIONS[name], {name}, [name]
     while waiting:
         for line in _DEFINITIONS[waiting.pop(0)].splitlines():

@@ -1,32 +1,44 @@
 """Event, Tick, Frame, State: what goes into the core, what comes out, and what it remembers.
 
-Frame, State and Timing are NumPy structured scalars laid out as `service.contract.records` says.
+Frame and State are assembled from what each stage declares in its package.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kmp.compiled import compiled
-from service.contract import cdr, records
-from service.core.rotation import quaternion_of
+from service.contract import cdr
+from service.contract.records import Field, assembled, definition
+from service.core import arm, decision, intake, limiter, separation, setpoint, skill
+from service.core.record import DType, Record, dtype_of
 
-Vector: TypeAlias = NDArray[np.float64]
-Record: TypeAlias = np.void
-Records: TypeAlias = NDArray[np.void]
-DType: TypeAlias = np.dtype[np.void]
 Frame: TypeAlias = Record  # of the layout `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
 
+_PACKAGES: tuple[ModuleType, ...] = (intake, skill, decision, separation, setpoint, arm, limiter)
+STAGES = tuple(package.__name__.rsplit(".", 1)[1] for package in _PACKAGES)  # in the order of the data
+_TICK = (Field("tick", "int64"),)
+FRAME = assembled(_TICK, *(package.FRAME for package in _PACKAGES))
+STATE = assembled(_TICK, *(package.STATE for package in _PACKAGES))
+TIMING_FIELDS = (
+    Field("tick", "int64"),
+    Field("time_ns", "int64"),  # the tick's deadline on the wall clock
+    Field("missed", "int64"),  # deadlines skipped since start
+    Field("lateness_us", "float32"),
+    Field("work_us", "float32"),
+    Field("latency_us", "float32"),  # newest hand's stamp to command published; 0: no new sample
+    Field("stages_us", "float32", (len(STAGES),)),
+)
+TIMING = dtype_of(TIMING_FIELDS, 0)
+
 
 def no_lap(stage: str) -> None:
-    """Measures nothing: outside of the shell nobody asks how long a stage took."""
+    """Measures nothing: outside of the daemon nobody asks how long a stage took."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,24 +65,20 @@ class Tick:
     inbox: tuple[Event, ...] = ()
 
 
-@functools.cache
-def _dtype(layout: records.Layout, joints: int) -> DType:
-    # ">" or "<" are said by none of the types: NumPy's own order is that of CDR on every machine
-    # that this runs on
-    return np.dtype([(field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints)) for field in layout])
-
-
 def frame_layout(joints: int) -> DType:
     """The layout of a Frame for an arm with so many joints."""
-    return _dtype(records.FRAME, joints)
+    return dtype_of(FRAME, joints)
 
 
 def state_layout(joints: int) -> DType:
     """The layout of a State for an arm with so many joints."""
-    return _dtype(records.STATE, joints)
+    return dtype_of(STATE, joints)
 
 
-TIMING = _dtype(records.TIMING, 0)
+def definitions(joints: int) -> dict[str, str]:
+    """The ROS 2 definitions of Frame, State and Timing for an arm with so many joints."""
+    layouts = {"Frame": FRAME, "State": STATE, "Timing": TIMING_FIELDS}
+    return {f"thirdhand/{name}": definition(layout, joints) for name, layout in layouts.items()}
 
 
 def timed(
@@ -86,32 +94,6 @@ def timed(
     fields = (tick, time_ns, missed, lateness_us, work_us, latency_us, stages_us)
     record: Record = np.array([fields], TIMING)[0]
     return record
-
-
-def blank(layout: DType) -> Record:
-    """A record of zeros, to be filled."""
-    record: Record = np.zeros(1, layout)[0]
-    return record
-
-
-def copied(record: Record) -> Record:
-    """A copy with memory of its own, as `blank` makes it."""
-    copy: Record = np.array([record])[0]
-    return copy
-
-
-def as_array(record: Record) -> Records:
-    """The memory (1,) of a record that was made by `blank` or `copied`, as compiled functions take
-    it.
-    """
-    memory: Any = record.base
-    return memory  # type: ignore[no-any-return]
-
-
-def frozen(record: Record) -> Record:
-    """A copy that cannot be changed."""
-    copy: Record = np.frombuffer(record.tobytes(), record.dtype)[0]
-    return copy
 
 
 def encode(record: Record) -> bytes:
@@ -136,47 +118,3 @@ def differences(a: Record, b: Record) -> dict[str, float]:
         for field in a.dtype.names or ()
         if a[field].tobytes() != b[field].tobytes()
     }
-
-
-@compiled
-def fill(
-    frames: Records,
-    states: Records,
-    tool: Vector,
-    rotation: Vector,
-    target: Vector,
-    velocity: Vector,
-    acceleration: Vector,
-    covariance: Vector,
-    deviation: float,
-    orientation: Vector,
-    turning: Vector,
-    orientation_covariance: Vector,
-    told: Vector,
-) -> None:
-    """Into the memory of a blank frame what the state's memory holds, and what was predicted."""
-    frame, state = frames[0], states[0]
-    frame.tick, frame.mode, frame.reason = state.tick, state.mode, state.reason
-    left, right = state.hand_ticks[0], state.hand_ticks[1]
-    if left == right:
-        frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
-    else:
-        frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
-    for side in range(2):
-        seen = state.hand_ticks[side]
-        frame.hand_ages[side] = -1 if seen < 0 else state.tick - seen
-        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
-    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
-    frame.setpoint_acceleration[:] = state.setpoint[2]
-    frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = target, velocity, acceleration
-    frame.covariance[:], frame.deviation = covariance, deviation
-    frame.orientation[:], frame.turning[:] = orientation, turning
-    frame.orientation_covariance[:] = orientation_covariance
-    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
-    frame.tool[:] = tool
-    quaternion_of(rotation, frame.tool_orientation)
-    frame.closure, frame.gripper = state.closure, state.gripper
-    frame.joints[:], frame.joint_velocities[:] = state.joints[0], state.joints[1]
-    frame.joint_accelerations[:] = state.joints[2]
-    frame.rejected[:] = state.rejected
-    frame.hand_distance, frame.hand_limit = told[0], told[1]

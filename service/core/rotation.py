@@ -5,16 +5,13 @@ angle, and one that was turned on.
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kmp.compiled import compiled
+from service.core.record import Vector
 
-Vector: TypeAlias = NDArray[np.float64]
-
-STEPS = 1e9  # to which quaternions are rounded, so that machines that differ in the last bits agree
+ROUND_TO = 1e9  # of quaternions: machines that differ in the last bits agree
 _TINY = 1e-12
 
 
@@ -81,7 +78,7 @@ def normalise(quaternion: Vector) -> None:
         length += quaternion[i] * quaternion[i]
     length = math.copysign(math.sqrt(length), quaternion[3])
     for i in range(4):
-        quaternion[i] = np.rint(quaternion[i] / length * STEPS) / STEPS
+        quaternion[i] = np.rint(quaternion[i] / length * ROUND_TO) / ROUND_TO
 
 
 @compiled

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.record import Vector
 
 LEAST_SHARE, HALVINGS = 1e-3, 40  # of its acceleration with which an axis waits for the slowest; how that is found
 

@@ -17,7 +17,7 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
-from service.core.intake.intake import rest_ticks
+from service.core.intake.intake import still_ticks
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
 
@@ -57,7 +57,7 @@ def _as_sent(skill: Skill) -> Skill:
 def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
     controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
-    count = rest_ticks(settings) + REHEARSED_TICKS
+    count = still_ticks(settings) + REHEARSED_TICKS
     for index in range(count):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

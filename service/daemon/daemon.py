@@ -20,13 +20,14 @@ from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
-from service.contract.records import STAGES, Reason
+from service.contract.records import Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
 from service.core.controller import Controller, run
-from service.core.frame import Event, Frame, Tick, blank, frame_layout, order, timed
+from service.core.frame import STAGES, Event, Frame, Tick, frame_layout, order, timed
 from service.core.outputs import outgoing
-from service.core.separation.separation import FARTHEST, IRRELEVANT
+from service.core.record import blank
+from service.core.separation.separation import FARTHEST
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
@@ -105,7 +106,7 @@ class Daemon:
         self._measured_tool = MeasuredTool(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
-        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, IRRELEVANT
+        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
         self._sources = InputMonitor(settings)
         self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
@@ -121,7 +122,7 @@ class Daemon:
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
-        self._status = encode_json(self._survey())
+        self._status = encode_json(self._status_now())
         self._queryables = Queryables(
             self._session,
             settings,
@@ -267,7 +268,7 @@ class Daemon:
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
-            status = self._survey()
+            status = self._status_now()
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
@@ -287,10 +288,10 @@ class Daemon:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
 
-    def _survey(self) -> Status:
+    def _status_now(self) -> Status:
         """The status at this moment."""
         frame, state, clock = self._frame, self._controller.state, self._clock
-        sources = self._sources.survey(self._controller, state, time.monotonic())
+        sources = self._sources.update(self._controller, state, time.monotonic())
         return CellStatus(frame, self._controller, state, sources, self._settings, self._failure).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),

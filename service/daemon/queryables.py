@@ -15,6 +15,8 @@ import zenoh
 from service.client import ENCODINGS
 from service.config import Settings
 from service.contract import channels
+from service.contract.incidents import word
+from service.contract.records import Mode
 from service.contract.requests import (
     Add,
     Clear,
@@ -28,8 +30,8 @@ from service.contract.requests import (
     encode_json,
 )
 from service.core.frame import Event, Frame, order
-from service.core.setpoint.workspace import is_reachable
 from service.core.skill.skill import Skill
+from service.core.skill.workspace import is_reachable
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.saved_via_points import SavedViaPoints
@@ -217,13 +219,13 @@ class Queryables:
             time.sleep(POLL_S)
         mode, reason = outcome(self._frame())
         note = ""
-        if suffix == "reset" and before != "fault":
+        if suffix == "reset" and before is not Mode.FAULT:
             note = "there was no fault: nothing was reset"
-        elif suffix == "resume" and before == "follow":
+        elif suffix == "resume" and before is Mode.FOLLOW:
             note = "there was no hold to end"
-        elif suffix == "resume" and mode == "fault":
+        elif suffix == "resume" and mode is Mode.FAULT:
             note = "a fault is ended by reset, not by resume"
-        return Reply(tick, mode=mode, reason=reason, note=note)
+        return Reply(tick, mode=word(mode), reason=word(reason), note=note)
 
     def _through_the_loop(self, event: Event) -> int:
         pending = PendingEvent(event)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from service.config import Settings
-from service.contract.incidents import MALFORMED, SOURCE_NAMES, remedy
+from service.contract.incidents import MALFORMED, Evidence, Outside, explained, word
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
-from service.core.controller import RETURNING, Controller
-from service.core.frame import Frame, Record
-from service.core.intake.intake import REST_S
+from service.core.controller import Controller
+from service.core.decision.decision import RETURNING
+from service.core.frame import Frame
 from service.core.intake.plausibility import SCATTERED_M, SETTLED
+from service.core.record import Record
 from service.core.rotation import off_target
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import standard_deviations
@@ -35,15 +39,16 @@ class CellStatus(NamedTuple):
         """The status; `more` are the fields that the core knows nothing of."""
         frame, sources, settings = self.frame, self.sources, self.settings
         begun, seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
-        skill, (mode, word) = self.controller.skill, outcome(frame)
+        skill, (mode, reason) = self.controller.skill, outcome(frame)
+        why = explained(reason if begun else Reason.NONE, self.evidence())
         low, high = skill.demonstrated
         return Status(
             cell=settings.cell,
-            mode=mode,
-            reason=word if begun else "",
-            because=self.because() if begun else "",
-            remedy=self.remedy(word) if begun else "",
-            flags=tuple(str(flag.name).lower() for flag in Flag(int(frame["flags"]))),
+            mode=word(mode),
+            reason=word(reason) if begun else "",
+            because=why.why,
+            remedy=why.what_to_do,
+            flags=tuple(map(word, Flag(int(frame["flags"])))),
             tick=int(frame["tick"]),
             skill=skill.name,
             places=tuple(point.name for point in skill.via_points),
@@ -64,7 +69,7 @@ class CellStatus(NamedTuple):
             turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
-            deviation_m=round(float(frame["deviation"]), 5) if aimed else None,
+            deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,
         )
@@ -74,97 +79,44 @@ class CellStatus(NamedTuple):
         tool, target = self.frame["tool_orientation"], self.frame["orientation"]
         return round(float(off_target(tool, target, direction=self.settings.tool.orientation == "direction")), 5)
 
-    def remedy(self, word: str) -> str:
-        """What to do about a reason; where it comes of rejected samples, about these."""
-        needed = {"no_hands": SIDES, "stale_hand": SIDES, "arm_not_ready": ("arm",)}.get(word, ())
-        culprit = next((self.sources[source] for source in needed if _is_refused(self.sources.get(source))), None)
-        return remedy(word if culprit is None else culprit.cause)
+    def evidence(self) -> Evidence:
+        """The figures of what there is to say."""
+        settings, skill, (error_rad, speed) = self.settings, self.controller.skill, self.controller.decision.measured
+        errors = np.abs(self.frame["joints"] - self.state["measured"])
+        limit = settings.tool.fault_speed
+        return Evidence(
+            sources=self.sources,
+            contested=SETTLED,
+            scatter_mm=1e3 * SCATTERED_M,
+            deviation_m=(float(self.frame["gate_m"]), skill.threshold),
+            between_places=skill.between is not None,
+            outside=self._outside(),
+            error_rad=(error_rad, settings.arm.fault_error_rad),
+            worst_joint=(settings.joints.names[int(errors.argmax())], float(errors.max())),
+            measured_speed=(speed, limit) if speed > limit else None,
+            commanded_speed=(speed, settings.tool.max_speed),
+            failure=self.failure,
+        )
 
-    def because(self) -> str:
-        """The reason for mode hold or fault in words, with its figures."""
-        frame, sources, settings = self.frame, self.sources, self.settings
-        error_rad, speed = self.controller.measured
-        match Reason(int(frame["reason"])):
-            case Reason.NO_HANDS | Reason.STALE_HAND:
-                return "; ".join(_silence(side, sources[side]) for side in SIDES if not sources[side].fresh)
-            case Reason.FAR_FROM_DEMONSTRATIONS:
-                skill = self.controller.skill
-                what = "the target's standard deviation is" if skill.between is None else "a hand is off its places by"
-                return f"{what} {100 * float(frame['deviation']):.1f} cm, {100 * skill.threshold:.1f} accepted"
-            case Reason.TWO_SOURCES:
-                return _contest(sources)
-            case Reason.ARM_NOT_READY:
-                return self._not_ready()
-            case Reason.ARM_ERROR:
-                return f"a joint was {error_rad:.3f} rad off, {settings.arm.fault_error_rad:g} accepted"
-            case Reason.ARM_SILENT:
-                return f"no joint states for {settings.arm.silent_ms:g} ms"
-            case Reason.TOOL_SPEED:
-                max_speed = settings.tool.fault_speed
-                if speed > max_speed:
-                    return f"the tool was measured at {speed:.2f} m/s, {max_speed:g} accepted"
-                return f"a command came to {speed:.2f} m/s, {settings.tool.max_speed:g} accepted"
-            case Reason.SERVICE:
-                return self.failure
-        return ""
-
-    def _not_ready(self) -> str:
-        source, joints = self.sources.get("arm"), self.settings.joints
-        if source is None:
-            return ""
-        if _is_refused(source):
-            return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
-        if not source.fresh:
-            return "no joint states came yet" if source.age_ms is None else f"no joint states for {_ago(source.age_ms)}"
-        measured = self.state["measured"].tolist()
-        for name, at, low, high in zip(joints.names, measured, joints.lower, joints.upper, strict=True):
-            if int(self.state["arm_ready"]) == RETURNING and not low <= at <= high:
-                return f"{name} at {at:.3f} rad is outside {low:g} to {high:g}, and is moved back"
-        return f"the arm has not told one posture for {REST_S:g} s"
+    def _outside(self) -> Outside | None:
+        """The first joint that is moved back into its limits."""
+        joints, measured = self.settings.joints, self.state["measured"].tolist()
+        found = map(Outside, joints.names, measured, joints.lower, joints.upper)
+        returning = int(self.state["arm_ready"]) == RETURNING
+        return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
 
 
-def outcome(frame: Frame) -> tuple[str, str]:
+def outcome(frame: Frame) -> tuple[Mode, Reason]:
     """Mode and reason of a frame."""
-    reason = Reason(int(frame["reason"]))
-    return Mode(int(frame["mode"])).name.lower(), "" if reason is Reason.NONE else reason.name.lower()
-
-
-def _is_refused(source: Source | None) -> bool:
-    """Whether something comes of a source, and nothing of it is accepted."""
-    return source is not None and source.rate_hz > 0 and not source.fresh and bool(source.cause)
-
-
-def _silence(side: str, source: Source) -> str:
-    """Since when a hand is not there, and what of it is rejected instead."""
-    seen = "has not been seen yet" if source.age_ms is None else f"was last seen {_ago(source.age_ms)} ago"
-    why = f", as what comes is rejected as {source.cause}: {source.refused}" if _is_refused(source) else ""
-    return f"the {SOURCE_NAMES[side]} {seen}{why}"
-
-
-def _contest(sources: dict[str, Source]) -> str:
-    """Whose samples contradict each other, or scatter, and by how much."""
-    side, source = max(sources.items(), key=lambda item: item[1].contested)
-    when = "in the last second" if source.rate_hz else "before it ended"
-    if source.contested > SETTLED:
-        return f"{SOURCE_NAMES[side]}: {source.contested:.0%} of what came {when} contradicts the rest"
-    side, source = max(sources.items(), key=lambda item: item[1].scatter_mm or 0.0)
-    return (
-        f"{SOURCE_NAMES[side]}: what came {when} scatters by {source.scatter_mm:.0f} mm an axis, "
-        f"{1e3 * SCATTERED_M:.0f} accepted"
-    )
-
-
-def _ago(age_ms: float) -> str:
-    return f"{age_ms:.0f} ms" if age_ms < 1000 else f"{age_ms / 1000:.1f} s"
+    return Mode(int(frame["mode"])), Reason(int(frame["reason"]))
 
 
 def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
     """What was rejected of all sources, by cause; what was malformed by its key."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():
-            told = f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause
-            counts[told] = counts.get(told, 0) + count
+            counts[f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause] += count
     return counts
 
 

@@ -16,9 +16,9 @@ from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING, topic
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
 from service.contract.requests import encode_json
-from service.core.frame import Vector
 from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
+from service.core.record import Vector
 from service.core.rotation import rotation
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, Track, chosen
 from service.learning.demonstration import Demonstration

@@ -16,8 +16,8 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint
-from service.core.frame import Vector
-from service.core.intake.stillness import rested
+from service.core.intake.stillness import stillness_of
+from service.core.record import Vector
 from service.core.skill.places import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Layout, Places, Task
 from service.core.skill.skill import LearnedBetween
 from service.core.skill.task_parameterized import Placed, with_hands
@@ -76,7 +76,7 @@ class Told:
         """The demonstration whose hands (T, 6) and tool (T, 3) are in phase."""
         period_s = demonstration.period_s
         hands = _smoothed(hands, round(SMOOTHED_S / period_s))
-        rest = rested(np.gradient(hands, period_s, axis=0), period_s)
+        rest = stillness_of(np.gradient(hands, period_s, axis=0), period_s)
         layout = task.layout(Places.of(demonstration.places))
         inputs, off = Placed.of(task, layout).inputs(hands, rest)
         shares = _along(tool, layout.tool)

@@ -15,7 +15,7 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.skill.places import Task
 from service.core.skill.skill import LearnedBetween, Skill
 from service.learning.between import Told, learned, places_never_reached, task_of

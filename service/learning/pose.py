@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.rotation import angles
 from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from service.learning.choice import Choice, Parameters, rms

@@ -15,6 +15,7 @@ from mcap.writer import MCAP0_MAGIC, IndexType, Writer
 
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
+from service.core.frame import definitions
 
 CHUNK_BYTES = 128 * 1024  # a kill loses at most this between two flushes; a reader holds at most this
 
@@ -104,7 +105,7 @@ class McapFile:
         self._stream = _WholeWrites(path)
         kinds = IndexType.ALL if attached else IndexType.CHUNK | IndexType.MESSAGE
         self.writer = Writer(self._stream, chunk_size=1 << 62, index_types=kinds, enable_data_crcs=True)  # type: ignore[arg-type]
-        self._joints = joints
+        self._definitions = definitions(joints)
         self._pending = 0  # bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -130,7 +131,7 @@ class McapFile:
         if channel is None:
             if kind not in self._schemas:
                 self._schemas[kind] = self.writer.register_schema(
-                    kind, "ros2msg", schema(kind, joints=self._joints).encode()
+                    kind, "ros2msg", schema(kind, self._definitions).encode()
                 )
             channel = self.writer.register_channel(topic, "cdr", self._schemas[kind], {"offered_qos_profiles": qos})
             self._channels[topic] = channel

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from service import palette
 from service.contract.records import SIDES, Mode
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.report.report import Report
 from service.report.tables import Table, comparison, names_of, summary, tables
 
@@ -108,7 +108,7 @@ def _over_time(report: Report) -> Figure:
     _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
     between = any(skill.between is not None for _, skill in report.columns.skills)
     look = (OFF, "hands off what is known") if between else (TARGET, "the target's deviation")
-    _curve(errors, times, np.where(frames["deviation"] > 0, 1000 * frames["deviation"], np.nan), *look)
+    _curve(errors, times, np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan), *look)
     errors.set(ylabel="[mm]", yscale="log")
 
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):

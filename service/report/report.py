@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from service.contract.incidents import REASONS
+from service.contract.incidents import word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.recording.recording import Recording
-from service.report.causes import what_led, why_held
+from service.report.causes import before, why
 from service.report.columns import Columns, read, runs
 from service.report.visits import Place, places
 
@@ -25,27 +25,28 @@ SHARES = (50, 99, 100)
 
 
 class Span(NamedTuple):
-    """What the service did for a while, since the first tick [s], and what is to be said of why."""
+    """What the service did for a while, since the first tick [s]; unless it followed, why and what
+    was to be done; of a fault also what was before it, and how it ended.
+    """
 
     start_s: float
     lasts_s: float
     mode: Mode
     reason: Reason
     why: str = ""
+    remedy: str = ""
+    before: tuple[str, ...] = ()
+    ended: str = ""
+
+    @property
+    def end_s(self) -> float:
+        """When it was over [s]."""
+        return self.start_s + self.lasts_s
 
     @property
     def doing(self) -> str:
         """In one word or two."""
-        mode = str(self.mode.name).lower()
-        return mode if self.reason is Reason.NONE else f"{mode}: {str(self.reason.name).lower()}"
-
-
-class Fault(NamedTuple):
-    """A fault, what led to it, and how it ended."""
-
-    span: Span
-    led: tuple[str, ...]
-    ended: str
+        return ": ".join(filter(None, (word(self.mode), word(self.reason))))
 
 
 class Percentiles(NamedTuple):
@@ -122,7 +123,6 @@ class Report:
     lasts_s: float
     lacks: tuple[str, ...]  # gaps, damage, a cut, what is not understood
     spans: tuple[Span, ...]
-    faults: tuple[Fault, ...]
     rate_hz: float
     missed: int
     lateness_us: Percentiles | None
@@ -135,6 +135,11 @@ class Report:
     joints: tuple[Joint, ...]
     rejections: tuple[Rejection, ...]
     hands_hz: dict[str, float]
+
+    @property
+    def faults(self) -> tuple[Span, ...]:
+        """The spans of mode fault."""
+        return tuple(span for span in self.spans if span.mode is Mode.FAULT)
 
     def seconds(self, mode: Mode, reason: Reason | None = None) -> float:
         """How long it was in a mode [s], for one reason or for any."""
@@ -151,7 +156,7 @@ class Report:
         yield Figure("follow", self.seconds(Mode.FOLLOW), "s", 1)
         for reason in Reason:
             for mode in (Mode.HOLD, Mode.FAULT):
-                yield Figure(f"{mode.name}: {reason.name}".lower(), self.seconds(mode, reason), "s", 1)
+                yield Figure(f"{word(mode)}: {word(reason)}", self.seconds(mode, reason), "s", 1)
         yield Figure("faults", len(self.faults), "times", 0)
         yield Figure("rate", self.rate_hz, "Hz", 2)
         yield Figure("deadlines missed", self.missed, "", 0)
@@ -166,14 +171,12 @@ class Report:
         yield Figure("closest approach", self.approach and 1000 * self.approach.distance_m, "mm", 0)
         touched = {limit.name: limit.lasts_s for limit in self.limits}
         for flag in Flag:
-            yield Figure(name := str(flag.name).lower(), touched.get(name, 0.0), "s", 1)
+            yield Figure(word(flag), touched.get(word(flag), 0.0), "s", 1)
         rejected = {rejection.cause: rejection.samples for rejection in self.rejections}
         for cause in Cause:
-            yield Figure(f"rejected: {cause.name}".lower(), rejected.get(str(cause.name).lower(), 0), "", 0)
+            yield Figure(f"rejected: {word(cause)}", rejected.get(word(cause), 0), "", 0)
         for place in dict.fromkeys(place.name for place in self.places):
-            best = min(
-                (one.best_m for one in self.places if one.name == place and one.best_m is not None), default=None
-            )
+            best = self.best_m(place)
             yield Figure(f"place {place}: nearest", None if best is None else 1000 * best, "mm", 1)
 
 
@@ -200,7 +203,6 @@ def report(columns: Columns) -> Report:
         lasts_s=lasts_s,
         lacks=(*columns.gaps, *columns.remarks),
         spans=spans,
-        faults=tuple(_faults(columns, spans)),
         rate_hz=(len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0,
         missed=int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0,
         lateness_us=Percentiles.of(timing["lateness_us"]),
@@ -223,23 +225,20 @@ def _spans(columns: Columns) -> Iterator[Span]:
     pieces[columns.breaks] = 1
     for begin, end in runs((np.cumsum(pieces) * 256 + frames["mode"]) * 256 + frames["reason"]):
         mode, reason = Mode(int(frames["mode"][begin])), Reason(int(frames["reason"][begin]))
-        why = ""
-        if mode is Mode.HOLD:
-            why = why_held(columns, begin, end) or REASONS[str(reason.name).lower()].about
         whole = end == len(frames) or end in columns.breaks
         until = float(times[end - 1]) + period_s if whole else float(times[end])
-        yield Span(float(times[begin]), until - float(times[begin]), mode, reason, why)
+        span = Span(float(times[begin]), until - float(times[begin]), mode, reason, *why(columns, begin, end))
+        if mode is Mode.FAULT:
+            span = span._replace(before=tuple(before(columns, begin)), ended=_ended(columns, span))
+        yield span
 
 
-def _faults(columns: Columns, spans: tuple[Span, ...]) -> Iterator[Fault]:
-    for span in spans:
-        if span.mode is Mode.FAULT:
-            begin, end_s = int(np.searchsorted(columns.times, span.start_s)), span.start_s + span.lasts_s
-            resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
-            ended = end_s <= columns.times[-1]
-            by = "a `reset`" if any(abs(at - end_s) < 0.1 for at in resets) else "what is not recorded"
-            how = f"ended by {by} after {span.lasts_s:.1f} s" if ended else "not ended in this recording"
-            yield Fault(span, tuple(what_led(columns, begin)), how)
+def _ended(columns: Columns, fault: Span) -> str:
+    if fault.end_s > columns.times[-1]:
+        return "not ended in this recording"
+    resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
+    by = "a `reset`" if any(abs(at - fault.end_s) < 0.1 for at in resets) else "what is not recorded"
+    return f"ended by {by} after {fault.lasts_s:.1f} s"
 
 
 def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
@@ -261,7 +260,7 @@ def _limits(columns: Columns) -> Iterator[Limit]:
         begins = [begin for begin, _ in runs(raised) if raised[begin]]
         if begins:
             lasts_s = float(raised.sum()) * columns.period_s
-            yield Limit(str(flag.name).lower(), lasts_s, len(begins), float(columns.times[begins[0]]))
+            yield Limit(word(flag), lasts_s, len(begins), float(columns.times[begins[0]]))
 
 
 def _joints(columns: Columns, sent: Any) -> Iterator[Joint]:
@@ -281,7 +280,7 @@ def _rejections(columns: Columns) -> Iterator[Rejection]:
     for cause in Cause:
         more = counts[:, cause] - counts[0, cause]
         if more[-1]:
-            yield Rejection(str(cause.name).lower(), int(more[-1]), float(columns.times[int(np.argmax(more > 0))]))
+            yield Rejection(word(cause), int(more[-1]), float(columns.times[int(np.argmax(more > 0))]))
 
 
 def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]:
@@ -314,18 +313,12 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     recording, since which times are told.
     """
     begin_s, until_s = begun_s + start_s, begun_s + end_s
-    stops = [
-        span
-        for span in found.spans
-        if span.mode is not Mode.FOLLOW and span.start_s < until_s and span.start_s + span.lasts_s > begin_s
-    ]
+    stops = [s for s in found.spans if s.mode is not Mode.FOLLOW and s.start_s < until_s and s.end_s > begin_s]
     if stops:
         worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
-        led = next((fault.led[0] for fault in found.faults if fault.span is worst), worst.why)
-        what = "was at fault" if worst.mode is Mode.FAULT else "held"
-        name, at_s = str(worst.reason.name).lower(), worst.start_s - begun_s
+        what, at_s = "was at fault" if worst.mode is Mode.FAULT else "held", worst.start_s - begun_s
         since = f"from {at_s:.1f} s on" if at_s > 0 else "from before the script began"
-        return f"the arm {what} ({name}) {since}, for {worst.lasts_s:.1f} s{f': {led}' if led else ''}"
+        return f"the arm {what} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: {worst.why}"
     hands_m = [one.hands_m for one in found.places if one.name == place]
     if not hands_m:
         return f"no place {place!r} was taught"

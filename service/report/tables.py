@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from service.contract.incidents import remedy
-from service.report.report import Fault, Figure, Percentiles, Report, differing_settings
+from service.contract.incidents import remedy, word
+from service.report.report import Figure, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
 NOTHING_MISSING = "Nothing is missing in it."
@@ -111,9 +111,9 @@ def _tables(report: Report) -> Iterator[Table]:
     )
 
 
-def _fault(fault: Fault) -> tuple[str, str, str]:
-    reason = str(fault.span.reason.name).lower()
-    return _s(fault.span.start_s), reason, "\n".join((*fault.led, fault.ended, f"what to do: {remedy(reason)}"))
+def _fault(fault: Span) -> tuple[str, str, str]:
+    told = (fault.why, *fault.before, fault.ended, f"what to do: {fault.remedy}")
+    return _s(fault.start_s), word(fault.reason), "\n".join(told)
 
 
 def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]:

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from service.client import Client, open_session
-from service.contract.records import STAGES
-from service.core.frame import TIMING
+from service.core.frame import STAGES, TIMING
 from service.launch import launched
 from service.recording.recording import Recording
 from service.shipped import SHIPPED_SKILL, recordings

@@ -213,7 +213,7 @@ def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dic
         skills = Path(name)
         shutil.copy(recordings() / SHIPPED_SKILL, skills)
         say(f"making a skill of {LARGE} points")
-        (skills / f"{LARGE_SKILL}.npz").write_bytes(_large())
+        (skills / f"{LARGE_SKILL}.npz").write_bytes(large_skill())
         rows = []
         for load in LOADS:
             say(f"{load.what}: {2 * seconds:g} s")
@@ -275,8 +275,8 @@ def until_following(client: Client) -> None:
     time.sleep(SETTLE_S)
 
 
-def _large() -> bytes:
-    """The file of a skill of LARGE points: copies of the shipped skill's with noise."""
+def large_skill() -> bytes:
+    """The file of a skill of many points: the shipped one's over and over, a little beside."""
     skill = shipped_skill()
     inputs, reference = skill.primitive.inputs, skill.primitive.reference
     pick = np.arange(LARGE) % len(inputs)

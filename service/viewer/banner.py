@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from service import palette
+from service.contract.incidents import explained, word
 from service.contract.records import Mode, Reason
 
 WIDTH, HEIGHT = 640, 80  # pixels
@@ -17,8 +18,12 @@ LETTERS, MARGIN = 44, 24
 
 def title(mode: int, reason: int) -> str:
     """Mode and reason in words: `hold: no hands`."""
-    name = Mode(mode).name.lower()
-    return f"{name}: {Reason(reason).name.lower().replace('_', ' ')}" if reason else name
+    return ": ".join(filter(None, (word(Mode(mode)), word(Reason(reason)).replace("_", " "))))
+
+
+def line(mode: int, reason: int) -> str:
+    """The same for the log, and what the reason means."""
+    return ": ".join(filter(None, (title(mode, reason), explained(Reason(reason)).why)))
 
 
 @functools.cache

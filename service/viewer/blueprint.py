@@ -17,7 +17,6 @@ from rerun.blueprint import components
 
 from service import palette
 from service.config import Settings
-from service.core.separation.separation import IRRELEVANT
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
@@ -53,7 +52,7 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
-            PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, IRRELEVANT),
+            PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
             PlotView("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
             PlotView("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
             PlotView("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),

@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.config import Settings
-from service.contract.records import SIDES, STAGES, Mode, Reason
-from service.core.frame import TIMING, Record
+from service.contract.incidents import word
+from service.contract.records import SIDES, Mode, Reason
+from service.core.frame import STAGES, TIMING
+from service.core.record import Record
 from service.core.rotation import off_target
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import FARTHEST
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.core.skill.skill import standard_deviations
-from service.viewer.banner import banner, title
+from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import ArmModels
 
@@ -156,8 +158,8 @@ class DynamicScene:
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        differs = known & (np.abs(frames["deviation"] - std_m) > SAME_M)
-        yield from scalars("/deviation/hands", np.flatnonzero(differs), 1e3 * frames["deviation"], "/deviation")
+        differs = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)
+        yield from scalars("/deviation/hands", np.flatnonzero(differs), 1e3 * frames["gate_m"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
         measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
@@ -206,10 +208,8 @@ class DynamicScene:
         if not sent:
             return
         modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
-        mode_names = [Mode(modes[i]).name.lower() for i in sent]
-        reason_names = [Reason(reasons[i]).name.lower() if reasons[i] else "" for i in sent]
-        yield columns("/mode/mode", sent, rr.StateChange.columns(state=mode_names))
-        yield columns("/mode/reason", sent, rr.StateChange.columns(state=reason_names))
+        yield columns("/mode/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
+        yield columns("/mode/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
         for i in sent:
             picture = banner(modes[i], reasons[i])
             layout = rr.components.ImageFormat(
@@ -219,7 +219,7 @@ class DynamicScene:
             yield columns("/scene/banner", [i], texture)
         for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
-            yield columns("/log", [i], rr.TextLog.columns(text=[title(modes[i], reasons[i])], level=[level]))
+            yield columns("/log", [i], rr.TextLog.columns(text=[line(modes[i], reasons[i])], level=[level]))
 
     def _scene(
         self,
@@ -263,12 +263,12 @@ class DynamicScene:
         is near a point, and no text.
         """
         body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
-        placed, near = np.empty((len(body.links), 2, 3)), np.empty(9)
-        place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.links, body.ends, placed)
+        placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
+        place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
         if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST):
             for side in np.flatnonzero(seen):
                 hand = np.stack([frame["hands"][side], frame["hands"][side] + self._forearm])
-                for ends, radius in zip(placed, body.radii.tolist(), strict=True):
+                for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
                     distance = between_segments(ends, hand, near) - radius - self._hand_radius
                     if distance < found[0]:
                         surfaces = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]

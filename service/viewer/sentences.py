@@ -19,14 +19,12 @@ def sentence(note: str) -> str:
     asked, _, rest = note.partition(" ")
     if asked not in _ASKED:
         return note
-    for outcome in ("refused", "failed"):
-        if rest.startswith(f"{outcome}: "):
-            return f"{_ASKED[asked]} {'was refused' if outcome == 'refused' else outcome}: {rest[len(outcome) + 2 :]}"
+    outcome, _, why = rest.partition(": ")
+    if outcome in ("refused", "failed"):
+        return f"{_ASKED[asked]} {'was refused' if outcome == 'refused' else outcome}: {why}"
     try:
-        request = msgspec.json.decode(rest)
+        request = msgspec.json.decode(rest, type=dict[str, Any])
     except msgspec.DecodeError:
-        return note
-    if not isinstance(request, dict):
         return note
     if asked == "skill":
         return f"Skill {request.get('name')} is in force."

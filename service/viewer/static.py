@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from service import palette
 from service.config import Reach, Settings
-from service.contract.records import SIDES, STAGES, Mode, Reason
+from service.contract.records import SIDES, Mode, Reason
+from service.core.frame import STAGES
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
 

@@ -19,6 +19,7 @@ from service.core.skill.skill import Skill
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
+from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array
 from sim.experiments.rivals import COMPONENTS
@@ -87,9 +88,17 @@ def reached(variant: Variant, count: int) -> Reached:
             refused += 1
             continue
         hands, wanted = at_the_events(scene, number)
-        errors.append(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
-        steepness.append([np.linalg.norm(taught.primitive.jacobian(row), ord=2) for row in hands])
+        errors.append(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
+        steepness.append([np.linalg.norm(_slope(taught, row), ord=2) for row in hands])
     return Reached(np.array(errors).reshape(-1, 3), np.array(steepness).reshape(-1, 3), refused)
+
+
+def _slope(skill: Skill, hands: Array) -> Array:
+    """How the tool moves with the hands (6,) [m]: the velocities (6, 3) for one of 1 m/s of each
+    axis of a hand.
+    """
+    at, still = hands.reshape(2, 3), np.zeros((2, 3))
+    return np.array([skill.predict(at, way.reshape(2, 3), still).velocity for way in np.eye(6)])
 
 
 def at_the_events(scene: Scene, seed: int) -> tuple[Array, Array]:

@@ -13,12 +13,12 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import pinocchio as pin
 import rerun as rr
 from scipy.stats import wilcoxon
 
 from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, improve
-from service.config import WAM, Settings
+from service.config import Settings, robot_description
+from service.core.arm.arm import Arm, Kinematics
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
 from sim.experiments.writing import TARGETS, write
 
@@ -64,10 +64,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "updates": updates,
         "rollouts": ROLLOUTS,
         "search": "PI^BB: noise constant over a rollout, weighed by its total reward; not PI^2",
-        "cost_fall_percent": _interval([100 * (1 - t.learned.cost / t.first.cost) for t in trials], trials),
+        "cost_fall_percent": _interval(
+            [100 * (1 - t.policies.learned.cost / t.policies.first.cost) for t in trials], trials
+        ),
         "distance_rms_cm": {
-            "before": float(np.mean([t.first.distance for t in trials])),
-            "learned": float(np.mean([t.learned.distance for t in trials])),
+            "before": float(np.mean([t.policies.first.distance for t in trials])),
+            "learned": float(np.mean([t.policies.learned.distance for t in trials])),
         },
         "c": {"median": float(np.median([t.c for t in trials])), "largest": max(t.c for t in trials)},
         "cost_beside_c_percent": {
@@ -103,39 +105,42 @@ class Policy(NamedTuple):
     trajectory: Array
 
 
-class Trial(NamedTuple):
-    """One letter with one via-point: before learning, learned, and three that are equally far from
-    the reference. Only what is tried at that distance counts as a try of the random ones: the
-    trajectories by which each is brought there do not.
+class Policies(NamedTuple):
+    """Before learning, learned, and three that are equally far from the reference. Only what is
+    tried at that distance counts as a try of the random ones: the trajectories by which each is
+    brought there do not.
     """
+
+    first: Policy
+    learned: Policy
+    constant: Policy  # Lambda = c I
+    random: Policy
+    begun_at_c: Policy
+
+
+class Trial(NamedTuple):
+    """One letter with one via-point."""
 
     letter: str
     via_s: float
     via_cm: Array
-    first: Policy
-    learned: Policy
+    policies: Policies
     costs: Array  # (U + 1,) [rad] of the policy before the first update and after each
     trajectories: list[Array]  # the same
     c: float
-    constant: Policy  # Lambda = c I
-    random: Policy
-    begun_at_c: Policy
     flipped: float  # share of the correlations of which learning changed the sign
     largest_miss: float  # of the via-point [cm]
 
     def beside_c(self, method: str) -> float:
         """A method's cost as a multiple of that of Lambda = c I."""
-        return float(getattr(self, method).cost / self.constant.cost)
+        return float(getattr(self.policies, method).cost / self.policies.constant.cost)
 
     def numbers(self) -> dict[str, Any]:
         """By name."""
-        policies = {name: getattr(self, name) for name in ("first", "learned", "constant", "random", "begun_at_c")}
-        return {
-            "letter": self.letter,
-            "via_s": self.via_s,
-            "c": self.c,
-            **{name: {"cost_rad": one.cost, "distance_cm": one.distance} for name, one in policies.items()},
+        policies = {
+            name: {"cost_rad": one.cost, "distance_cm": one.distance} for name, one in self.policies._asdict().items()
         }
+        return {"letter": self.letter, "via_s": self.via_s, "c": self.c, **policies}
 
 
 def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
@@ -175,27 +180,12 @@ def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
         key=lambda each: each.cost,
     )
     more = improve(primitive, beyond, TIMES[:, None], correlation=single, exploration=EXPLORATION * c, **searched)
-    constant, begun_at_c = policy(single), policy(more.correlation)
-    misses = [
-        each.correlation.applied(primitive).mean([[via_s]])[0] - via for each in (learned, constant, best, begun_at_c)
-    ]
+    policies = Policies(first, learned, policy(single), best, policy(more.correlation))
+    misses = [each.correlation.applied(primitive).mean([[via_s]])[0] - via for each in policies[1:]]
     signs = np.sign(learned.correlation(TIMES[:, None]))
     flipped = float(np.mean([signs[:, i] * signs[:, j] < 0 for i, j in ((0, 1), (0, 2), (1, 2))]))
-    return Trial(
-        one.name,
-        via_s,
-        via,
-        first,
-        learned,
-        -np.log(found.rewards) / SHARPNESS,
-        seen[:: ROLLOUTS + 1],
-        c,
-        constant,
-        best,
-        begun_at_c,
-        flipped,
-        float(np.linalg.norm(misses, axis=1).max()),
-    )
+    costs, miss = -np.log(found.rewards) / SHARPNESS, float(np.linalg.norm(misses, axis=1).max())
+    return Trial(one.name, via_s, via, policies, costs, seen[:: ROLLOUTS + 1], c, flipped, miss)
 
 
 def scaled(
@@ -246,40 +236,33 @@ def _interval(values: list[float], trials: list[Trial]) -> dict[str, float]:
 
 def _said(one: Trial) -> str:
     others = ", ".join(f"{method} {one.beside_c(method):.3f}" for method in METHODS)
-    return f"{one.first.cost:.2f} to {one.learned.cost:.2f} rad at {one.learned.distance:.1f} cm, beside c: {others}"
+    first, learned = one.policies[:2]
+    return f"{first.cost:.2f} to {learned.cost:.2f} rad at {learned.distance:.1f} cm, beside c: {others}"
 
 
 class Joints:
     """The WAM's joints along a trajectory of its tool, by the pseudo-inverse of the Jacobian."""
 
     def __init__(self) -> None:
-        self._model = pin.buildModelFromUrdf(str(WAM))
-        self._data = self._model.createData()
-        self._tool = self._model.getFrameId("tool_plate")
-        self._posture = np.array(Settings().arm.posture)
+        settings = Settings()
+        self._arm, self._posture = Arm(settings, robot_description(settings)), np.array(settings.arm.posture)
 
-    def _jacobian(self, q: Array) -> Array:
-        jacobian: Array = pin.computeFrameJacobian(
-            self._model, self._data, q, self._tool, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        )[:3]
-        return jacobian
-
-    def _step(self, q: Array, way: Array) -> Array:
-        jacobian = self._jacobian(q)
-        return np.asarray(q + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, way))
+    def _step(self, here: Kinematics, way: Array) -> Kinematics:
+        jacobian = here.jacobian[:3]
+        return self._arm.at(here.joints + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, way))
 
     def along(self, trajectory: Array) -> Array:
         """Joints (M, 7) [rad] for the tool (M, 3) [cm], as the paper moves them: q + J^+ (xi' -
         xi), from the posture's nearest at the start.
         """
         metres = trajectory / 100
-        q = self._posture
+        here = self._arm.at(self._posture)
         for _ in range(20):
-            pin.framesForwardKinematics(self._model, self._data, q)
-            q = self._step(q, metres[0] - self._data.oMf[self._tool].translation)
-        rows = [q]
+            here = self._step(here, metres[0] - here.position)
+        rows = [here.joints]
         for way in np.diff(metres, axis=0):
-            rows.append(self._step(rows[-1], way))
+            here = self._step(here, way)
+            rows.append(here.joints)
         return np.array(rows)
 
     def cost(self, trajectory: Array) -> float:
@@ -335,7 +318,7 @@ def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
         second.plot(*trial.trajectories[k].T, color=plt.get_cmap("Blues")(shade), lw=1.4, label=label)
     second.plot(*one.base.reference.mean.T, "--", color=REFERENCE, lw=1.2, label="reference")
     label = f"Λ = {trial.c:.1f} I, as far from the reference"
-    second.plot(*trial.constant.trajectory.T, color=ADAPTED, lw=1.6, label=label)
+    second.plot(*trial.policies.constant.trajectory.T, color=ADAPTED, lw=1.6, label=label)
     last = trial.trajectories[-1]
     second.plot(*last[:1].T, "*", color="black", ms=8, label="start")
     second.plot(*last[-1:].T, "+", color="black", ms=9, mew=2, label="end")
@@ -343,7 +326,7 @@ def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
     second.set_title("(b) learned, and loosened by one number", loc="left")
     above.legend(*second.get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     for axes in (first, second):
-        lines = [one.demonstrations.reshape(-1, 3), *trial.trajectories, trial.constant.trajectory]
+        lines = [one.demonstrations.reshape(-1, 3), *trial.trajectories, trial.policies.constant.trajectory]
         equal_box(axes, np.concatenate(lines))
         axes.view_init(elev=18, azim=-30)
         axes.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]")
@@ -380,7 +363,7 @@ def _record(results: Results, one: Letter, trial: Trial) -> None:
         static=True,
     )
     stream.log("/letter/via_point", rr.Points3D([trial.via_cm], colors=[rgb(DESIRED)], radii=[0.4]), static=True)
-    constant = rr.LineStrips3D([trial.constant.trajectory], colors=[rgb(ADAPTED)], radii=[0.1])
+    constant = rr.LineStrips3D([trial.policies.constant.trajectory], colors=[rgb(ADAPTED)], radii=[0.1])
     stream.log("/letter/constant", constant, static=True)
     for k, (trajectory, cost) in enumerate(zip(trial.trajectories, trial.costs, strict=True)):
         stream.set_time("update", sequence=k)

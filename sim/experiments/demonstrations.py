@@ -15,6 +15,7 @@ from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.via_points import adapted
 from sim.experiments.beside_the_paper import at_the_events
+from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
@@ -74,7 +75,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 def _reproduction_mm(skill: Skill, held_out: list[Demonstration]) -> float:
     """Root mean square distance along demonstrations that the skill does not know."""
-    squares = [np.sum((skill.primitive.mean(one.hands) - one.tool[:, :3]) ** 2, axis=1) for one in held_out]
+    squares = [np.sum((skill.mean(one.hands) - one.tool[:, :3]) ** 2, axis=1) for one in held_out]
     return float(1000 * np.sqrt(np.mean(np.concatenate(squares))))
 
 
@@ -93,7 +94,7 @@ def _events_mm(skill: Skill, number: int) -> Array:
     scene = draw(number).scene
     taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
     hands, wanted = at_the_events(scene, number)
-    return np.asarray(1000 * np.linalg.norm(taught.primitive.mean(hands) - wanted, axis=1))
+    return np.asarray(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
 
 
 def _draw(results: Results, counts: list[int], errors: dict[str, Array], events: Array, floor: float) -> None:

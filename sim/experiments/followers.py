@@ -11,19 +11,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
-import msgspec
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from service.config import Settings, robot_description
 from service.contract.records import SIDES, Flag
 from service.core.arm.arm import Arm, Closing
-from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick, Vector
+from service.core.frame import Tick
 from service.core.limiter.limiter import Limiter
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.moving_hands import PERIOD_S, Moving
+from sim.experiments.open_loop import frames, targets
 from sim.experiments.results import Array
 
 SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it
@@ -47,14 +47,10 @@ Follower: TypeAlias = Callable[[Moving], Followed]
 
 def ours(skill: Skill, settings: Settings) -> Follower:
     """The service's core, tick by tick; it never holds for being far from the demonstrations."""
-    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
-    skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
+    skill = replace(skill, threshold=math.inf)
 
     def follow(hands: Moving) -> Followed:
-        frames: list[Frame] = []
-        controller = Controller(settings, skill, urdf=urdf)
-        run(controller, _ticks(hands), [lambda tick, frame: frames.append(frame)])
-        seen = np.array(frames[SETTLE_TICKS:])
+        seen = frames(skill, _ticks(hands), settings)[SETTLE_TICKS:]
         speed = np.linalg.norm(np.diff(seen["tool"], axis=0), axis=1) / PERIOD_S
         limited = float(np.mean(seen["flags"] & Flag.SPEED_LIMITED > 0))
         return Followed(seen["tool"], float(speed.max()), limited, seen["hands"], seen["target"], seen["setpoint"])
@@ -93,8 +89,8 @@ class _Chain:
         self.orientation = skill.orientation
 
     def targets(self, samples: Array) -> Array:
-        """What the skill makes of samples (M, 6): (M, 3) [m], inside its workspace."""
-        return np.clip(self.skill.mean(samples), *self.skill.workspace)
+        """What the skill makes of samples (M, 6): (M, 3) [m]."""
+        return targets(self.skill, samples)
 
     def start(self, position: Vector) -> tuple[Vector, Vector, Vector]:
         """The joints at rest with the tool at a position."""

@@ -25,6 +25,7 @@ from service.shipped import recordings
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
 from sim.experiments.linear_floor import Floor, best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
+from sim.experiments.open_loop import targets
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.workers import shared_out
 
@@ -127,7 +128,7 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, which, hands = task
     skill, by_name = _known[which]
-    target = np.clip(skill.mean(hands.truth), *skill.workspace)
+    target = targets(skill, hands.truth)
     return figures(name, replace(hands, group=hands.group + which), target, by_name[name](hands))
 
 

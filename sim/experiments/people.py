@@ -1,7 +1,7 @@
 """What learned skills are worth on people who did not demonstrate: ours beside its rivals.
 
 All learn from the same demonstrations, are told the same places with the same errors, and are
-followed by the same setpoint stage. Parameters are chosen on the people of the tuning set, of as
+followed by the same core. Parameters are chosen on the people of the tuning set, of as
 many candidates for each method; the figures are those of the test set, whom nothing was chosen on.
 """
 
@@ -33,7 +33,6 @@ from sim.experiments.trials import (
     Seen,
     judge,
     seen,
-    workspace,
 )
 from sim.experiments.workers import shared_out
 from sim.people import Group, person
@@ -71,21 +70,21 @@ METHODS = {
     "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
     "paper": Entry(
         "KMP, the paper's numbers,\nour neighbourhoods",
-        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.01, 0.0001, 0.001, 0.003, 0.005, 0.02)),
+        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.005, 0.0001, 0.001, 0.003, 0.01, 0.02)),
     ),
     "promp": Entry(
         "Interaction ProMP",
         tuple(
             InteractionProMP(by_length=by_length, hands_m=hands_m)
             for by_length in (True, False)
-            for hands_m in (0.02, 0.01, 0.03)
+            for hands_m in (0.01, 0.02, 0.03)
         ),
     ),
     "tp_gmm": Entry(
         "TP-GMM",
         tuple(
             TaskParameterised(components, 0.01, iterations)
-            for components, iterations in ((20, 1), (10, 1), (20, 3), (10, 3), (10, 40), (6, 40))
+            for components, iterations in ((6, 40), (10, 1), (20, 3), (10, 3), (10, 40), (20, 1))
         ),
     ),
 }
@@ -106,11 +105,6 @@ class Task(NamedTuple):
 @functools.cache
 def _taught() -> list[Shown]:
     return demonstrations(DEMONSTRATORS)
-
-
-@functools.cache
-def _box() -> Array:
-    return workspace(_taught())
 
 
 @functools.cache
@@ -139,9 +133,9 @@ def outcomes(task: Task) -> list[Outcome]:
     """What became of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
-        return [judge(None, one, _box()) for one in runs]
+        return [judge(None, one) for one in runs]
     model = _learned(task.method, task.candidate)
-    return [judge(model.place(one.session.told), one, _box()) for one in runs]
+    return [judge(model.place(one.session.told), one) for one in runs]
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:

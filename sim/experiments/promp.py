@@ -80,30 +80,20 @@ class Compared(NamedTuple):
 
 
 def _compared(letter: Letter, case: Case) -> Compared:
-    primitive = adapted(letter, case)
-    kmp, other = primitive.mean(TIMES[:, None]), _conditioned(letter, case, ridge=RIDGE)
-    mean, away = letter.demonstrations.mean(axis=0), elsewhere(case)
+    kmp, other = adapted(letter, case).mean(TIMES[:, None]), _conditioned(letter, case, ridge=RIDGE)
+    misses, deviations, largest, everywhere = zip(*(_off(letter, case, line) for line in (kmp, other)), strict=True)
+    return Compared(case, kmp, other, misses, deviations, largest, everywhere)
+
+
+def _off(letter: Letter, case: Case, line: Array) -> tuple[float, float, float, float]:
+    """The largest miss of a trajectory (200, 2) at the desired points; far from those its rms and
+    its largest deviation from the demonstrations' mean, and everywhere its rms [cm].
+    """
     at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
-
-    def miss(line: Array) -> float:
-        return float(np.linalg.norm(line[at] - case.points, axis=1).max())
-
-    def off(line: Array, where: Any) -> Array:
-        return np.asarray(np.linalg.norm((line - mean)[where], axis=1))
-
-    def rms(line: Array, where: Any) -> float:
-        return float(np.sqrt(np.mean(off(line, where) ** 2)))
-
-    everywhere = slice(None)
-    return Compared(
-        case,
-        kmp,
-        other,
-        (miss(kmp), miss(other)),
-        (rms(kmp, away), rms(other, away)),
-        (float(off(kmp, away).max()), float(off(other, away).max())),
-        (rms(kmp, everywhere), rms(other, everywhere)),
-    )
+    miss = np.linalg.norm(line[at] - case.points, axis=1).max()
+    off = np.linalg.norm(line - letter.demonstrations.mean(axis=0), axis=1)
+    away = off[elsewhere(case)]
+    return float(miss), float(np.sqrt(np.mean(away**2))), float(away.max()), float(np.sqrt(np.mean(off**2)))
 
 
 Drawn: TypeAlias = tuple[list[Letter], dict[str, list[Compared]]]
@@ -124,16 +114,11 @@ def _bare(letters: list[Letter]) -> dict[str, float]:
     """ProMP with the covariance of its weights as the demonstrations leave it: largest miss, mean
     rms deviation elsewhere [cm].
     """
-    misses, deviations = [], []
-    for letter in letters:
-        for case in cases(letter):
-            line = _conditioned(letter, case, ridge=0.0)
-            at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
-            misses.append(np.linalg.norm(line[at] - case.points, axis=1).max())
-            deviations.append(
-                np.sqrt(np.mean(np.sum((line - letter.demonstrations.mean(axis=0))[elsewhere(case)] ** 2, axis=1)))
-            )
-    return {"largest_miss_cm": float(max(misses)), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
+    found = [
+        _off(letter, case, _conditioned(letter, case, ridge=0.0))[:2] for letter in letters for case in cases(letter)
+    ]
+    misses, deviations = zip(*found, strict=True)
+    return {"largest_miss_cm": max(misses), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
 
 
 def _summary(rows: list[Compared]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,20 +19,17 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
-from service.core.intake.stillness import RESTING
-from service.core.skill.pose import NO_GRIPPER, Turn
-from service.core.skill.skill import Known, Prediction, Skill
+from service.core.skill.skill import Skill
+from service.core.skill.task_parameterized import STEP_S
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.via_points import adapted
 from sim.bench import Bench
+from sim.experiments.open_loop import Law, Said, by_law, differences, rival
 from sim.experiments.results import Array, ExperimentError
 from sim.experiments.trials import Model
 from sim.people import Places
 from sim.scene import Scene
-
-Law: TypeAlias = Callable[[Array], Array]
-"""From hands (M, 6) [m] to tool (M, 3) [m]."""
 
 COMPONENTS, POINTS, SEED = 10, 200, 0
 PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
@@ -42,71 +38,6 @@ BASES = 20  # of the ProMP, for each of x, y and z
 # Times the mean variance of a ProMP's weights: of 0 to 100, about where it leaves the rest of a
 # letter as well alone as KMP does.
 RIDGE = 10.0
-STEP_S = 1e-3  # of differences in time
-
-
-@dataclass(frozen=True, eq=False)
-class Rival(Skill):
-    """A skill that predicts by another law; workspace and tool direction are the skill's it was
-    made from.
-    """
-
-    law: Law = field(kw_only=True)
-
-    def predict(
-        self,
-        hands: Array,
-        velocities: Array,
-        accelerations: Array,
-        rest: Array = RESTING,
-        *,
-        before: Known | None = None,
-    ) -> Prediction:
-        """The law's tool, and how it moves by differences along the hands' motion."""
-        s, v, a = hands.reshape(6), velocities.reshape(6), accelerations.reshape(6)
-        curve = STEP_S**2 / 2 * a
-        return _moving(self.law(np.stack([s - STEP_S * v + curve, s, s + STEP_S * v + curve])), self.constant_turn)
-
-
-@dataclass(frozen=True, eq=False)
-class TimeDriven(Skill):
-    """A skill that plays a trajectory at its nominal speed whatever the hands do, from the moment
-    they begin.
-    """
-
-    trajectory: Law = field(kw_only=True)  # from times (M, 1) [s] to tool (M, 3) [m]
-    bench: Bench = field(kw_only=True)
-
-    def predict(
-        self,
-        hands: Array,
-        velocities: Array,
-        accelerations: Array,
-        rest: Array = RESTING,
-        *,
-        before: Known | None = None,
-    ) -> Prediction:
-        """The trajectory's tool now; it is told when the hands begin."""
-        t = self.bench.time_s
-        rows = self.trajectory(np.array([[t - STEP_S], [t], [t + STEP_S]]))
-        return _moving(rows, self.constant_turn)
-
-
-def _moving(rows: Array, turn: Turn) -> Prediction:
-    """The middle one of three positions (3, 3) that are STEP_S apart, with its velocity and
-    acceleration.
-    """
-    behind, now, ahead = rows
-    return Prediction(
-        np.round(now, 6),
-        np.round((ahead - behind) / (2 * STEP_S), 6),
-        np.round((ahead - 2 * now + behind) / STEP_S**2, 6),
-        np.zeros((3, 3)),
-        0.0,
-        turn,
-        NO_GRIPPER,
-    )
-
 
 Adapt: TypeAlias = Callable[[Scene], Callable[[Bench], Skill]]
 """From a scene to the skill that is told its places, once there is a bench."""
@@ -124,16 +55,16 @@ def ours(skill: Skill) -> Adapt:
 
 def gmr(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     """Gaussian mixture regression alone, which cannot be told of places."""
-    mixture = GaussianMixture.fit(_samples(demonstrations), components=COMPONENTS, seed=SEED)
-    law = _regression(mixture)
-    return lambda scene: lambda bench: _rival(skill, law)
+    mixture = GaussianMixture.fit(samples_of(demonstrations), components=COMPONENTS, seed=SEED)
+    law = regression_of(mixture)
+    return lambda scene: lambda bench: by_law(skill, law)
 
 
 def paper(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
     """KMP with the paper's ell = 0.5 and lambda = 2 (in metres), and each place a bare point of
     variance 1e-6 m².
     """
-    samples = _samples(demonstrations)
+    samples = samples_of(demonstrations)
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED)
     inputs = mixture.sample_inputs(POINTS, dimensions=6, seed=SEED)
     base = KMP.fit(
@@ -153,7 +84,7 @@ def paper(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # that is what is found out here
             primitive = base.adapt(hands, desired, tolerance=TOLERANCE_M)
-        return lambda bench: _rival(skill, primitive.mean)
+        return lambda bench: by_law(skill, primitive.mean)
 
     return adapt
 
@@ -165,7 +96,7 @@ def of_model(skill: Skill, model: Model) -> Adapt:
         s = scene
         points = (s.left_start, s.right_start, s.handover, s.glass, s.soldering, s.iron, s.robot_start)
         placed = model.place(Places._make([*(np.array(point) for point in points), 0.0]))
-        return lambda bench: _rival(skill, lambda hands: placed.mean(hands, np.zeros_like(hands)))
+        return lambda bench: by_law(skill, lambda hands: placed.mean(hands, np.zeros_like(hands)))
 
     return adapt
 
@@ -182,7 +113,7 @@ def gaussian_process(
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    samples = _samples(demonstrations)[::every]
+    samples = samples_of(demonstrations)[::every]
     inputs, outputs, centre = samples[:, :6], samples[:, 6:], samples[:, 6:].mean(axis=0)
     kernel = ConstantKernel(0.05, (1e-4, 1e2)) * RBF(np.full(6, 0.3), (0.03, 10.0)) + WhiteKernel(1e-4, (1e-6, 1e-2))
     if ell is not None:
@@ -204,7 +135,7 @@ def gaussian_process(
         y = np.concatenate([outputs[kept], wanted]) - centre
         variance = np.concatenate([np.full(int(kept.sum()), noise), np.full(len(at), VIA_STD_M**2)])
         weights = cho_solve(cho_factor(covariance(s, s) + np.diag(variance)), y)
-        return lambda bench: _rival(skill, lambda q: np.asarray(covariance(q, s) @ weights + centre))
+        return lambda bench: by_law(skill, lambda q: np.asarray(covariance(q, s) @ weights + centre))
 
     return adapt
 
@@ -227,11 +158,13 @@ def promp(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
 
         grid = np.linspace(0.0, lasts_s, 1001)
         spline = CubicSpline(grid, conditioned.mean_trajectory(grid.copy()))
-        return lambda bench: TimeDriven(
-            **_fields(skill, b"promp"),
-            trajectory=lambda t: np.asarray(spline(np.clip(t[:, 0], 0.0, lasts_s))),
-            bench=bench,
-        )
+
+        def says(bench: Bench) -> Said:
+            """Its tool now; it is told when the hands begin."""
+            rows = (spline(np.clip(bench.time_s + way * STEP_S, 0.0, lasts_s)) for way in (-1, 0, 1))
+            return Said(differences(*rows))
+
+        return lambda bench: rival(skill, lambda *moving: says(bench))
 
     return adapt
 
@@ -253,14 +186,14 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
             "ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    primitive.copy_from([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
+    primitive.imitate([t.copy() for t in times], list(trajectories))  # it divides the times that it is given
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
         primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))
     )
 
 
-def _regression(mixture: GaussianMixture) -> Law:
+def regression_of(mixture: GaussianMixture) -> Law:
     """The mean of the mixture's regression, as `regress` gives it, with all that does not depend on
     the query made once.
     """
@@ -279,21 +212,5 @@ def _regression(mixture: GaussianMixture) -> Law:
     return law
 
 
-def _samples(demonstrations: Sequence[Demonstration]) -> Array:
+def samples_of(demonstrations: Sequence[Demonstration]) -> Array:
     return np.concatenate([np.hstack([d.hands, d.tool[:, :3]]) for d in demonstrations])
-
-
-def _rival(skill: Skill, law: Law) -> Rival:
-    return Rival(**_fields(skill, b"rival"), law=law)
-
-
-def _fields(skill: Skill, known: bytes) -> dict[str, Any]:
-    return {
-        "name": known.decode(),
-        "primitive": skill.primitive,
-        "orientation": skill.orientation,
-        "workspace": skill.workspace,
-        "threshold": skill.threshold,
-        "learned_from": skill.learned_from,
-        "file": known,  # its digest: nothing is recorded that would need the rest
-    }

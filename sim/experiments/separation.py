@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+import msgspec
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from scipy.ndimage import maximum_filter1d
 from kmp.compiled import compiled
 from service.config import Settings, robot_description
 from service.contract.records import Flag
-from service.core.separation.body import body_of
+from service.core.separation.body import Body, body_of
 from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import SLIP, Separation, allowed_speed
 from service.shipped import shipped_skill
@@ -122,12 +123,12 @@ def run_one(task: tuple[str, int]) -> Outcome:
     kind, number = task
     drawn = draw(number)
     script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
-    nearest: list[tuple[float, float]] = []
+    clearances: list[tuple[float, float]] = []
 
     def look(bench: Bench) -> None:
         if bench.tick % CLEARANCE_TICKS == 0:
             world = bench.world
-            nearest.append(
+            clearances.append(
                 (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
             )
 
@@ -138,29 +139,21 @@ def run_one(task: tuple[str, int]) -> Outcome:
     else:
         done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
     away_s = script.away_s if isinstance(script, ThrustScript) else 0.0
-    return _judged(kind, number, drawn, away_s, done, nearest)
+    return _judged(kind, number, drawn, away_s, done, clearances)
 
 
 def _judged(
-    kind: str, number: int, drawn: Drawn, away_s: float, done: Rehearsed, nearest: list[tuple[float, float]]
+    kind: str, number: int, drawn: Drawn, away_s: float, done: Rehearsed, clearances: list[tuple[float, float]]
 ) -> Outcome:
-    settings = Settings()
-    people, body, dt = settings.people, body_of(settings, robot_description(settings)), 1 / RATE_HZ
-    velocities = np.gradient(done.hands, dt, axis=0)
-    moving = int(np.flatnonzero(body.links)[0])
-    count = len(body.links) - moving
-    distance, speed, coming = (np.empty((len(done.hands), 2, count)) for _ in range(3))
-    own, table = np.empty(len(done.hands)), np.empty(len(done.hands))
-    forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
-    _measure(
-        done.joints[:, 0], done.joints[:, 1], done.hands, velocities, *body, moving, people.radius, forearm,
-        settings.table.centre[2], distance, speed, coming, own, table,
-    )  # fmt: skip
+    settings, dt = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), 1 / RATE_HZ
+    people, body = settings.people, body_of(settings, robot_description(settings))
+    distance, speed, coming, own, table = nearest(settings, body, done.joints, done.hands)
     reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
     allowed = np.empty_like(distance)
     _allow(distance, coming, people.brake, reaction_s, people.clearance, allowed)
     offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
-    tool = body.links[moving:] == len(settings.joints.names)
+    links = body.capsules["link"]
+    tool = links[links > 0] == len(settings.joints.names)
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
     lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
@@ -178,7 +171,7 @@ def _judged(
         done.errors_mm,
         tuple(getattr(done.events, name).time_s for name in TaskEvents.__struct_fields__),
         away_s,
-        1000 * min(map(min, nearest)),
+        1000 * min(map(min, clearances)),
         1000 * float(pushed.max()),
         float((speed - allowed)[began].max()),
         float(np.where(assumed, over, -1.0)[began].max()),
@@ -206,32 +199,44 @@ def _later_by(ticks: int, values: Array) -> Array:
     return np.concatenate([np.repeat(values[:1], ticks, axis=0), values])[: len(values)]
 
 
-@compiled
-def _measure(
-    q: Array, dq: Array, hands: Array, velocities: Array, frames: Array, axes: Array, links: Array, ends: Array,
-    radii: Array, pairs: Array, moving: int, radius: float, forearm: Array, top: float, distance: Array, speed: Array,
-    coming: Array, own: Array, table: Array,
-) -> None:  # fmt: skip
-    """Of each capsule and each hand (T, 2, N) the distance, how fast the capsule's nearest point
-    comes, and how fast the hand does; the least distances (T,) of links, and of links and table.
+def nearest(settings: Settings, body: Body, joints: Array, hands: Array) -> tuple[Array, ...]:
+    """Of each moving capsule of the body and each hand the distance [m], how fast the capsule's
+    nearest point comes, and how fast the hand does [m/s], (T, 2, N) each; then the least distances
+    (T,) [m] of links, and of links and table. Joints (T, 2, J) [rad, rad/s], hands (T, 2, 3) [m].
     """
-    here, then, near, arm = np.empty((len(links), 2, 3)), np.empty((len(links), 2, 3)), np.empty(9), np.empty((2, 3))
-    for t in range(len(q)):
-        place(q[t], frames, axes, links, ends, here)
-        place(q[t] + STEP_S * dq[t], frames, axes, links, ends, then)
-        own[t] = table[t] = 1.0
-        for pair in range(len(pairs)):
-            one, other = pairs[pair, 0], pairs[pair, 1]
-            apart = between_segments(here[one], here[other], near) - radii[one] - radii[other]
-            own[t] = min(own[t], apart)
-        for c in range(moving, len(links)):
+    people, count = settings.people, int((body.capsules["link"] > 0).sum())
+    moving = np.stack([hands, np.gradient(hands, settings.period_s, axis=0)], axis=2)
+    pairs, least = np.empty((3, len(hands), 2, count)), np.ones((2, len(hands)))
+    forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
+    shape = np.array([people.radius, *forearm, settings.table.centre[2]])
+    _measure(np.ascontiguousarray(joints), moving, body, shape, pairs, least)
+    return (*pairs, *least)
+
+
+@compiled
+def _measure(joints: Array, hands: Array, body: Body, shape: Array, pairs: Array, least: Array) -> None:
+    """`nearest`, with the hands' velocities (T, 2, 2, 3), and the shape (5,) of a forearm and the
+    table: radius, way to the elbow, height. Into pairs (3, T, 2, N) and least (2, T).
+    """
+    frames, axes, capsules, kept_apart = body
+    count, near, arm = len(capsules), np.empty(9), np.empty((2, 3))
+    here, then, fixed = np.empty((count, 2, 3)), np.empty((count, 2, 3)), count - pairs.shape[3]
+    for t in range(len(joints)):
+        q = joints[t, 0]
+        place(q, frames, axes, capsules, here)
+        place(q + STEP_S * joints[t, 1], frames, axes, capsules, then)
+        for pair in range(len(kept_apart)):
+            one, other = kept_apart[pair, 0], kept_apart[pair, 1]
+            apart = between_segments(here[one], here[other], near) - capsules[one].radius - capsules[other].radius
+            least[0, t] = min(least[0, t], apart)
+        for c in range(fixed, count):
             if max(here[c, 0, 0], here[c, 1, 0]) > 0.35:
-                table[t] = min(table[t], min(here[c, 0, 2], here[c, 1, 2]) - radii[c] - top)
+                least[1, t] = min(least[1, t], min(here[c, 0, 2], here[c, 1, 2]) - capsules[c].radius - shape[4])
             for side in range(2):
-                arm[0] = hands[t, side]
-                arm[1] = arm[0] + forearm
-                distance[t, side, c - moving] = between_segments(here[c], arm, near) - radii[c] - radius
-                long = whole = along = hand = 0.0
+                arm[0] = hands[t, side, 0]
+                arm[1] = arm[0] + shape[1:4]
+                pairs[0, t, side, c - fixed] = between_segments(here[c], arm, near) - capsules[c].radius - shape[0]
+                long = whole = along = coming = 0.0
                 for i in range(3):
                     way = here[c, 1, i] - here[c, 0, i]
                     whole += way * way
@@ -240,8 +245,8 @@ def _measure(
                 for i in range(3):
                     first, second = then[c, 0, i] - here[c, 0, i], then[c, 1, i] - here[c, 1, i]
                     along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
-                    hand -= near[6 + i] * velocities[t, side, i]
-                speed[t, side, c - moving], coming[t, side, c - moving] = along, max(hand, 0.0)
+                    coming -= near[6 + i] * hands[t, side, 1, i]
+                pairs[1, t, side, c - fixed], pairs[2, t, side, c - fixed] = along, max(coming, 0.0)
 
 
 @compiled

@@ -42,7 +42,7 @@ class Service:
 
     def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
         """The skill that the service learns by default."""
-        return LearnedByService(learn([recorded(one) for one in demonstrations]))
+        return LearnedByService(learn([recorded(one) for one in demonstrations]), start=True)
 
 
 @dataclass(frozen=True)
@@ -58,39 +58,21 @@ class ServiceAsPaper:
         """The skill with these parameters."""
         taken = [recorded(one) for one in demonstrations]
         return LearnedByService(
-            learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
+            learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components),
+            start=False,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedByService:
-    """A skill of the service."""
+    """A skill of the service, and whether the start is among its places."""
 
     skill: Skill
+    start: bool
 
-    def place(self, places: Places) -> PlacedSkill:
+    def place(self, places: Places) -> Skill:
         """The skill adapted to the places."""
-        points = via_points(places, start=self.skill.between is not None)
-        return PlacedSkill(adapted(self.skill, points, tolerance=TOLERANCE_M))
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedSkill:
-    """A skill of the service with its places taught."""
-
-    skill: Skill
-    memoryless = True
-
-    def mean(self, hands: Array, rest: Array) -> Array:
-        """As `trials.Placed`."""
-        return self.skill.mean(hands, rest)
-
-    def predict(self, hands: Array, rest: Array) -> Predicted:
-        """As `trials.Placed`; far is what the service's gate says."""
-        some = self.skill.covariances(hands[::COVARIANCE_EVERY], rest[::COVARIANCE_EVERY])
-        covariance = np.repeat(some, COVARIANCE_EVERY, axis=0)[: len(hands)] + 1e-12 * np.eye(3)
-        far = self.skill.deviations(hands) > self.skill.threshold
-        return Predicted(self.mean(hands, rest), covariance, far)
+        return adapted(self.skill, via_points(places, start=self.start), tolerance=TOLERANCE_M)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
-"""One session of a person with one skill, open loop: hands through the service's own intake, the
-skill's target, the service's own setpoint stage with its limits; and what is judged of it.
+"""One session of a person with one skill: hands as a tracker sees them through the service's core,
+whose arm does as it is told; and what is judged of it.
 
-All in process at one rate, the same for every skill. The tool is where the setpoint is: no arm.
+All in process at one rate, the same for every skill.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -17,26 +17,23 @@ from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2
 
 from service.config import Settings
-from service.contract.messages import BASE, PoseStamped
-from service.core.frame import blank, state_layout
-from service.core.intake.intake import Intake
-from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.setpoint.workspace import Target
-from service.core.stops import fastest_stop
-from sim.closed_loop import START_NS
+from service.contract.records import SIDES, Mode
+from service.core.frame import Event, Tick
+from service.core.skill.skill import Skill
+from service.shipped import shipped_skill
+from sim.closed_loop import START_NS, hand_event
+from sim.experiments.open_loop import Said, along_hands, controller, frames, rival
 from sim.experiments.results import Array
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
 from sim.sessions import Session, Shown
+from sim.teach import places_of
 
 RATE_HZ = 125
 WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # of an event
 NEAR_M, FAST_MPS = 0.05, 0.25  # faster than this nearer than that to a hand is a failure
 WRONG_M = 0.10  # a target so far from the teacher's is followed falsely
-STEP_S = 0.02  # of differences along the hands' motion
-CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
-SMOOTHED = 5  # ticks over which a target's velocity is taken where the skill has a memory
-RESUMED_S = 0.1  # hands must be near the data for so long after they were far
+SMOOTHED = 5  # ticks over which a target's velocity is taken where a rival has a memory
 LONGEST_DELAY_S = 0.6
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose coverage is counted
 KEPT = 0.05  # share of the time falsely followed up to which the way was kept
@@ -53,7 +50,7 @@ class Predicted(NamedTuple):
 
 
 class Placed(Protocol):
-    """A skill that was told the places of a scene."""
+    """A rival that was told the places of a scene."""
 
     @property
     def memoryless(self) -> bool:
@@ -71,8 +68,8 @@ class Placed(Protocol):
 class Model(Protocol):
     """What was learned from demonstrations."""
 
-    def place(self, places: Places) -> Placed:
-        """The skill in a scene whose places are perceived so."""
+    def place(self, places: Places) -> Placed | Skill:
+        """The rival, or a skill of the service, in a scene whose places are perceived so."""
 
 
 class Method(Protocol):
@@ -87,6 +84,7 @@ class Seen:
     """A session as the service sees it, tick by tick, and as it is."""
 
     session: Session
+    ticks: tuple[Tick, ...]
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
     rest: Array  # (T, 2) how much each hand rests
@@ -106,40 +104,32 @@ def settings() -> Settings:
     return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
 
 
+def ticks(session: Session) -> Iterator[Tick]:
+    """What the tracker says of a session, tick by tick."""
+    inboxes: list[list[Event]] = [[] for _ in range(int(session.lasts_s * RATE_HZ))]
+    for side, (stamps, samples) in zip(SIDES, session.samples(), strict=True):
+        for stamp, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
+            if (k := int(np.ceil(stamp * RATE_HZ - 1e-9))) < len(inboxes):
+                inboxes[k].append(hand_event(side, (x, y, z), START_NS + round(1e9 * stamp)))
+    return (Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes))
+
+
 def seen(session: Session) -> Seen:
-    """The session through tracker and intake."""
-    chosen = settings()
-    intake, state = Intake(chosen), blank(state_layout(len(chosen.joints.names)))
-    intake.begin(state)
-    ticks = int(session.lasts_s * RATE_HZ)
-    times = np.arange(ticks) / RATE_HZ
-    samples = session.samples()
-    at = [np.ceil(stamps * RATE_HZ - 1e-9).astype(int) for stamps, _ in samples]
-    upto = [0, 0]
-    estimates, rest, fresh = np.zeros((ticks, 3, 6)), np.zeros((ticks, 2)), np.zeros(ticks, bool)
-    for k in range(ticks):
-        intake.advance(state, 1)
-        for side in (0, 1):
-            while upto[side] < len(at[side]) and at[side][upto[side]] <= k:
-                i = upto[side]
-                x, y, z = samples[side][1][i].tolist()
-                stamp_ns = START_NS + round(1e9 * float(samples[side][0][i]))
-                intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, (x, y, z), (0.0, 0.0, 0.0, 1.0)))
-                upto[side] += 1
-        estimates[k], rest[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["repose"]
-        fresh[k] = intake.are_fresh(state) and not intake.is_contested(state, already=bool(k and not fresh[k - 1]))
+    """The session through tracker and service, which holds for nothing but the hands."""
+    known = tuple(ticks(session))
+    core = controller(replace(shipped_skill(), threshold=np.inf), settings())
+    times = np.arange(len(known)) / RATE_HZ
+    estimates, rest, fresh = np.zeros((len(known), 3, 6)), np.zeros((len(known), 2)), np.zeros(len(known), bool)
+    for k, tick in enumerate(known):
+        fresh[k] = core.step(tick)["mode"] == Mode.FOLLOW
+        state = core.state
+        estimates[k], rest[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["hand_stillness"]
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(session, times, estimates, rest, fresh, swapped, session.hands(times), session.tool(times))
+    return Seen(session, known, times, estimates, rest, fresh, swapped, session.hands(times), session.tool(times))
 
 
-def workspace(demonstrations: Sequence[Shown]) -> Array:
-    """The box (2, 3) [m] that targets are kept in, the same for every skill."""
-    tools = np.concatenate([one.tool for one in demonstrations])
-    return np.stack([tools.min(axis=0) - 0.25, tools.max(axis=0) + 0.25])
-
-
-class Event(NamedTuple):
+class EventOutcome(NamedTuple):
     """How one event went: whether it succeeded, the least distance [mm] to the place as perceived,
     then to the true one, and whether the tool held all through its window.
     """
@@ -156,7 +146,7 @@ class Outcome(NamedTuple):
     person: str
     number: int
     success: bool
-    events: tuple[Event, Event, Event]
+    events: tuple[EventOutcome, EventOutcome, EventOutcome]
     too_near: bool
     path_mm: float  # rms of the target from the teacher's tool, its delay taken out
     delay_s: float  # of the target; and of the tool
@@ -177,30 +167,25 @@ class Outcome(NamedTuple):
         return self.success and self.falsely_followed <= KEPT
 
 
-def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
+def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
     """The outcome of a session; None stands for the teacher, who is told the places as the others
     are.
     """
-    predicted, velocity, acceleration = _targets(placed, one)
-    mean = np.clip(predicted.mean, box[0], box[1])
-    inside = mean == predicted.mean
-    held = _held(predicted.far) | ~one.fresh
-    targets = np.stack([mean, velocity * inside, acceleration * inside])
-    tool = follow(targets, held, start=one.session.places.robot_start, box=box)
+    found = served(placed, one)
+    target, tool, held = found["target"], found["tool"], found["mode"] != Mode.FOLLOW
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
     events = tuple(_event(one, tool, speed, held, i) for i in range(3))
     apart = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
     too_near = bool(((apart < NEAR_M) & (speed > FAST_MPS)).any())
     judged = one.times > 0.5
     good = judged & ~one.due
-    delay, _ = _delayed(mean, one.tool, good)
+    delay, _ = _delayed(target, one.tool, good)
     tool_delay, _ = _delayed(tool, one.tool, good & ~held)
-    wanted = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(mean) - delay]])
-    errors = (wanted - predicted.mean)[good]
-    covariance = predicted.covariance[good]
+    wanted = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
+    errors, covariance = (wanted - target)[good], found["covariance"][good]
     squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
-    wrong = np.linalg.norm(mean - wanted, axis=1) > WRONG_M
+    wrong = np.linalg.norm(target - wanted, axis=1) > WRONG_M
     planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
     return Outcome(
         one.session.person.name,
@@ -208,7 +193,7 @@ def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
         all(event.reached for event in events) and not too_near,
         events,  # type: ignore[arg-type]
         too_near,
-        1000 * float(np.sqrt(np.mean(np.sum((wanted - mean)[good] ** 2, axis=1)))),
+        1000 * float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
         delay / RATE_HZ,
         tool_delay / RATE_HZ,
         float(held[judged].mean()),
@@ -223,70 +208,47 @@ def judge(placed: Placed | None, one: Seen, box: Array) -> Outcome:
     )
 
 
-def _targets(placed: Placed | None, one: Seen) -> tuple[Predicted, Array, Array]:
-    """The predictions of all ticks, and how the target moves: velocities and accelerations (T, 3).
+def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
+    """The service's frames (T,) of a session: with its skill, or with a rival in its place."""
+    if isinstance(placed, Skill):
+        return frames(placed, one.ticks, settings())
+    predicted, motion = _moving(placed, one)
+    now = 0
 
-    Of a memoryless skill by differences along the hands' motion, as the service's own derivatives
-    say, and none along that of a hand which only trembles; of another by differences in time of
-    what it has said.
+    def counted() -> Iterator[Tick]:
+        nonlocal now
+        for tick in one.ticks:
+            now = tick.index
+            yield tick
+
+    skill = rival(
+        shipped_skill(),
+        lambda *moving: Said(motion[now], predicted.covariance[now], bool(predicted.far[now])),
+        via_points=places_of(one.session.told),
+    )
+    return frames(skill, counted(), settings())
+
+
+def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
+    """A rival's predictions of all ticks, and how its target moves (T, 3, 3).
+
+    Of a memoryless one along the hands' motion, as of the service's skill; of another by
+    differences in time of what it has said.
     """
     s, v, a = one.estimates.transpose(1, 0, 2)
-    if placed is None or not placed.memoryless:
-        if placed is None:
-            count, as_told = len(one.times), replace(one.session, places=one.session.told)
-            predicted = Predicted(
-                as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool)
-            )
-        else:
-            predicted = placed.predict(s, one.rest)
-        before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
-        velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
-        return predicted, velocity, np.zeros_like(velocity)
-    predicted = placed.predict(s, one.rest)
-    speed = np.repeat(np.linalg.norm(v.reshape(-1, 2, 3), axis=2), 3, axis=1)
-    goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
-    step, curve = STEP_S * goes * v, STEP_S**2 / 2 * goes * a
-    behind, ahead = (placed.mean(s + way * step + curve, one.rest) for way in (-1, 1))
-    most = settings().tool.max_acceleration
-    acceleration = np.clip((ahead - 2 * predicted.mean + behind) / STEP_S**2, -most, most)
-    return predicted, (ahead - behind) / (2 * STEP_S), acceleration
+    if placed is None:
+        count, as_told = len(one.times), replace(one.session, places=one.session.told)
+        predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool))
+    else:
+        predicted = placed.predict(s, one.rest)
+        if placed.memoryless:
+            return predicted, along_hands(lambda hands: placed.mean(hands, one.rest), s, v, a)
+    before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
+    velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
+    return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)
 
 
-def _held(far: Mask) -> Mask:
-    """Far, and a moment longer (T,)."""
-    steps = int(RESUMED_S * RATE_HZ)
-    recent = np.convolve(far, np.ones(steps + 1))[: len(far)]
-    return np.asarray(recent > 0)
-
-
-def follow(targets: Array, held: Mask, *, start: Array, box: Array) -> Array:
-    """The setpoints (T, 3) [m] that follow targets (3, T, 3), positions, velocities and
-    accelerations, and brake where held (T,), from rest at `start`.
-    """
-    chosen = settings()
-    generator, state = SetpointGenerator(chosen), blank(state_layout(len(chosen.joints.names)))
-    generator.begin(state, np.stack([start, np.zeros(3), np.zeros(3)]))
-    mean, velocity, acceleration = np.ascontiguousarray(targets)
-    costs, out, stop = np.zeros((3, 3, 1)), np.empty(mean.shape), np.empty(6)
-    tool = chosen.tool
-    for k in range(len(mean)):
-        if held[k]:
-            now = state["setpoint"]
-            if not now[1:].any():
-                out[k] = now[0]
-                continue
-            for i in range(3):
-                fastest_stop(now[1, i], now[2, i], tool.max_acceleration, tool.max_jerk, chosen.period_s, stop)
-                now[0, i] += stop[2]
-                now[1, i], now[2, i] = stop[0], stop[1]
-            generator.begin(state, now.copy())
-        else:
-            generator.step(state, Target(mean[k], velocity[k], acceleration[k], clamped=False), box, costs, 1.0)
-        out[k] = state["setpoint"][0]
-    return out
-
-
-def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> Event:
+def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
     if i == 0:  # the board is wanted where the hand is, as it is seen
@@ -302,7 +264,7 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> Event:
     best = int(np.argmin(uniform_filter1d(off, steps, mode="nearest")))
     true_off = np.linalg.norm(tool[window] - true, axis=1)
     reached, was_held = bool((runs >= steps - 0.5).any()), bool(held[window].mean() > 0.8)
-    return Event(reached, 1000 * float(off[best]), 1000 * float(true_off[best]), was_held)
+    return EventOutcome(reached, 1000 * float(off[best]), 1000 * float(true_off[best]), was_held)
 
 
 def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:

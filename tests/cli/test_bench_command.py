@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cell import thirdhand
 
 from service.recording.replay import replay
 from service.timing import loads, soak
+from support.cell import thirdhand
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.timed]
 QUIET = {"say": lambda line: None}
@@ -33,7 +33,7 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
 
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
-    monkeypatch.setattr(loads, "_large", bytes)
+    monkeypatch.setattr(loads, "large_skill", bytes)
     (row,) = loads.run(500, 1.0, **QUIET)
     assert row["mode"] == "follow"
     assert row["ticks"] == pytest.approx(500, abs=150)

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import psutil
 import pytest
-from cell import thirdhand
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from tests_paths import ROOT
 
 from service.cli.demo import text
+from support.cell import thirdhand
+from support.paths import ROOT
 
 pytestmark = pytest.mark.timed
 SCENE = """

@@ -110,9 +110,14 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
         (
             {"sources": source("left", rejected={"older": 90})},
             "left hand",
-            ("45% of what comes contradicts", "one publisher of lab/hands/left", "stop one"),
+            ("45% of what came contradicts", "one publisher of lab/hands/left", "stop one"),
         ),
-        ({"sources": source("right", contested=0.3)}, "right hand", ("30% of what comes", "one publisher", "stop one")),
+        ({"sources": source("right", contested=0.3)}, "right hand", ("30% of what came", "one publisher", "stop one")),
+        (
+            {"sources": source("left", scatter_mm=9.0)},
+            "left hand",
+            ("scatters by 9 mm an axis, 8 accepted", "stop one"),
+        ),
         ({"sources": source("left", clock_ms=-4000.0)}, "left hand's clock", ("4 s after it comes", "chrony")),
         ({"sources": source("left", clock_ms=5000.0)}, "left hand's clock", ("5 s before it comes", "no latency")),
         ({"command_heard": False}, "arm's driver", ("nobody listens to lab/joints/command",)),

@@ -18,14 +18,14 @@ from types import ModuleType
 
 import pytest
 import zenoh
-from cell import LEFT, Daemon, Tracker
-from tests_paths import ROOT
 
 from service.cli.main import main
 from service.client import endpoints, open_session
 from service.config import Settings
 from service.contract import cdr, messages
 from service.launch import launched
+from support.cell import LEFT, Daemon, Tracker
+from support.paths import ROOT
 
 NEAR_LEFT = (0.95, -0.30, 0.08)  # a hand that moves a little: an arm that is late is not far off
 PATIENT = """# Threads of a busy test may be late.

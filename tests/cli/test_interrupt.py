@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests_paths import RECORDINGS, ROOT
+
+from support.paths import RECORDINGS, ROOT
 
 SAID = "thirdhand: interrupted"
 DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts

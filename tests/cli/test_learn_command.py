@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cell import thirdhand
 
 from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations
+from support.cell import thirdhand
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,13 @@ import threading
 from pathlib import Path
 
 import pytest
-from tests_paths import ROOT
 
 from service.cli.main import main
 from service.contract.channels import ENDPOINT
 from service.launch import free_port
 from service.learning.skill_file import decoded
 from sim import teach
+from support.paths import ROOT
 
 BLOCKS = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL)
 SPEED, REST_S = "10", "0.4"

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests_paths import RECORDINGS, ROOT
-from wam import STATE
 
 from service import palette
 from service.cli.main import main
 from service.config import Settings
-from service.core.frame import blank
+from service.core.record import blank
 from service.recording.recording import Recorder, Recording
 from service.report.page import thinned
+from support.paths import RECORDINGS, ROOT
+from support.wam import STATE
 
 GOLDEN = RECORDINGS / "golden.mcap"
 

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import chromium
 import numpy as np
 import pytest
-from cell import Daemon, Tracker, serving
 from PIL import Image
-from tests_paths import ROOT
 
 from service.cli.live_page import STREAM
 from service.cli.view import FRESH_S, screenshot
+from support import chromium
+from support.cell import Daemon, Tracker, serving
+from support.paths import ROOT
 
 TIMEOUT_S = 90
 EMPTY_GRPC = b"\0\0\0\0\0"  # a message without fields
@@ -108,6 +108,7 @@ def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere
     connection.close()
 
 
+@pytest.mark.usefixtures("drawing")
 def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scene_to_who_comes_late(
     page: Page, tmp_path: Path
 ) -> None:

@@ -210,7 +210,7 @@ def of_promp(data: Data) -> Outcome:
 
     def fit():
         promp = ProMP(n_dims=2, n_weights_per_dim=20)
-        promp.copy_from(np.tile(t, (len(stacked), 1)), stacked)
+        promp.imitate(np.tile(t, (len(stacked), 1)), stacked)
         return promp
 
     def adapt(point):
@@ -241,7 +241,7 @@ def of_dmp(data: Data) -> Outcome:
 
     def fit():
         dmp = DMP(n_dims=2, execution_time=2.0, dt=2.0 / (len(t) - 1), n_weights_per_dim=50)
-        dmp.copy_from(t, mean)
+        dmp.imitate(t, mean)
         return dmp
 
     def moved():

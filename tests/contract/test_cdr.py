@@ -15,11 +15,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
-from wam import JOINT_NAMES
 
 from service.contract import cdr, channels, messages, requests
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
+from service.core.frame import definitions
+from support.wam import JOINT_NAMES
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES = ("", "b", "ba", "bas", "base", "base_", "base_l", "a/tracker/over there", "tête")
@@ -294,7 +295,7 @@ def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
     keys = [channel.key for channel in channels.CHANNELS]
     assert len(set(keys)) == len(keys)
     assert all(
-        channel.codec.encoding == "json" or schema(channel.codec.type, joints=7) for channel in channels.CHANNELS
+        channel.codec.encoding == "json" or schema(channel.codec.type, definitions(7)) for channel in channels.CHANNELS
     )
     entering = {channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded}
     assert entering - {"objects"} < set(EVENT_NUMBERS)

@@ -1,7 +1,7 @@
 """Bytes from strangers: every decoder answers with a value or a refusal in words, and soon.
 
 `THIRDHAND_EXAMPLES=100000 pytest tests/contract/test_hostile_bytes.py` mutates more;
-`hostile_bytes` itself searches with atheris.
+`support/hostile_bytes.py` itself searches with atheris.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from collections.abc import Callable
 from random import Random
 
 import pytest
-from hostile_bytes import DECODERS, FOUND, REQUESTS, check, mutated, seeds
 
 from service.contract import cdr
 from service.contract.messages import WireError
 from service.contract.requests import RequestError
+from support.hostile_bytes import DECODERS, FOUND, REQUESTS, check, mutated, seeds
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "1500"))
 LARGE = 2_000_000  # bytes, far more than any message has

@@ -15,15 +15,16 @@ import numpy as np
 from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
-from in_process import ASSUMED, LEFT, RIGHT, hand
-from tests_paths import RECORDINGS
-from wam import URDF
 
 from service.contract.records import SIDES, Cause, Mode
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, order
+from service.core.frame import Tick, order
+from service.core.record import Vector
 from service.learning.skill_file import decoded
+from support.in_process import ASSUMED, LEFT, RIGHT, hand
+from support.paths import RECORDINGS
+from support.wam import URDF
 
 PERIOD_S, TICKS = 0.002, 1000
 SECONDS, LOOPS = 2.0, st.sampled_from([500, 250, 1000])  # of a legal hand, and rates [Hz] of the loop

@@ -15,13 +15,13 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wam import JOINT_NAMES, URDF
 
 from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
 from service.core.arm.arm import Arm
 from service.core.limiter.limiter import Limiter
-from service.core.setpoint.workspace import clamp
+from service.core.skill.workspace import clamp
+from support.wam import JOINT_NAMES, URDF
 
 Vector = npt.NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def minimum_jerk(start: Vector, end: Vector, seconds: float) -> tuple[Vector, Ve
 
 def test_forward_kinematics_is_the_product_of_the_published_parameters_and_gives_their_check_values() -> None:
     for q in random_joints(200, seed=1):
-        _, position, rotation, *_ = ARM.at(q)
+        position, rotation = ARM.at(q).position, ARM.at(q).rotation
         expected = dh_frames(q)[-1]
         assert np.abs(position - expected[:3, 3]).max() < 1e-9
         assert np.abs(rotation - expected[:3, :3]).max() < 1e-9
@@ -143,7 +143,7 @@ def test_the_tool_sits_on_the_plate_where_the_settings_say() -> None:
     )
     q = random_joints(1, seed=2)[0]
     plate = dh_frames(q)[-1]
-    _, position, rotation, *_ = arm.at(q)
+    position, rotation = arm.at(q).position, arm.at(q).rotation
     assert position == pytest.approx(plate[:3, 3] + plate[:3, :3] @ [0.01, 0.02, 0.1], abs=1e-9)
     assert rotation[:, 2] == pytest.approx(plate[:3, 0], abs=1e-9)
 

@@ -7,21 +7,21 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
-from tests_paths import RECORDINGS
-from wam import FRAME, URDF
 
 from service.config import Settings
-from service.contract import channels, records
+from service.contract import channels
 from service.contract.records import Flag, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Event, Tick, order
+from service.core.frame import Event, Tick, definitions, order
 from service.core.outputs import outgoing
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
+from support.paths import RECORDINGS
+from support.wam import FRAME, URDF
 
 PERIOD_S = 0.002
 POSTURE = Settings().arm.posture
@@ -290,7 +290,7 @@ def test_frames_cannot_be_changed_and_describe_themselves(taught: Skill) -> None
     frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
     with pytest.raises(ValueError, match="read-only"):
         frame["joints"][0] = 1.0
-    assert records.definition(records.FRAME, 7).startswith("int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n")
+    assert definitions(7)["thirdhand/Frame"].startswith("int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n")
 
 
 def test_the_assumed_arm_starts_at_the_configured_posture(taught: Skill) -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
-from wam import URDF
 
 from service.config import Settings
 from service.contract import channels
@@ -20,6 +18,8 @@ from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, order
 from service.core.skill.skill import Skill
 from service.recording.recording import Recorder
+from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
+from support.wam import URDF
 
 SETTINGS = Settings()
 SECONDS, EVERY = 12.0, 5  # between samples [ticks]

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from test_intake import LEFT, PERIOD_S, Hands, follow
 
 from service.config import HandSettings
-from service.core.frame import Vector
 from service.core.intake import hand_estimator
 from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE, model
+from service.core.record import Vector
+from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 
 def reach(t: float) -> Vector:
@@ -44,7 +44,7 @@ def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
     hands = Hands()
     states = follow(hands, lambda t: still, until_s=6.0, noise=noise)
     assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.65 * noise_m
-    found = math.sqrt(hands.state["noise"][LEFT, 0])
+    found = math.sqrt(hands.state["noise_variance"][LEFT])
     assert max(noise_m, LEAST_NOISE) * 0.7 < found < max(noise_m, LEAST_NOISE) * 1.4
 
 
@@ -66,7 +66,7 @@ def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
     many.advance(20)
     assert one.state["tick"] == many.state["tick"]
     np.testing.assert_allclose(many.state["hands"], one.state["hands"], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(many.state["covariances"], one.state["covariances"], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(many.state["mode_covariances"], one.state["mode_covariances"], rtol=1e-9, atol=1e-15)
 
 
 def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() -> None:
@@ -78,12 +78,12 @@ def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() 
             at = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
             hands.hand(tick + 1, tuple(at.tolist()))
     state = hands.state
-    for covariance in state["covariances"][LEFT]:
+    for covariance in state["mode_covariances"][LEFT]:
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
         assert np.linalg.eigvalsh(covariance).min() > 0
-    assert state["modes"][LEFT].sum() == pytest.approx(1.0)
-    assert (state["modes"][LEFT] > 0).all()
-    assert LEAST_NOISE**2 <= state["noise"][LEFT, 0] <= MOST_NOISE**2
+    assert state["mode_probabilities"][LEFT].sum() == pytest.approx(1.0)
+    assert (state["mode_probabilities"][LEFT] > 0).all()
+    assert LEAST_NOISE**2 <= state["noise_variance"][LEFT] <= MOST_NOISE**2
     assert np.isfinite(state["hands"]).all()
 
 

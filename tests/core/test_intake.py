@@ -5,80 +5,18 @@ between its samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from wam import JOINT_NAMES, STATE
 
-from service.config import HandSettings, Settings
-from service.contract.messages import JointState, PoseStamped
+from service.config import HandSettings
+from service.contract.messages import PoseStamped
 from service.contract.records import Cause
-from service.core.frame import Record, Vector, blank
-from service.core.intake.intake import Intake
 from service.core.rotation import rotation
+from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
+from support.wam import JOINT_NAMES
 
-PERIOD_S = 0.002
-LEFT, RIGHT = 0, 1
-STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
-
-
-class Hands:
-    """An intake and its state, moved on tick by tick."""
-
-    def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
-        self.intake = Intake(Settings(hands=hands or HandSettings(), rate_hz=rate_hz))
-        self.state: Record = blank(STATE)
-        self.intake.begin(self.state)
-        self.advance()
-
-    def advance(self, ticks: int = 1) -> None:
-        self.intake.advance(self.state, ticks)
-
-    def hand(
-        self,
-        stamp_ns: int,
-        position: tuple[float, ...] = (0.5, 0.1, 0.2),
-        turn: tuple[float, ...] = STRAIGHT,
-        side: int = LEFT,
-    ) -> Vector:
-        """The filtered position (3,) [m] after one more sample."""
-        self.intake.take_hand(self.state, side, PoseStamped(stamp_ns, "base", position, turn))  # type: ignore[arg-type]
-        return np.array(self.state["hands"][side, 0])
-
-    def arm(
-        self,
-        stamp_ns: int,
-        names: tuple[str, ...] = JOINT_NAMES,
-        position: tuple[float, ...] = (0.1,) * 7,
-        velocity: tuple[float, ...] = (),
-    ) -> None:
-        self.intake.take_arm(self.state, JointState(stamp_ns, names, position, velocity))
-
-    def fresh(self, side: int = LEFT) -> bool:
-        return self.intake.is_fresh(self.state, side)
-
-    def rejected(self) -> dict[Cause, int]:
-        return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}
-
-
-def follow(
-    hands: Hands, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
-) -> Vector:
-    """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
-    states, taken = [], 0
-    for tick in range(round(until_s / PERIOD_S)):
-        if tick:
-            hands.advance()
-        if tick * PERIOD_S * rate_hz >= taken - 1e-9:
-            stamp_s = tick * PERIOD_S
-            position = where(stamp_s) + (0.0 if noise is None else noise[taken])
-            hands.hand(1_000_000_000 + round(stamp_s * 1e9), tuple(position.tolist()))
-            taken += 1
-        states.append(hands.state["hands"][LEFT].copy())
-    assert hands.rejected() == {}
-    return np.array(states)
 
 
 # --- what a tracker says -------------------------------------------------------------------------

@@ -13,24 +13,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bounds import bounds_hold
-from explained import Explained
 from hypothesis import HealthCheck
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
-from in_process import LEFT, RIGHT
-from tests_paths import RECORDINGS
-from wam import JOINT_NAMES, URDF
 
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, Vector, order
+from service.core.frame import Event, Frame, Tick, order
+from service.core.record import Vector
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import Scene
+from support.bounds import bounds_hold
+from support.explained import explained_controller
+from support.in_process import LEFT, RIGHT
+from support.paths import RECORDINGS
+from support.wam import JOINT_NAMES, URDF
 
 SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s
@@ -59,8 +59,7 @@ class Cell(RuleBasedStateMachine):
 
     @initialize(skill=st.integers(0, len(SKILLS) - 1), hands=st.booleans())
     def start(self, skill: int, hands: bool) -> None:
-        self.controller = Controller(SETTINGS, SKILLS[skill], urdf=URDF)
-        self.controller._setpoint = Explained(SETTINGS)
+        self.controller = explained_controller(SETTINGS, SKILLS[skill], urdf=URDF)
         self.tick = 0
         self.joints: Vector = np.array(SETTINGS.arm.posture)
         self.at: Vector = np.array([LEFT, RIGHT])

@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from service.core.arm.inverse_kinematics import (
-    DAMPING,
-    GAP_FREE,
-    GAP_SLOW,
-    TURN_LEVER,
-    least_squares,
-    measured_error,
-    slow_down,
-    tool_speeds,
-    tool_tasks,
-)
+from service.core.arm.arm import DAMPING, TURN_LEVER
+from service.core.arm.inverse_kinematics import describe, tool_speeds
+from service.core.arm.least_squares import least_squares
+from service.core.decision.decision import measured_error
+from service.core.record import parameters
+from service.core.setpoint.setpoint import GAP_FREE, GAP_SLOW, slow_down
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -38,23 +33,25 @@ def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> Non
 def test_tasks_are_the_tool_s_velocity_and_what_turns_it(count: int) -> None:
     random = np.random.default_rng(1)
     jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
-    tasks = np.empty((count, 7))
-    damping = tool_tasks(jacobian, rotation, tasks)
+    arm = parameters(turn_lever=TURN_LEVER, damping=DAMPING, singular_damping=2e-3, singular_volume=0.04)
+    here = parameters(tasks=np.empty((count, 7)), damping=0.0, jacobian=np.empty((6, 7)), rotation=np.empty((3, 3)))
+    describe(arm, here, jacobian, rotation)
     expected = np.vstack([jacobian[:3], TURN_LEVER * rotation.T @ jacobian[3:]])[:count]
-    np.testing.assert_allclose(tasks, expected, rtol=1e-12, atol=1e-15)
-    assert damping == DAMPING  # far from singular
+    np.testing.assert_allclose(here["tasks"][0], expected, rtol=1e-12, atol=1e-15)
+    assert here["damping"][0] == DAMPING  # far from singular
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
     random = np.random.default_rng(2)
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
-    speed, coming = tool_speeds(tasks, dq, ddq, jerk)
+    here = parameters(tasks=tasks, joints=q)
+    speed, coming = tool_speeds(here, dq, ddq, jerk)
     crest = np.linalg.norm(tasks[:3] @ (dq + ddq * np.abs(ddq) / (2 * jerk)))
     assert speed == pytest.approx(np.linalg.norm(tasks[:3] @ dq), rel=1e-12)
     assert coming == pytest.approx(max(speed, crest), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
-    error, fast = measured_error(q, tasks, measured, dq)
+    error, fast = measured_error(parameters(measured=measured, measured_velocities=dq), here)
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
 

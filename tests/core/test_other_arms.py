@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from in_process import frames, ticks_of
 
 from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
@@ -23,6 +22,7 @@ from service.recording.replay import replay
 from sim.scene import Scene
 from sim.script import HandScript
 from sim.teach import demonstrations
+from support.in_process import frames, ticks_of
 
 
 class Model(NamedTuple):
@@ -103,7 +103,8 @@ def test_its_recording_replays_identically(cell: Settings, reach: Skill, tmp_pat
 
 def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> None:
     arm = Arm(cell, robot_description(cell))
-    _, position, rotation, *_ = arm.at(np.array(cell.arm.posture))
+    here = arm.at(np.array(cell.arm.posture))
+    position, rotation = here.position, here.rotation
     assert position == pytest.approx(Scene().robot_start, abs=0.03)
     assert rotation[:, 2] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)], abs=0.01)
     assert len(cell.joints.names) == len(cell.joints.lower) == len(cell.arm.posture)

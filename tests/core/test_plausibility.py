@@ -14,17 +14,18 @@ import pytest
 from hypothesis import example, given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
-from in_process import ASSUMED, LEFT, RIGHT, frames, hand
-from test_intake import LEFT as LEFT_SIDE
-from test_intake import STRAIGHT, Hands
-from wam import URDF
 
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, as_array, copied
+from service.core.frame import Tick
 from service.core.intake import plausibility
+from service.core.record import Vector, as_array, copied
 from service.core.skill.skill import Skill
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.tracked import LEFT as LEFT_SIDE
+from support.tracked import STRAIGHT, Hands
+from support.wam import URDF
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
 
@@ -62,7 +63,7 @@ def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, 
     tell(told, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
     tell(missing, [*head, *[None] * length, *tail], rate_hz)
     assert told.rejected() == {Cause.JUMPED: length}
-    for name in ("hands", "means", "covariances", "noise", "modes"):
+    for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "even_samples", "mode_probabilities"):
         assert told.state[name].tobytes() == missing.state[name].tobytes(), name
 
 
@@ -262,7 +263,7 @@ def test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculat
         hands.intake.take_hand(hands.state, LEFT_SIDE, PoseStamped(stamp_ns, frame, position, turn))  # type: ignore[arg-type]
         taken = sum(hands.rejected().values()) == count
         assert taken <= (int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])), (k, before)
-        for name in ("hands", "means", "covariances", "noise", "modes", "contested"):
+        for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "mode_probabilities", "contested"):
             assert np.isfinite(hands.state[name]).all(), name
         assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 0]) < 10.0
 
@@ -340,4 +341,5 @@ def test_compiled_and_plain_memory_agree() -> None:
             answers.append(way(plausibility.is_confirmed)(as_array(state).view(np.recarray), 0, at, 50, 0.002))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
-        assert compiled["doubts"].tobytes() == plain["doubts"].tobytes()
+        for name in ("jump_first_tick", "jump_newest_tick", "jump_count", "jump_is_swap"):
+            assert compiled[name].tobytes() == plain[name].tobytes()

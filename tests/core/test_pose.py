@@ -9,18 +9,17 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from in_process import ASSUMED, frames, ticks_of
 from scipy.spatial.transform import Rotation
-from wam import FRAME, URDF
 
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.config import Settings
 from service.contract import cdr
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import blank, state_layout
+from service.core.frame import state_layout
 from service.core.limiter.limiter import Limiter
 from service.core.outputs import outgoing
+from service.core.record import blank
 from service.core.rotation import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint.orientation import SPEED_SHARE, OrientationSetpoint
 from service.core.skill.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
@@ -28,6 +27,8 @@ from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, frames, ticks_of
+from support.wam import FRAME, URDF
 
 PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
-from service.core.intake.stillness import rested
+from service.core.intake.stillness import stillness_of
+from service.core.record import Vector
 
 HZ = 125
 
@@ -15,7 +15,7 @@ def rest_of(along: Vector, hz: int = HZ) -> Vector:
     """The rest (T,) of a left hand that moves so (T,) [m/s] along x; the right one does not."""
     velocities = np.zeros((len(along), 6))
     velocities[:, 0] = along
-    found = rested(velocities, 1.0 / hz)
+    found = stillness_of(velocities, 1.0 / hz)
     np.testing.assert_array_equal(found[:, 1], 1.0)
     return found[:, 0]
 

@@ -13,33 +13,35 @@ import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
-from in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from scipy.optimize import minimize
-from wam import URDF
 
 from service.config import Box, Obstacles, Settings, Table
 from service.contract.records import Flag, Mode
 from service.core.arm.arm import Arm
 from service.core.arm.least_squares import keep_under, least_squares
 from service.core.controller import Controller, start_state
-from service.core.frame import Tick, Vector
+from service.core.frame import Tick, frame_layout
+from service.core.record import Vector, blank
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
-from service.core.separation.separation import SLIP, Separation, allowed_speed
+from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
-from sim.experiments.separation import _measure
+from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.wam import URDF
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
 LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)
 POSTURE = np.array(ASSUMED.arm.posture)
+FRAME = blank(frame_layout(7))
 
 
 def placed(q: Vector) -> Vector:
-    out = np.empty((len(BODY.links), 2, 3))
-    place(q, BODY.frames, BODY.axes, BODY.links, BODY.ends, out)
+    out = np.empty((len(BODY.capsules), 2, 3))
+    place(q, BODY.frames, BODY.axes, BODY.capsules, out)
     return out
 
 
@@ -48,7 +50,7 @@ def test_capsules_lie_around_the_collision_shapes_as_pinocchio_has_them() -> Non
     shapes = pin.buildGeomFromUrdfString(model, URDF, pin.GeometryType.COLLISION)
     data, there = model.createData(), pin.GeometryData(shapes)
     random = np.random.default_rng(1)
-    assert len(BODY.links) == len(shapes.geometryObjects)
+    assert len(BODY.capsules) == len(shapes.geometryObjects)
     for q in random.uniform(LOWER, UPPER, (20, 7)):
         pin.updateGeometryPlacements(model, data, shapes, there, q)
         capsules = placed(q)
@@ -61,14 +63,14 @@ def test_capsules_lie_around_the_collision_shapes_as_pinocchio_has_them() -> Non
                 r, h = shape.geometry.radius, shape.geometry.halfLength
                 corners = np.array([[r * math.cos(a), r * math.sin(a), z] for a in angles for z in (-h, h)])
             points = np.array([at.act(corner) for corner in corners])
-            for k in np.flatnonzero(BODY.links == shape.parentJoint):
+            for k in np.flatnonzero(BODY.capsules["link"] == shape.parentJoint):
                 far = [between_segments(np.array([p, p]), capsules[k], np.empty(9)) for p in points]
-                if max(far) <= BODY.radii[k] + 1e-9 and max(far) > BODY.radii[k] - 1e-3:
+                if max(far) <= BODY.capsules["radius"][k] + 1e-9 and max(far) > BODY.capsules["radius"][k] - 1e-3:
                     covered.add(int(k))
                     break
             else:
                 pytest.fail(f"{shape.name} is not covered")
-        assert covered == set(range(len(BODY.links)))
+        assert covered == set(range(len(BODY.capsules)))
 
 
 def test_distances_of_capsules_are_those_of_coal() -> None:
@@ -116,29 +118,31 @@ def test_a_stop_from_the_allowed_speed_ends_the_clearance_away(hand_speed: float
     assert allowed_speed(0.02, hand_speed, 3.0, 0.13, 0.03) == 0.0
 
 
-def test_rows_are_how_fast_distances_shrink() -> None:
+def test_constraints_are_how_fast_distances_shrink() -> None:
     settings = msgspec.structs.replace(
         ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
     )
-    apart = Separation(settings, URDF)
+    apart, table = Separation(settings, URDF), settings.table
+    low, high = np.array(table.centre) - [*table.half_size, TABLE_DEPTH], np.add(table.centre, [*table.half_size, 0.0])
+    boxes = np.array([[low, high], [(0.45, -0.05, 0.15), (0.55, 0.05, 0.25)]])
     state = start_state(settings, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"], state["hands"][:, 0] = 0, np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]
     random, near, total = np.random.default_rng(4), np.empty(9), 0
     for q, dq in zip(random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True):
         here = ARM.at(q)
-        apart.look(state, q, here.position, here.jacobian)
+        apart.step(state, FRAME, here.record)
         total += apart.count
-        speeds = apart.rows[: apart.count] @ dq
+        speeds = apart.constraints["row"][: apart.count] @ dq
         both = [placed(q + h * dq) for h in (-1e-6, 1e-6)]
         found = []
         for side in range(2):
             arm = state["hands"][side, 0] + np.array([[0.0, 0, 0], [0.24, 0, 0]])
-            for k in np.flatnonzero(BODY.links):
+            for k in np.flatnonzero(BODY.capsules["link"]):
                 found.append(-np.diff([between_segments(at[k], arm, near) for at in both])[0] / 2e-6)
         for i, j in BODY.pairs:
             found.append(-np.diff([between_segments(at[i], at[j], near) for at in both])[0] / 2e-6)
-        for k in np.flatnonzero(BODY.links):
-            for box in apart._boxes:
+        for k in np.flatnonzero(BODY.capsules["link"]):
+            for box in boxes:
                 for share in (nearest_to_box(placed(q)[k], box), 0.0, 1.0):
                     found.append(-np.diff([to_box(at[k], share, box, near) for at in both])[0] / 2e-6)
         expected = np.array(found)
@@ -167,7 +171,7 @@ def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int)
     found = np.empty(7)
     least_squares(tasks, wanted, posture, damping, bounds, found)
     before = found.copy()
-    met = keep_under(tasks, wanted, posture, damping, bounds, rows, limits, count, found)
+    met = keep_under(tasks, wanted, posture, damping, bounds, rows, limits, found)
     assert met == bool((rows @ before > limits + 1e-9).any())
     assert (rows @ found <= limits + 1e-8).all()
     assert ((bounds[0] <= found) & (found <= bounds[1])).all()
@@ -190,7 +194,7 @@ def test_between_two_things_that_cannot_both_be_left_the_way_along_them_is_free(
     tasks, wanted, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
     rows, found = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
     least_squares(tasks, wanted, np.zeros(3), 1e-3, bounds, found)
-    assert keep_under(tasks, wanted, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), 2, found)
+    assert keep_under(tasks, wanted, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), found)
     np.testing.assert_allclose(found, [0.3, 0.0, 0.0], atol=1e-3)
 
 
@@ -198,15 +202,8 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
     near its links come to each other and to the table (T,).
     """
-    people, moving = settings.people, int(np.flatnonzero(BODY.links)[0])
-    size = (len(seen), 2, len(BODY.links) - moving)
-    distance, speed, coming, own, table = *(np.empty(size) for _ in range(3)), *(np.empty(len(seen)) for _ in range(2))
-    joints, velocities = (np.ascontiguousarray(seen[name]) for name in ("joints", "joint_velocities"))
-    forearm = np.array([people.length, 0.0, 0.0])
-    _measure(
-        joints, velocities, hands, 0 * hands, *BODY, moving, people.radius, forearm, settings.table.centre[2],
-        distance, speed, coming, own, table,
-    )  # fmt: skip
+    joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
+    distance, speed, _, own, table = measured(settings, BODY, joints, hands)
     return distance, speed, own, table
 
 
@@ -248,9 +245,10 @@ def test_distance_and_limit_are_in_the_frame(taught: Skill) -> None:
     distance = nearest(seen, hands)[0].min(axis=(1, 2))
     assert np.abs(seen["hand_distance"][1:] - distance[:-1]).max() < 0.005  # a tick apart
     assert seen["hand_limit"].min() >= 0
-    assert seen["hand_limit"].max() <= 1.5
+    most = Separation(ASSUMED, URDF).max_speed
+    assert seen["hand_limit"].max() <= most
     alone = frames(Controller(ASSUMED, taught, urdf=URDF), [Tick(0)])
-    assert (alone["hand_distance"][0], alone["hand_limit"][0]) == (3.0, 1.5)
+    assert (alone["hand_distance"][0], alone["hand_limit"][0]) == (3.0, most)
 
 
 def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(taught: Skill) -> None:
@@ -271,8 +269,11 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
                 corners = np.array([np.subtract(box.centre, box.half_size), np.add(box.centre, box.half_size)])
             else:
                 corners = np.array([[0.35, -0.6, -0.73], [1.25, 0.6, 0.27]])
-            for k in np.flatnonzero(BODY.links):
-                apart = to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near) - BODY.radii[k]
+            for k in np.flatnonzero(BODY.capsules["link"]):
+                apart = (
+                    to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near)
+                    - BODY.capsules["radius"][k]
+                )
                 assert apart > settings.obstacles.clearance - 0.001, (k, apart)
 
 
@@ -301,13 +302,13 @@ def test_motion_that_leaves_a_hand_is_not_slowed() -> None:
     state["hands"][:, 0] = here.position, RIGHT
     state["hands"][0, 0, 0] += 0.09
     for way in ([-0.4, 0.0, 0.0], [-0.2, 0.1, 0.3]):
-        apart.look(state, POSTURE, here.position, here.jacobian)
+        apart.step(state, FRAME, here.record)
         free = ARM.step(POSTURE, here.position, np.array(way), here.rotation[:, 2])
-        kept = ARM.step(POSTURE, here.position, np.array(way), here.rotation[:, 2], apart=apart)
+        kept = ARM.step(POSTURE, here.position, np.array(way), here.rotation[:, 2], separation=apart)
         assert apart.count
-        assert (kept.apart, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
-    toward = ARM.step(POSTURE, here.position, np.array([0.4, 0.0, 0.0]), here.rotation[:, 2], apart=apart)
-    assert toward.apart
+        assert (kept.separated, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
+    toward = ARM.step(POSTURE, here.position, np.array([0.4, 0.0, 0.0]), here.rotation[:, 2], separation=apart)
+    assert toward.separated
     assert here.tasks[0] @ toward.velocity < 0.05
 
 
@@ -320,44 +321,45 @@ def test_a_hand_that_passes_is_foreseen_where_the_arm_goes(hand_speed: float) ->
     state["hands"][0, 1, 1] = hand_speed
     free = ARM.step(POSTURE, here.position, way, here.rotation[:, 2])
     state["joints"][1] = free.velocity
-    apart.look(state, POSTURE, here.position, here.jacobian)
-    kept = ARM.step(POSTURE, here.position, way, here.rotation[:, 2], apart=apart)
+    apart.step(state, FRAME, here.record)
+    kept = ARM.step(POSTURE, here.position, way, here.rotation[:, 2], separation=apart)
     forearm = state["hands"][0, 0] + np.array([[0.0, 0.0, 0.0], [0.24, 0.0, 0.0]])
-    for k in np.flatnonzero(BODY.links == 7):
+    for k in np.flatnonzero(BODY.capsules["link"] == 7):
         then = between_segments(placed(POSTURE + 1e-6 * free.velocity)[k], forearm, near)
         assert then > between_segments(placed(POSTURE)[k], forearm, near)
     if hand_speed < 1.0:
-        assert (kept.apart, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
+        assert (kept.separated, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
     else:
-        assert kept.apart
+        assert kept.separated
         assert (here.tasks[:3] @ kept.velocity)[0] < 0.8 * (here.tasks[:3] @ free.velocity)[0]
 
 
 def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -> None:
     apart = Separation(ASSUMED, URDF)
-    apart.expect(taught.via_points)
+    apart.set_contacts(taught.via_points)
     state, here = start_state(ASSUMED, _Nothing()), ARM.at(POSTURE)  # type: ignore[arg-type]
     state["hand_ticks"] = 0
-    tool = BODY.links == 7
+    tool = BODY.capsules["link"] == 7
     for off, gentle in ((0.0, True), (0.1, False)):
         state["hands"][:, 0] = Scene().handover, Scene().right_start
         state["hands"][:, 0, 2] += off
-        apart.look(state, POSTURE, here.position, here.jacobian)
-        limits = sorted(set(apart.plan[: apart.count].round(6).tolist()))
+        apart.step(state, FRAME, here.record)
+        limits = sorted(set(apart.constraints["planned"][: apart.count].round(6).tolist()))
         assert tool.sum() == 1
         assert all(limit >= 0 for limit in limits)
         state["hands"][0, 0] = here.position  # the hand is at the tool: only where it receives it may be touched
         if gentle:
-            apart._contacts[0, :3] = here.position
-        apart.look(state, POSTURE, here.position, here.jacobian)
-        allowed = apart.allowed[: apart.count] - SLIP
+            place, *others = taught.via_points
+            apart.set_contacts([msgspec.structs.replace(place, left=tuple(here.position.tolist())), *others])
+        apart.step(state, FRAME, here.record)
+        allowed = apart.constraints["allowed"][: apart.count] - SLIP
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
         state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, here.position  # the other hand receives nothing
-        apart.look(state, POSTURE, here.position, here.jacobian)
-        assert not (abs(apart.allowed[: apart.count] - SLIP - 0.25) < 1e-9).any()
+        apart.step(state, FRAME, here.record)
+        assert not (abs(apart.constraints["allowed"][: apart.count] - SLIP - 0.25) < 1e-9).any()
         state["hands"][0, 0], state["hands"][1, 0] = here.position, Scene().right_start
-        apart.look(state, POSTURE, here.position, here.jacobian)
-        assert apart.told[1] == 0.0  # no other part may come nearer
+        apart.step(state, FRAME, here.record)
+        assert apart.speed_limit == 0.0  # no other part may come nearer
 
 
 def test_a_hand_just_seen_counts_as_fast() -> None:
@@ -365,13 +367,13 @@ def test_a_hand_just_seen_counts_as_fast() -> None:
     state = start_state(ASSUMED, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"], state["hands"][:, 0] = 0, (here.position, RIGHT)
     state["hands"][0, 0, 0] += 0.25
-    state["modes"] = 1 / 3
-    apart.look(state, POSTURE, here.position, here.jacobian)
-    known = apart.told[1]
-    state["covariances"][0, :, 1, 1] = 0.3**2
-    apart.look(state, POSTURE, here.position, here.jacobian)
-    assert apart.told[1] == pytest.approx(allowed_speed(apart.told[0], 1.6, 3.0, 0.13, 0.03))
-    assert apart.told[1] < 0.5 * known
+    state["mode_probabilities"] = 1 / 3
+    apart.step(state, FRAME, here.record)
+    known = apart.speed_limit
+    state["mode_covariances"][0, :, 1, 1] = 0.3**2
+    apart.step(state, FRAME, here.record)
+    assert apart.speed_limit == pytest.approx(allowed_speed(apart.nearest_m, 1.6, 3.0, 0.13, 0.03))
+    assert apart.speed_limit < 0.5 * known
 
 
 def test_it_costs_little_beside_a_tick(taught: Skill) -> None:
@@ -382,8 +384,9 @@ def test_it_costs_little_beside_a_tick(taught: Skill) -> None:
     began = time.perf_counter()
     frames(controller, ticks[1000:1500])
     tick_s = (time.perf_counter() - began) / 500
-    state, here, apart = controller.state, ARM.at(controller.state["joints"][0]), controller._apart
+    state, here, apart = controller.state, ARM.at(controller.state["joints"][0]), Separation(ASSUMED, URDF)
+    apart.set_contacts(taught.via_points)
     began = time.perf_counter()
     for _ in range(500):
-        apart.look(state, here.joints, here.position, here.jacobian)
+        apart.step(state, FRAME, here.record)
     assert (time.perf_counter() - began) / 500 < 0.5 * tick_s

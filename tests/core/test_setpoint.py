@@ -8,20 +8,20 @@ import msgspec
 import numpy as np
 import pytest
 import ruckig
-from explained import Explained, margin
 from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
-from wam import STATE
 
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
-from service.core.frame import Vector, blank
 from service.core.intake.intake import Intake
+from service.core.record import Vector, blank
 from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
 from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
-from service.core.setpoint.workspace import Target
+from service.core.skill.workspace import Target
 from service.core.stops import fastest_stop
+from support.explained import Explained, margin
+from support.wam import STATE
 
 PERIOD_S = 0.002
 TOOL = ToolSettings()

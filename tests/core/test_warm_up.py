@@ -8,7 +8,8 @@ import subprocess
 import sys
 
 import pytest
-from tests_paths import RECORDINGS
+
+from support.paths import RECORDINGS
 
 COUNTED = """
 import importlib

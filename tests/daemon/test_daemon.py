@@ -17,10 +17,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from cell import LEFT, RIGHT, Tracker, serving, thirdhand
-from in_process import arm
-from tests_paths import RECORDINGS, ROOT
-from wam import JOINT_NAMES
 from zenoh.handlers import FifoChannel
 
 from service.cli.main import main
@@ -34,6 +30,10 @@ from service.core.skill.skill import Skill
 from service.daemon.measured_tool import MeasuredTool
 from service.recording.recording import Recording
 from service.recording.replay import replay
+from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand
+from support.in_process import arm
+from support.paths import RECORDINGS, ROOT
+from support.wam import JOINT_NAMES
 
 HANDOVER = requests.ViaPoint(
     "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
-from cell import serving
-from fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
 
 from service.config import Settings
 from service.contract import cdr
 from service.contract.records import Mode
+from support.cell import serving
+from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
 
 SECONDS, INTERVAL_S = 5.0, 0.01
 INPUTS = ("hands/left", "hands/right", "joints/state")

@@ -13,9 +13,6 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from many_cells import ROS2_DOMAIN
-from tests_paths import RECORDINGS, ROOT
-from wam import JOINT_NAMES
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
 from zenoh_ros2_sdk.session import ZenohSession
 
@@ -23,6 +20,10 @@ from service.cli.main import main
 from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
 from service.contract import cdr, channels, requests, ros2, ros2msg
 from service.contract.messages import PoseStamped
+from service.core.frame import definitions
+from support.many_cells import ROS2_DOMAIN
+from support.paths import RECORDINGS, ROOT
+from support.wam import JOINT_NAMES
 
 NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
@@ -40,7 +41,12 @@ class Lab(NamedTuple):
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as router:
         (endpoint,) = endpoints(router)
-        command = [sys.executable, str(ROOT / "tests" / "many_cells.py"), str(tmp_path_factory.mktemp("lab")), endpoint]
+        command = [
+            sys.executable,
+            str(ROOT / "tests" / "support" / "many_cells.py"),
+            str(tmp_path_factory.mktemp("lab")),
+            endpoint,
+        ]
         process = subprocess.Popen([*command, *NAMES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert process.stdin is not None
         assert process.stdout is not None
@@ -152,7 +158,7 @@ def ros(lab: Lab) -> Iterator[dict[str, Any]]:
 
 def typed(kind: str) -> dict[str, str]:
     """What a ROS 2 node knows of a message type."""
-    definition = ros2msg.schema(kind, joints=len(JOINT_NAMES))
+    definition = ros2msg.schema(kind, definitions(len(JOINT_NAMES)))
     return {"msg_type": kind, "msg_definition": definition, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
 
 

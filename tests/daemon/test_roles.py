@@ -16,7 +16,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from cell import LEFT, Tracker, thirdhand
 from cryptography import x509
 
 from service.cli.main import main
@@ -26,6 +25,7 @@ from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.single_instance import BOUNDS
 from service.launch import launched
+from support.cell import LEFT, Tracker, thirdhand
 
 CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", "objects")

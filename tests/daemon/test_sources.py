@@ -8,18 +8,20 @@ import re
 from typing import Any
 
 import pytest
-from in_process import LEFT, RIGHT
-from wam import JOINT_NAMES, URDF
 
 from service.config import HandSettings, Settings
+from service.contract.incidents import explained
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
 from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, blank, frame_layout
+from service.core.frame import Event, Frame, Tick, frame_layout
+from service.core.record import blank
 from service.core.skill.skill import Skill
-from service.daemon.input_monitor import KEYS, InputMonitor, in_words
+from service.daemon.input_monitor import KEYS, InputMonitor, evidence
 from service.daemon.status import CellStatus
+from support.in_process import LEFT, RIGHT
+from support.wam import JOINT_NAMES, URDF
 
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 S = 1_000_000_000
@@ -55,12 +57,12 @@ class Cell:
 
     def status(self, now_s: float, *, failure: str = "") -> Status:
         state = self.controller.state
-        told = self.sources.survey(self.controller, state, now_s)
+        told = self.sources.update(self.controller, state, now_s)
         self.log += self.sources.news(told, now_s)
         none = Percentiles()
         more = {"rate_hz": 500.0, "missed": 0, "realtime": True, "memory_locked": True, "scribe": {}, "endpoints": ()}
-        survey = CellStatus(self.frame, self.controller, state, told, self.settings, failure)
-        return survey.status(**more, version="", lateness_us=none, work_us=none, latency_ms=none)
+        cell = CellStatus(self.frame, self.controller, state, told, self.settings, failure)
+        return cell.status(**more, version="", lateness_us=none, work_us=none, latency_ms=none)
 
 
 @pytest.mark.parametrize(
@@ -69,12 +71,17 @@ class Cell:
         ("left", pose(2, frame="camera"), Cause.WRONG_FRAME, "frame 'camera'; 'base' or none accepted"),
         ("left", pose(2, (980.0, -320.0, 60.0)), Cause.OUT_OF_RANGE, "at (980, -320, 60), which looks like mm;"),
         ("left", pose(2, turn=(0.0, 0.0, 0.0, 0.0)), Cause.NOT_A_ROTATION, "of norm 0; norm 1 needed"),
-        ("right", pose(2, (math.nan, 0.0, 0.0)), Cause.NOT_FINITE, "position (nan, 0, 0)"),
+        (
+            "right",
+            pose(2, (math.nan, 0.0, 0.0)),
+            Cause.NOT_FINITE,
+            "at (nan, 0, 0) in the tracker's frame, orientation (0, 0, 0, 1); finite",
+        ),
         ("right", pose(S, RIGHT), Cause.REPEATED, "stamp 1.000 s again"),
         ("right", pose(3 * S, RIGHT), Cause.AHEAD, "stamped 2 s after the newest accepted one"),
         ("right", pose(S // 2, RIGHT), Cause.OLDER, "stamped 0.5 s before the newest accepted one"),
         ("left", pose(S + 1, (0.5, 0.0, 0.3)), Cause.JUMPED, "at (0.5, 0, 0.3) in the tracker's frame"),
-        ("arm", joints(2, (90.0,) * 7), Cause.OUT_OF_RANGE, "base_yaw_joint at 90 rad, which looks like degrees; -2.6"),
+        ("arm", joints(2, (90.0,) * 7), Cause.OUT_OF_RANGE, "base_yaw_joint at 90 rad, which looks like degrees; -2.8"),
         ("arm", joints(2, (0.0, 0.0), ("a", "b")), Cause.INCOMPLETE, "missing among 2, a, b"),
     ],
 )
@@ -85,7 +92,7 @@ def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: A
     refused = cell.controller.intake.refused[source, cause]
     assert refused[:2] == (cause, message)
     cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
-    assert words in in_words(refused, cell.settings)
+    assert words in explained(cause, evidence(refused, cell.settings)).why
 
 
 def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:
@@ -180,14 +187,14 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
     assert "what comes of the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
     cell.tell(("arm", joints(2)))
-    assert cell.status(0.2).because == "the arm has not told one posture for 0.1 s"
+    assert cell.status(0.2).because == "the arm has not told one posture for long enough"
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))
     assert cell.status(0.5).because == "wam/base_yaw_joint at 2.700 rad is outside -2.6 to 2.6, and is moved back"
     for _ in range(60):
         cell.tell()
-    assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 100 ms")
+    assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 120 ms")
 
 
 def test_a_tool_that_was_too_fast_says_how_fast(skill: Skill) -> None:

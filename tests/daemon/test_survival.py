@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cell import Daemon, Tracker, serving, thirdhand
 
 from service.client import RefusedError, UnreachableError
 from service.daemon.single_instance import Lock
@@ -24,6 +23,7 @@ from service.daemon.skill_worker import SkillWorker
 from service.daemon.supervised_thread import supervised
 from service.learning.skill_file import SkillError
 from service.recording.replay import replay
+from support.cell import Daemon, Tracker, serving, thirdhand
 
 SABOTAGE = """
 import pathlib
@@ -41,11 +41,11 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
         return honest(*arguments, **more)
     setattr(owner, name, method)
 
-sabotaged(daemon.Daemon, "_survey")
+sabotaged(daemon.CellStatus, "status")
 sabotaged(controller.Controller, "step")
-sabotaged(daemon.Daemon, "_publish")
+sabotaged(daemon, "outgoing")
 sabotaged(queryables.RequestQueue, "enqueue")
-sabotaged(queryables.Queryables, "_reply")
+sabotaged(daemon.Daemon, "note")
 """
 
 
@@ -84,11 +84,11 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
         Tracker(daemon.session),
     ):
         for name, provoke in {
-            "_survey": lambda: None,
+            "status": lambda: None,
             "enqueue": lambda: daemon.client.ask("resume"),
-            "_reply": lambda: daemon.client.ask("resume"),
+            "note": lambda: daemon.client.ask("resume"),
             "step": lambda: None,
-            "_publish": lambda: None,
+            "outgoing": lambda: None,
         }.items():
             daemon.until(lambda status: status["mode"] == "follow")
             (tmp_path / "mark").write_text("once")
@@ -232,9 +232,11 @@ def test_a_cell_without_a_folder_for_its_lock_is_served_all_the_same(tmp_path: P
 
 
 def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
+    go = tmp_path / "go"
     before = (
-        "import time\nfrom service.daemon.daemon import Daemon\nhonest = Daemon._run\n"
-        "def late(self):\n    time.sleep(10)\n    honest(self)\nDaemon._run = late"
+        "import pathlib, time\nfrom service.daemon import daemon\nrun = daemon.run\n"
+        f"def late(*arguments):\n    while not pathlib.Path({str(go)!r}).exists():\n        time.sleep(0.01)\n"
+        "    run(*arguments)\ndaemon.run = late"
     )
     with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
         told = daemon.client.status()
@@ -244,6 +246,7 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
         rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
         assert rows["mode"] == "starting: nothing has been decided yet"
         assert rows.keys() == {"mode", "skill", "listening"}
+        go.touch()
         daemon.until(lambda status: status["tick"] >= 0)
         assert "starting" not in thirdhand("status", "--connect", daemon.endpoint).stdout
 

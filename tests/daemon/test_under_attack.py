@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cell import Daemon, serving
-from tests_paths import ROOT
 
 from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
 from service.daemon.clock import NETWORK_NICE
 from service.daemon.daemon import MOST_NOTES
 from service.daemon.single_instance import MOST_SESSIONS
+from support.cell import Daemon, serving
+from support.paths import ROOT
 
 pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"

@@ -10,10 +10,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from tests_paths import ROOT
 
 import kmp
 from kmp import KMP, GaussianKernel, Gaussians
+from support.paths import ROOT
 
 WITHOUT_NUMBA = """
 import json, sys

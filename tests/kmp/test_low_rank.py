@@ -64,7 +64,7 @@ def agree(dense, low, queries, within=1e-6):
 def test_within_the_data_it_is_the_dense_solution_to_a_micrometre(seed, lambda_covariance):
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     assert (dense.representation, low.representation) == ("dense", "low_rank")
-    assert len(low._solution.centres) < 300
+    assert len(low.solution.centres) < 300
     agree(dense, low, np.concatenate([dense.inputs[:20], tube(seed + 7, 20)[0]]))
 
 
@@ -92,7 +92,7 @@ def test_so_many_changes_that_all_points_go_are_solved_anew():
     dense, low = both(0, count=60)
     inputs, desired = dense.inputs + 0.001, Gaussians(dense.reference.mean + 0.1, dense.reference.covariance)
     dense, low = (one.adapt(inputs, desired, tolerance=0.5) for one in (dense, low))
-    assert len(low._changes.replaced) > 50
+    assert len(low.changes.replaced) > 50
     agree(dense, low, dense.inputs[:10], within=1e-5)
 
 
@@ -156,10 +156,10 @@ def test_more_via_points_than_points():
 
 def test_what_is_too_much_to_keep_is_made_again_and_gives_the_same(monkeypatch):
     before = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
-    monkeypatch.setattr("kmp.low_rank.solution._KEPT", 0)
-    monkeypatch.setattr("kmp.database._DISTANCES", 1)
+    monkeypatch.setattr("kmp.low_rank.solution.KEPT", 0)
+    monkeypatch.setattr("kmp.database.DISTANCES", 1)
     after = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
-    assert np.array_equal(before._changes.replaced, after._changes.replaced)
+    assert np.array_equal(before.changes.replaced, after.changes.replaced)
     assert np.array_equal(before.weights, after.weights)
 
 

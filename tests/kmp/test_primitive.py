@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 from kmp import KMP, GaussianKernel, Gaussians
+from support.primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 
 @properties
@@ -147,11 +147,11 @@ def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
         arrays = [
             one.inputs,
             one.weights,
-            one._changes.replaced,
+            one.changes.replaced,
             one.prior_mean,
             one.reference.mean,
             one.via_inputs,
-            *one._solution._inverse_factor.bands,
+            *one.solution.inverse_factor.bands,
         ]
         assert not any(array.flags.writeable for array in arrays)
 

@@ -58,8 +58,8 @@ def test_one_call_gives_what_the_others_give_bit_for_bit(skill, monkeypatch):
 @pytest.mark.parametrize("seed", range(5))
 def test_compiled_loops_give_the_same_but_for_rounding(skill, seed):
     motion = moving(skill, seed)
-    found, plain = skill.predict_motion(*motion), skill._query.motion(*motion, covariance=True)
-    assert (skill._compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
+    found, plain = skill.predict_motion(*motion), skill.query.motion(*motion, covariance=True)
+    assert (skill.compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
     for name in plain._fields[:3] + plain._fields[4:]:
         size = np.abs(getattr(plain, name)).max()
         np.testing.assert_allclose(getattr(found, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
@@ -115,7 +115,7 @@ def test_a_copy_in_another_process_gives_the_same_bits(skill):
 
 
 def test_what_one_query_touches_is_contiguous_and_read_only(skill):
-    query = skill._query
+    query = skill.query
     for array in (query.centres, query.weights, query.weight_rows, query.stretch, query.prior_mean):
         assert array.flags.c_contiguous
         assert not array.flags.writeable

@@ -39,8 +39,8 @@ def primitive(request):
 
 
 def test_each_is_the_solution_that_is_meant():
-    assert {type(primitive._solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
-    assert all(type(primitive._solution) is kind for primitive, kind in SOLUTIONS.values())
+    assert {type(primitive.solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
+    assert all(type(primitive.solution) is kind for primitive, kind in SOLUTIONS.values())
 
 
 @pytest.mark.parametrize("kind", [Dense, LowRank, Conditioned])
@@ -53,13 +53,13 @@ def test_a_method_takes_what_the_protocol_says(kind):
 
 
 def test_all_that_the_protocol_names_is_there(primitive):
-    assert [name for name in MEMBERS if not hasattr(primitive._solution, name)] == []
+    assert [name for name in MEMBERS if not hasattr(primitive.solution, name)] == []
 
 
 def test_counts_and_shapes_agree(primitive):
-    solution = primitive._solution
+    solution = primitive.solution
     assert len(solution.database) == len(primitive.inputs) == len(primitive.reference)
-    assert primitive._query.covariance_scale == len(primitive.base.inputs) / primitive.lambda_covariance
+    assert primitive.query.covariance_scale == len(primitive.base.inputs) / primitive.lambda_covariance
     assert solution.weights.shape == (len(solution.centres), 2)
     rows = primitive.kernel(S[:5], solution.centres)
     assert mean_at(solution, S[:5]).shape == (5, 2)
@@ -69,27 +69,27 @@ def test_counts_and_shapes_agree(primitive):
 
 
 def test_solving_again_gives_the_solution_itself(primitive):
-    assert primitive._solution.solved() is primitive._solution
+    assert primitive.solution.solved() is primitive.solution
 
 
 def test_an_adapted_solution_is_adapted_from_its_base(primitive):
-    changes = fitted("dense", VIA)._changes
-    again, base = primitive._solution.adapted(changes).solved(), primitive.base._solution.adapted(changes).solved()
+    changes = fitted("dense", VIA).changes
+    again, base = primitive.solution.adapted(changes).solved(), primitive.base.solution.adapted(changes).solved()
     assert np.array_equal(mean_at(again, S), mean_at(base, S))
 
 
 def test_weights_that_are_given_are_kept_and_the_solution_is_left_as_it_was(primitive):
-    solution, ones = primitive._solution, np.ones_like(primitive.weights)
+    solution, ones = primitive.solution, np.ones_like(primitive.weights)
     other = solution.with_weights(ones)
     assert np.array_equal(other.weights, ones)
     assert not np.array_equal(solution.weights, ones)
 
 
 def test_each_is_stored_with_what_its_base_needs(primitive):
-    assert set(primitive._solution.to_arrays()) == set(primitive.base._solution.to_arrays())
+    assert set(primitive.solution.to_arrays()) == set(primitive.base.solution.to_arrays())
     assert primitive.representation == primitive.base.representation
     again = KMP.from_arrays(primitive.to_arrays())
-    assert type(again._solution) is type(primitive._solution)
+    assert type(again.solution) is type(primitive.solution)
     assert np.array_equal(again.mean(S), primitive.mean(S))
 
 
@@ -127,8 +127,8 @@ def test_outputs_that_nothing_tells_apart_are_solved_as_one_with_the_same_result
     other[0, 0, 0] *= 1 + 1e-13
     options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 2.0, "representation": "dense"}
     one, apart = (KMP.fit(inputs, Gaussians(mean, c), **options) for c in (covariance, other))
-    assert (one._solution.apart, apart._solution.apart) == (1, 2)
-    assert 2 * len(one._solution._factor) == len(apart._solution._factor)
+    assert (one.solution.apart, apart.solution.apart) == (1, 2)
+    assert 2 * len(one.solution.mean_factor) == len(apart.solution.mean_factor)
     queries = inputs[:7] + 0.1
     adapted = [x.adapt(queries, via(7, o), tolerance=0) for x in (one, apart)]
     for a, b in ((one, apart), adapted):
@@ -155,9 +155,9 @@ def test_adapting_changes_whether_outputs_are_solved_as_one(first):
     points = Gaussians(np.ones((3, 2)), apart if first == "alike" else alike)
     where = S[:3] + 0.01 if first == "alike" else S[37:]  # in the place of those that tell them apart
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
-    assert (base._solution.apart, adapted._solution.apart) == ((1, 2) if first == "alike" else (2, 1))
+    assert (base.solution.apart, adapted.solution.apart) == ((1, 2) if first == "alike" else (2, 1))
     anew = KMP.fit(adapted.inputs, adapted.reference, **options)
-    assert adapted._solution.same > 0
+    assert adapted.solution.same > 0
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
     one, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
     np.testing.assert_allclose(one, other, atol=1e-10)

@@ -3,7 +3,8 @@
 import re
 
 import pytest
-from tests_paths import ROOT
+
+from support.paths import ROOT
 
 PAGE = ROOT / "kmp" / "README.md"
 BLOCKS = [

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from taught_scene import PLACES, demonstrated, quickly
-from tests_paths import RECORDINGS
 
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
+from support.paths import RECORDINGS
+from support.taught_scene import PLACES, demonstrated, quickly
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.skill.places import MOST_CORNERS
 from service.core.skill.skill import Skill
-from service.core.skill.task_parameterized import _nearest
+from service.core.skill.task_parameterized import barycentric_weights
 from service.learning.between import places_never_reached, task_of
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
@@ -117,7 +117,7 @@ def test_shares_are_those_of_the_nearest_point_between_the_places() -> None:
         for _ in range(5):
             corners, found = random.standard_normal((MOST_CORNERS, 3)), np.empty(3)
             for point in 2.0 * random.standard_normal((20, 3)):
-                off = _nearest(point, corners, count, found)
+                off = barycentric_weights(point, corners, count, found)
                 assert found.min() >= 0.0
                 assert found.sum() == pytest.approx(1.0)
                 assert off == pytest.approx(np.linalg.norm(point - found @ corners), abs=1e-5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from taught_scene import PLACES, demonstrated, deviations
 
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
@@ -13,6 +12,7 @@ from service.learning.learn import learn
 from service.learning.skill_file import HIGHEST_GATE_M
 from service.learning.via_points import adapted
 from sim.experiments.scenes import draw
+from support.taught_scene import PLACES, demonstrated, deviations
 
 
 @pytest.fixture(scope="module")

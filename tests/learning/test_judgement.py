@@ -7,7 +7,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from taught_scene import demonstrated
 
 from service.config import Reach
 from service.learning.demonstration import Demonstration
@@ -15,6 +14,7 @@ from service.learning.judgement import Figures, table
 from service.learning.learn import Evidence, learn
 from service.learning.picture import draw
 from service.learning.skill_file import SkillError
+from support.taught_scene import demonstrated
 
 
 def judged(demonstrations: list[Demonstration], **options: object) -> Figures:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from taught_scene import demonstrated, deviations, error_m, quickly
 
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import mean_orientation
 from service.learning.skill_file import SkillError
+from support.taught_scene import demonstrated, deviations, error_m, quickly
 
 LATE = 40  # samples of 10 ms
 

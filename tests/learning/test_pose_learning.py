@@ -8,10 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from taught_scene import PLACES, SCENE
 
 from service.contract.requests import RequestError, ViaPoint, decode_request
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
@@ -21,6 +20,7 @@ from service.learning.via_points import adapted, in_force
 from service.shipped import shipped_skill
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
+from support.taught_scene import PLACES, SCENE
 
 TURN = np.radians(120.0) * np.array([0.0, 0.6, 0.8])
 START = Rotation.from_quat(TOOL_ORIENTATION)

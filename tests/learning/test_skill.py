@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from taught_scene import HANDOVER, SCENE, with_hands
 
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.script import HandMotions, HandScript
+from support.taught_scene import HANDOVER, SCENE, with_hands
 
 
 def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:

@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from taught_scene import PLACES
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
@@ -21,6 +20,7 @@ from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import SkillError, decoded, with_file
 from service.learning.via_points import adapted
+from support.taught_scene import PLACES
 
 
 @pytest.mark.parametrize("places", [(), PLACES])

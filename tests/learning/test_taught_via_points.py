@@ -9,12 +9,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from taught_scene import HANDOVER, PLACES, with_hands
 
 from service.contract.requests import ViaPoint
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted, in_force, warnings_of
+from support.taught_scene import HANDOVER, PLACES, with_hands
 
 
 def test_places_are_met(aimed: Skill) -> None:

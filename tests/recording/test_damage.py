@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
-from test_recording import CELL, SKILL, at_ns, ticks, write
-from test_sinks import drawn
 
 from service.cli.view import convert
 from service.contract.cdr import encode_pose
@@ -23,6 +21,7 @@ from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.recording import Recorder, Recording
 from service.recording.steps import Step
+from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
 
 COUNT = 600
 

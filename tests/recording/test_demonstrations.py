@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer
-from test_recording import START_NS, at_ns, write
 
 from service.contract import cdr, channels, messages
 from service.contract.ros2msg import schema
 from service.demonstrations.demonstration_reader import iter_hands, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import RecordingError
+from support.recorded import START_NS, at_ns, write
 
 
 def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, f
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
-        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type, joints=7).encode())
+        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type).encode())
         other = writer.register_channel("/chatter", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(other, 0, b"{}", 0)
         for topic, (stamps, poses) in streams.items():

@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,96 +17,21 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from wam import FRAME, JOINT_NAMES, STATE
 
 from service.config import Settings, robot_description
-from service.contract import cdr, channels, messages
+from service.contract import cdr, channels
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
-from service.core.frame import TIMING, Event, Record, Tick, blank, encode
+from service.core.frame import Event, Tick, definitions, encode
+from service.core.record import blank
 from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.recording import Recorder, Recording
 from service.urdf import Urdf
 from service.viewer.urdf_markers import with_markers
-
-START_NS = 1_700_000_000_000_000_000
-PERIOD_NS = 2_000_000
-SKILL = bytes(range(256)) * 40
-CELL = Settings(cell="hall/bench-1")
-
-
-def at_ns(tick: int) -> int:
-    """The time of a tick [ns]."""
-    return START_NS + tick * PERIOD_NS
-
-
-def pose(stamp_ns: int, x: float) -> bytes:
-    """A hand's pose."""
-    return cdr.encode_pose(messages.PoseStamped(stamp_ns, "base", (x, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0)))
-
-
-def state_after(tick: int) -> Record:
-    """A state that can be told from others."""
-    state = blank(STATE)
-    state["tick"], state["measured"] = tick, tick / 7
-    return state
-
-
-def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]]:
-    """Ticks with every kind of event, plausible frames of an arm that moves, and timings."""
-    random = np.random.default_rng(first)
-    for i in range(first, first + count):
-        frame, timing, angle = blank(FRAME), blank(TIMING), i / 500.0
-        hands = (0.7 + 0.1 * np.sin(angle), 0.5 - 0.1 * np.cos(angle))
-        frame["tick"], frame["hand_stamp_ns"] = i, at_ns(i) - 1_000_000
-        frame["hands"] = [[hands[0], -0.25, 0.2], [hands[1], 0.25, 0.2]]
-        frame["target"] = frame["setpoint"] = frame["tool"] = [0.5 + 0.1 * np.sin(angle), 0.1 * np.cos(angle), 0.4]
-        frame["covariance"] = np.diag([4e-4, 1e-4, 2e-4])
-        frame["orientation"] = [0.0, 0.9238795325112867, 0.0, 0.3826834323650898]
-        frame["joints"] = (
-            np.array([0, 0.2, 0, 2.2, 0, -0.1, 0]) + 0.2 * np.sin(angle + np.arange(7)) + random.normal(0, 1e-6, 7)
-        )
-        frame["joint_velocities"] = 0.2 * np.cos(angle + np.arange(7))
-        frame["hand_ages"] = [i % 3, i % 2] if i >= 10 else -1
-        frame["mode"], frame["reason"], frame["commanded"] = (1, 0, 1) if i >= 10 else (0, 1, i >= 5)
-        timing["tick"], timing["time_ns"], timing["latency_us"], timing["work_us"] = (
-            i,
-            at_ns(i),
-            800 + i % 7,
-            180 + i % 11,
-        )
-        inbox = []
-        if i >= 10:
-            inbox += [
-                Event("hands/left", pose(at_ns(i), hands[0]), None),
-                Event("hands/right", pose(at_ns(i), hands[1]), None),
-            ]
-        if i % 4 == 0:
-            joints = messages.JointState(at_ns(i), JOINT_NAMES, tuple(frame["joints"].tolist()), ())
-            inbox.append(Event("joints/state", cdr.encode_joints(joints), None))
-        if i % 100 == 50:
-            inbox += [
-                Event(kind, cdr.encode_string("{}"), None) for kind in ("fault", "reset", "hold", "resume", "hold")
-            ]
-            inbox.insert(1, Event("skill", random.bytes(2000), None))
-        yield Tick(i, tuple(inbox)), frame, timing
-
-
-def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tuple[Tick, Record, Record]]:
-    """Writes a recording with an initial state and a state every hundred ticks; returns what was
-    told.
-    """
-    told = list(ticks(count))
-    with Recorder(path, settings=settings, skill=SKILL, state=state_after(-1)) as recorder:
-        for tick, frame, timing in told:
-            state = state_after(tick.index) if tick.index % 100 == 99 else None
-            recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, state=state)
-            if tick.index % 50 == 0:
-                recorder.flush()
-                recorder.note("status", f"tick {tick.index}", at_ns(tick.index))
-    return told
+from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
+from support.wam import FRAME
 
 
 def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
@@ -282,7 +206,7 @@ def test_the_links_of_the_arm_and_what_matters_around_it_are_one_tree_of_frames(
 
 @pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
 def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
-    text = schema(kind, joints=7)
+    text = schema(kind, definitions(7))
     told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
     needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
     assert needed == told

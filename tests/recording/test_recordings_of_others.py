@@ -15,12 +15,12 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
-from tests_paths import RECORDINGS
 
 from service.config import HandSettings, Settings
 from service.demonstrations.demonstration_reader import read_demonstration
 from service.demonstrations.pose_streams import PoseTopic
 from service.recording.mcap_file import RecordingError
+from support.paths import RECORDINGS
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STAMPS = np.arange(40) * 10_000_000 + 1_000_000_000

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -18,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_recording import SKILL, at_ns, state_after, ticks
 
 from service.config import Files, Settings
-from service.core.frame import Event, Record, Tick, encode
+from service.core.frame import Event, Tick, encode
 from service.recording.protocol import pack, unpack
 from service.recording.recording import Recording
 from service.recording.scribe import Scribe
+from support.recorded import SKILL, at_ns, state_after, tell, ticks
 
 SETTINGS = Settings(cell="hall/bench-1", rate_hz=50)
 
@@ -38,14 +37,6 @@ def scribe(**where: Any) -> Iterator[Scribe]:
         yield one
     finally:
         one.close(10)
-
-
-def tell(one: Scribe, count: int, *, first: int = 0, skill: bytes = SKILL) -> list[tuple[Tick, Record, Record]]:
-    """Tells of ticks as the loop does; returns them."""
-    told = list(ticks(count, first=first))
-    for tick, frame, timing in told:
-        one.send(tick, frame, timing, state=lambda index=tick.index: state_after(index), skill=skill)
-    return told
 
 
 def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
@@ -156,9 +147,8 @@ def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Pat
         pid = one.status()["pid"]
         os.kill(pid, signal.SIGINT)
         os.kill(pid, signal.SIGTERM)
-        assert one._child is not None
-        one._child.socket.shutdown(socket.SHUT_WR)  # as the end of this process would
-        assert one._child.process.wait(10) == 0
+        assert one.close(10) == ""
+        assert one.status()["errors"] == []
         tell(one, 1, first=300)
         assert one.status()["lost"] == 1
     recording = Recording.open(tmp_path / "a.mcap")
@@ -211,10 +201,11 @@ def test_a_process_that_is_slow_to_listen_is_given_more_time_and_listens_at_last
 
 DAEMON = """
 import os, signal, sys, time
-sys.path[:0] = sys.argv[3:]
 from pathlib import Path
-from test_scribe import SETTINGS, SKILL, Scribe, state_after, tell
-one = Scribe(SETTINGS, folder=Path(sys.argv[1]))
+from service.config import Settings
+from service.recording.scribe import Scribe
+from support.recorded import SKILL, state_after, tell
+one = Scribe(Settings(cell="hall/bench-1", rate_hz=50), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))
 pid = one.status()["pid"]
 if sys.argv[2] == "stopped":
@@ -227,9 +218,9 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.parametrize("how", ["running", "stopped"])
 def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(tmp_path: Path, how: str) -> None:
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-    command = [sys.executable, "-c", DAEMON, str(tmp_path), how, *paths]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=False)
+    command, path = [sys.executable, "-c", DAEMON, str(tmp_path), how], os.pathsep.join(sys.path)
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=False, env=environment)
     assert done.returncode == -signal.SIGKILL
     until(lambda: not Path(f"/proc/{int(done.stdout)}").exists() or _is_dead(int(done.stdout)))
     (path,) = tmp_path.glob("*.mcap")

@@ -16,14 +16,12 @@ from typing import Any
 
 import msgspec
 import pytest
-from in_process import ASSUMED, ticks_of
-from test_recording import SKILL, state_after, ticks, write
-from wam import URDF
 
 from service.cli.main import main
 from service.config import Files, Settings
 from service.core.controller import Controller, run
-from service.core.frame import TIMING, Frame, Tick, blank
+from service.core.frame import TIMING, Frame, Tick
+from service.core.record import blank
 from service.core.skill.skill import Skill
 from service.recording.paths import RecordingPaths
 from service.recording.recording import Recording
@@ -31,6 +29,9 @@ from service.recording.replay import replay
 from service.recording.scribe import Scribe
 from sim.scene import Scene
 from sim.script import HandScript
+from support.in_process import ASSUMED, ticks_of
+from support.recorded import SKILL, state_after, ticks, write
+from support.wam import URDF
 
 COUNT = 2100
 SMALL = Files(segment_mb=0.1, rerun=True)

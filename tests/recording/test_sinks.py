@@ -14,10 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rerun as rr
 from scipy.spatial.transform import Rotation
-from test_recording import at_ns, ticks, write
-from wam import JOINT_NAMES
 
 from service.cli.main import main
 from service.cli.usage import UsageError
@@ -35,14 +32,8 @@ from service.viewer.banner import banner
 from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
 from service.viewer.stream import Viewer, ViewerError
-
-
-def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """The rows of every entity in a Rerun file."""
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for chunk in rr.chunk.RrdReader(path).stream():
-        rows.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
-    return rows
+from support.recorded import at_ns, drawn, ticks, write
+from support.wam import JOINT_NAMES
 
 
 def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
@@ -96,7 +87,7 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
         ["follow"],
     ]
     assert Counter(row["TextLog:text"][0] for row in rows["/log"]) == {
-        "hold: no hands": 1,
+        "hold: no hands: a hand has not been seen since the start": 1,
         "follow": 1,
         "handover taught": 1,
     }

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from tests_paths import ROOT
 
 from service.cli.main import main
 from service.cli.record_options import add_options
@@ -43,6 +42,7 @@ from service.launch import free_port
 from service.recording.mcap_file import RecordingError
 from sim.scene import Scene
 from sim.teach import perform
+from support.paths import ROOT
 
 SETTINGS = Settings(
     hands=HandSettings(unit="mm", frame="tracker", base_from_tracker=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))

@@ -19,7 +19,6 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 import zenoh
-from wam import JOINT_NAMES
 
 from service.client import endpoints, open_session
 from service.config import WAM
@@ -33,6 +32,7 @@ from sim.network import Commands, Dropout, Live, RunReport, run
 from sim.scene import Scene
 from sim.script import GRIP_S, HandScript, Teacher
 from sim.teach import demonstrations
+from support.wam import JOINT_NAMES
 
 SCENE = Scene()
 STILL = (0.0,) * 7

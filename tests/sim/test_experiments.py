@@ -206,10 +206,10 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
 
 
 def test_the_fast_regression_of_the_rival_is_that_of_the_library() -> None:
-    samples = rivals._samples(demonstrated(2))[::10]
+    samples = rivals.samples_of(demonstrated(2))[::10]
     mixture = GaussianMixture.fit(samples, components=5, seed=0)
     np.testing.assert_allclose(
-        rivals._regression(mixture)(samples[:, :6]), mixture.regress(samples[:, :6]).mean, atol=1e-12
+        rivals.regression_of(mixture)(samples[:, :6]), mixture.regress(samples[:, :6]).mean, atol=1e-12
     )
 
 

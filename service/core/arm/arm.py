@@ -1,9 +1,5 @@
 """The arm's kinematics: where the tool is, which targets it can reach, and the joint velocities
 that bring it there.
-
-One step of differential inverse kinematics is a strictly convex least-squares problem with a bound
-on each joint's speed toward its limits, so that its solution is unique and continuous: unreachable
-targets and singular postures slow the arm, without chatter.
 """
 
 from __future__ import annotations
@@ -14,17 +10,26 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from kmp.compiled import compiled
 from service.config import Settings
-from service.core.arm.inverse_kinematics import APART, NEAR, SPEED, joint_costs, joint_step, tool_speeds, tool_tasks
-from service.core.frame import Vector
+from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe, follow, joint_costs, joint_step
+from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
 from service.core.limiter.limiter import MARGIN, approach_gain
+from service.core.record import Record, Records, Vector, as_array, parameters
+from service.core.rotation import quaternion_of
 from service.core.separation.separation import Separation
 
-# As those of `inverse_kinematics` chosen on the WAM, and tried on a Panda and a UR5.
-CLOSING_SPEED = 0.3  # [m/s] at most, of a large one's
+# Chosen on the WAM, whose tool reaches 0.88 m from its shoulder, and scaled by the arm's reach.
+REACH_M = 0.88
+TURN_LEVER = 0.03  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
+DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
+SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
+SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the WAM's table
+
+CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-SOON_S = 0.02  # in which joints have to come to what turns the tool, or it turns less
+HORIZON_S = 0.02  # for reaching the joint velocities that an orientation step needs; else it is scaled down
 SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
@@ -41,7 +46,7 @@ class Solution(NamedTuple):
     velocity: Vector
     speed_limited: bool
     near_limit: bool
-    apart: bool
+    separated: bool
 
 
 class Closing(NamedTuple):
@@ -54,19 +59,45 @@ class Closing(NamedTuple):
     far_damping: float
 
 
-class Kinematics(NamedTuple):
-    """The arm at some joints: the tool's position (3,) [m] and rotation (3, 3) in frame base.
+class Kinematics:
+    """The arm at some joints, as one record (1,), see `Arm.at`."""
 
-    The tasks (5 or 6, J): the tool's velocity by the joints', and what turns it, in its own axes,
-    times TURN_LEVER; their damping [m²]. The tool's Jacobian (6, J), velocity before turning.
-    """
+    __slots__ = ("record",)
 
-    joints: Vector
-    position: Vector
-    rotation: Vector
-    tasks: Vector
-    damping: float
-    jacobian: Vector
+    def __init__(self, record: Records) -> None:
+        self.record = record
+
+    @property
+    def joints(self) -> Vector:
+        """(J,) [rad]."""
+        return self.record["joints"][0]  # type: ignore[no-any-return]
+
+    @property
+    def position(self) -> Vector:
+        """The tool's (3,) [m], frame base."""
+        return self.record["position"][0]  # type: ignore[no-any-return]
+
+    @property
+    def rotation(self) -> Vector:
+        """The tool's (3, 3), frame base."""
+        return self.record["rotation"][0]  # type: ignore[no-any-return]
+
+    @property
+    def tasks(self) -> Vector:
+        """(5 or 6, J): the tool's velocity by the joints', and what turns it, in its own axes,
+        times the turn lever [m].
+        """
+        return self.record["tasks"][0]  # type: ignore[no-any-return]
+
+    @property
+    def damping(self) -> float:
+        """Of the tasks [m²]."""
+        return float(self.record["damping"][0])
+
+    @property
+    def jacobian(self) -> Vector:
+        """The tool's (6, J), velocity before turning, frame base."""
+        return self.record["jacobian"][0]  # type: ignore[no-any-return]
 
 
 class Arm:
@@ -86,26 +117,56 @@ class Arm:
         tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
         self._tool = self._model.addFrame(tool)
         self._data = self._model.createData()
-        max_speed, max_acceleration = settings.tool.max_speed, settings.tool.max_acceleration
-        closing = closing or Closing(CLOSING_BRAKES * max_acceleration, min(max_speed, CLOSING_SPEED), FAR_DAMPING)
-        self._tasks = 6 if settings.tool.orientation == "full" else 5
-        turn = settings.tool.max_turn_speed
-        self._closing = np.array([settings.period_s, *closing, TOOL_SHARE * max_speed, turn])
-        limits = settings.joints
-        self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
-        self._velocity = np.array(limits.velocity)
-        self._still = np.zeros(3)
-        self._nothing, self._none = np.empty((0, len(limits.velocity))), np.empty(0)
-        self._jerk = np.array(limits.jerk)
-        self._gain = approach_gain(limits)
-        self._posture = np.array(settings.arm.posture)
-        acceleration = np.array(limits.acceleration)
-        self._at_rest = np.zeros(len(acceleration))
-        self._change, self._any_change = SOON_S * acceleration, np.full(len(acceleration), np.inf)
-        self._scale = (acceleration / acceleration.max()) ** SPARING
-        self._limits = (
-            PLANNED_SHARE[:, None] * np.array([limits.velocity, limits.acceleration, limits.jerk]) / self._scale
+        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / REACH_M
+        closing = closing or Closing(
+            CLOSING_BRAKES * settings.tool.max_acceleration, min(top, CLOSING_SPEED), FAR_DAMPING
         )
+        joints, acceleration = len(limits.names), np.array(limits.acceleration)
+        scale = (acceleration / acceleration.max()) ** SPARING
+        self._jerk = np.array(limits.jerk)
+        self.parameters = parameters(
+            period_s=settings.period_s,
+            closing_braking=closing.braking,
+            closing_speed=float(closing.speed),
+            far_damping=closing.far_damping,
+            max_tool_speed=TOOL_SHARE * top,
+            max_turn_speed=float(settings.tool.max_turn_speed),
+            turn_lever=TURN_LEVER * size,
+            damping=DAMPING * size**2,
+            singular_damping=SINGULAR_DAMPING * size**2,
+            singular_volume=SINGULAR_VOLUME * size**3,
+            horizon_s=HORIZON_S,
+            lower=np.array(limits.lower) + MARGIN,
+            upper=np.array(limits.upper) - MARGIN,
+            approach_gain=approach_gain(limits),
+            max_velocity=np.array(limits.velocity, np.float64),
+            acceleration=acceleration,
+            posture=np.array(settings.arm.posture, np.float64),
+            scale=scale,
+            planned_limits=PLANNED_SHARE[:, None]
+            * np.array([limits.velocity, limits.acceleration, limits.jerk])
+            / scale,
+        )
+        tasks = 6 if settings.tool.orientation == "full" else 5
+        self._kinematics = np.dtype(
+            [
+                ("joints", np.float64, (joints,)),
+                ("position", np.float64, (3,)),
+                ("rotation", np.float64, (3, 3)),
+                ("tasks", np.float64, (tasks, joints)),
+                ("damping", np.float64),
+                ("jacobian", np.float64, (6, joints)),
+            ]
+        )
+        self._goal = parameters(
+            position=np.zeros(3),
+            velocity=np.zeros(3),
+            orientation=np.zeros(4),
+            turning=np.zeros(3),
+            moving=np.zeros(joints),
+            horizon_s=0.0,
+        )
+        self._unseparated = Separation.constraints_for(joints, 0)
 
     def at(self, q: Vector) -> Kinematics:
         """The arm at joints q (J,) [rad]."""
@@ -113,26 +174,34 @@ class Arm:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        rotation, tasks = placement.rotation.copy(), np.empty((self._tasks, len(q)))
-        jacobian = np.ascontiguousarray(jacobian)
-        damping = tool_tasks(jacobian, rotation, tasks)
-        return Kinematics(q, placement.translation.copy(), rotation, tasks, damping, jacobian)
+        here = np.zeros(1, self._kinematics)
+        here["joints"][0], here["position"][0] = q, placement.translation
+        describe(self.parameters, here, np.ascontiguousarray(jacobian), placement.rotation.copy())
+        return Kinematics(here)
 
     def costs(self, here: Kinematics) -> Vector:
         """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
 
         (3, 3, J): by order of the derivative, then by axis. The tool does not turn.
         """
-        out = np.empty((3, 3, len(here.joints)))
-        joint_costs(here.tasks * self._scale, here.damping, self._limits, out)
+        out = np.empty((3, 3, len(self._jerk)))
+        joint_costs(self.parameters, here.record, out)
         return out
 
     def speeds(self, here: Kinematics, dq: Vector, ddq: Vector) -> tuple[float, float]:
         """Speed of the tool [m/s] at joint velocities and accelerations (J,) [rad/s, rad/s²]; and
         the most it comes to as these accelerations are brought to 0.
         """
-        found: tuple[float, float] = tool_speeds(here.tasks, dq, ddq, self._jerk)
+        found: tuple[float, float] = _tool_speeds(here.record, dq, ddq, self._jerk)
         return found
+
+    def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
+        """Joint velocities that bring the tool to the state's setpoint, as `step` says."""
+        out = np.empty(len(self._jerk))
+        constraints, count = separation.constraints, separation.count
+        return _solution(
+            out, follow(self.parameters, here.record, as_array(state), self._goal, constraints, count, out)
+        )
 
     def step(
         self,
@@ -143,8 +212,7 @@ class Arm:
         turning: Vector | None = None,
         *,
         moving: Vector | None = None,
-        here: Kinematics | None = None,
-        apart: Separation | None = None,
+        separation: Separation | None = None,
     ) -> Solution:
         """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
         `velocity` (3,) [m/s].
@@ -152,37 +220,30 @@ class Arm:
         The tool turns to `orientation` (4,), which turns at `turning` (3,) [rad/s]: all of it or,
         as the settings say, its +z only, at any angle about it. Position goes before orientation,
         both before the posture; where joints that are `moving` (J,) [rad/s] cannot have both at
-        once, it turns later. `here` is the arm at q, where that is known; `apart` has
-        looked at it and says what goes before all. Never raises nor returns NaN for finite
-        arguments.
+        once, it turns later. `separation` was updated there and goes before all. Never raises nor
+        returns NaN for finite arguments.
         """
-        here = self.at(q) if here is None else here
-        out = np.empty(len(here.joints))
-        said = joint_step(
-            here.joints,
-            here.position,
-            here.rotation,
-            here.tasks,
-            here.damping,
-            position,
-            velocity,
-            orientation,
-            self._still if turning is None else turning,
-            self._posture,
-            self._within,
-            self._gain,
-            self._scale,
-            self._at_rest if moving is None else moving,
-            self._velocity,
-            self._any_change if moving is None else self._change,
-            self._closing,
-            self._nothing if apart is None else apart.rows,
-            self._none if apart is None else apart.plan,
-            0 if apart is None else apart.count,
-            out,
+        goal, out = self._goal[0], np.empty(len(self._jerk))
+        goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation
+        goal["turning"] = 0.0 if turning is None else turning
+        goal["moving"] = 0.0 if moving is None else moving
+        goal["horizon_s"] = math.inf if moving is None else HORIZON_S
+        constraints, count = (
+            (self._unseparated, 0) if separation is None else (separation.constraints, separation.count)
         )
-        out.setflags(write=False)
-        return Solution(out, bool(said & SPEED), bool(said & NEAR), bool(said & APART))
+        return _solution(out, joint_step(self.parameters, self.at(q).record, self._goal, constraints, count, out))
+
+
+@compiled
+def write_tool(heres: Records, frames: Records) -> None:
+    """Into the frame where the commanded joints put the tool."""
+    frames[0].tool[:] = heres[0].position
+    quaternion_of(heres[0].rotation, frames[0].tool_orientation)
+
+
+def _solution(velocity: Vector, flags: int) -> Solution:
+    velocity.setflags(write=False)
+    return Solution(velocity, bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
 
 
 def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:

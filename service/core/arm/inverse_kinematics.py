@@ -1,4 +1,4 @@
-"""The numbers of the arm's differential inverse kinematics, compiled: arrays in, arrays out.
+"""The arm's differential inverse kinematics, compiled.
 
 One step is a strictly convex least-squares problem with a bound on each joint's speed toward its
 limits, so that its solution is unique and continuous: unreachable targets and singular postures
@@ -13,64 +13,27 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.arm.least_squares import factorise, keep_under, least_squares, substitute
-from service.core.frame import Vector
+from service.core.record import Records, Vector
 from service.core.rotation import axis_of, quaternion_of, swing, turn_between
 
-# Gains, speeds and damping below were chosen on the WAM, and tried on a Panda and a UR5.
 NEAR_LIMIT = 0.1  # [rad]
-
 POSITION_GAIN = 50.0  # [1/s] of a small error's decay
 TURN_GAIN = 10.0  # [1/s]
-TURN_LEVER = 0.03  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
-DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
-SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
-SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the table
-FAR_SPEED = 0.15  # [m/s]
-GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
+FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
 ROUNDING = 1e-12  # of a speed
-STEPS = 1e9  # [s/rad] of the result: rounded so that a replay on another kind of CPU agrees
-SPEED, NEAR, APART = 1, 2, 4  # what a step says: a limit of speed met; of position near; of separation met
+ROUND_TO = 1e9  # [s/rad] of the result: machines that differ in the last bits agree
+SPEED = 1  # flag of a step: a joint's speed limit was met
+NEAR = 2  # a joint is near its position limit
+SEPARATED = 4  # separation asked for other velocities
 
 
 @compiled
-def measured_error(q: Vector, tasks: Vector, measured: Vector, velocities: Vector) -> tuple[float, float]:
-    """How far the joints are from where they are measured, the farthest [rad]; how fast the tool is
-    measured [m/s], by the tasks at q.
-    """
-    error = speed = 0.0
-    for joint in range(len(q)):
-        error = max(error, abs(q[joint] - measured[joint]))
-    for axis in range(3):
-        along = 0.0
-        for joint in range(len(q)):
-            along += tasks[axis, joint] * velocities[joint]
-        speed += along * along
-    return error, math.sqrt(speed)
-
-
-@compiled
-def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) -> float:
-    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
-    where it comes back; and for one that may keep only a share of its own speed.
-    """
-    along = gap = 0.0
-    for i in range(3):
-        ahead = setpoint[0, i] - tool[i]
-        along += ahead * setpoint[1, i]
-        gap += ahead * ahead
-    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
-    if share < 1.0:
-        speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
-        slow = min(slow, share * speed / max_speed)
-    return slow
-
-
-@compiled
-def tool_speeds(tasks: Vector, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float]:
-    """Speed now, and the greater of it and that of the crest, when the accelerations are 0."""
+def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float]:
+    """Speed of the tool now, and the greater of it and that when the accelerations are 0."""
+    tasks = heres[0].tasks
     now = crest = 0.0
     for axis in range(3):
         v = v_crest = 0.0
@@ -81,6 +44,62 @@ def tool_speeds(tasks: Vector, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[f
         now += v * v
         crest += v_crest * v_crest
     return math.sqrt(now), math.sqrt(max(now, crest))
+
+
+@compiled
+def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
+    """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
+    limit, by damped least squares; by order of the derivative, then by axis.
+    """
+    arm, here = arms[0], heres[0]
+    count, joints = here.tasks.shape
+    scaled, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
+    for i in range(count):
+        for joint in range(joints):
+            scaled[i, joint] = here.tasks[i, joint] * arm.scale[joint]
+    factorise(scaled, here.damping, root)
+    for axis in range(3):
+        right[:] = 0.0
+        right[axis] = 1.0
+        substitute(root, right)
+        for joint in range(joints):
+            speed = 0.0
+            for i in range(count):
+                speed += scaled[i, joint] * right[i]
+            for order in range(3):
+                out[order, axis, joint] = speed / arm.planned_limits[order, joint]
+
+
+@compiled
+def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) -> None:
+    """Into the kinematics at some joints the tool's Jacobian (6, J), rotation (3, 3), and tasks (5
+    or 6, J), of which the sixth turns it about its +z; their damping [m²]: small, and growing
+    smoothly where the tool's position becomes singular.
+    """
+    arm, here = arms[0], heres[0]
+    joints, square, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
+    here.jacobian[:], here.rotation[:] = jacobian, rotation
+    for joint in range(joints):
+        for i in range(3):
+            tasks[i, joint] = jacobian[i, joint]
+        for i in range(len(tasks) - 3):
+            turn = 0.0
+            for k in range(3):
+                turn += rotation[k, i] * jacobian[3 + k, joint]
+            tasks[3 + i, joint] = arm.turn_lever * turn
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for joint in range(joints):
+                total += jacobian[i, joint] * jacobian[j, joint]
+            square[i, j] = total
+    determinant = (
+        square[0, 0] * (square[1, 1] * square[2, 2] - square[1, 2] ** 2)
+        - square[0, 1] * (square[0, 1] * square[2, 2] - square[0, 2] * square[1, 2])
+        + square[0, 2] * (square[0, 1] * square[1, 2] - square[0, 2] * square[1, 1])
+    )
+    shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / arm.singular_volume, 0.0)
+    here.damping = arm.damping + arm.singular_damping * shortage * shortage
 
 
 @compiled
@@ -107,176 +126,117 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 
 
 @compiled
-def joint_costs(tasks: Vector, damping: float, limits: Vector, out: Vector) -> None:
-    """Into out (3, 3, J): joint speeds per tool velocity, by damped least squares, as shares of
-    limits (3, J).
-    """
-    count = len(tasks)
-    root, right = np.empty((count, count)), np.empty(count)
-    factorise(tasks, damping, root)
-    for axis in range(3):
-        right[:] = 0.0
-        right[axis] = 1.0
-        substitute(root, right)
-        for joint in range(tasks.shape[1]):
-            speed = 0.0
-            for i in range(count):
-                speed += tasks[i, joint] * right[i]
-            for order in range(3):
-                out[order, axis, joint] = speed / limits[order, joint]
-
-
-@compiled
-def tool_tasks(jacobian: Vector, rotation: Vector, tasks: Vector) -> float:
-    """The tasks (5 or 6, J) of a tool's Jacobian (6, J) and rotation (3, 3), the sixth turns it
-    about its +z; their damping [m²]: small, and growing smoothly where the tool's position becomes
-    singular.
-    """
-    joints = jacobian.shape[1]
-    square = np.empty((3, 3))
-    for joint in range(joints):
-        for i in range(3):
-            tasks[i, joint] = jacobian[i, joint]
-        for i in range(len(tasks) - 3):
-            turn = 0.0
-            for k in range(3):
-                turn += rotation[k, i] * jacobian[3 + k, joint]
-            tasks[3 + i, joint] = TURN_LEVER * turn
-    for i in range(3):
-        for j in range(3):
-            total = 0.0
-            for joint in range(joints):
-                total += jacobian[i, joint] * jacobian[j, joint]
-            square[i, j] = total
-    determinant = (
-        square[0, 0] * (square[1, 1] * square[2, 2] - square[1, 2] ** 2)
-        - square[0, 1] * (square[0, 1] * square[2, 2] - square[0, 2] * square[1, 2])
-        + square[0, 2] * (square[0, 1] * square[1, 2] - square[0, 2] * square[1, 1])
-    )
-    shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / SINGULAR_VOLUME, 0.0)
-    return DAMPING + SINGULAR_DAMPING * shortage * shortage
-
-
-@compiled
-def joint_step(
-    q: Vector,
-    tool: Vector,
-    rotation: Vector,
-    tasks: Vector,
-    damping: float,
-    position: Vector,
-    velocity: Vector,
-    orientation: Vector,
-    turning: Vector,
-    posture: Vector,
-    within: Vector,
-    gain: Vector,
-    scale: Vector,
-    moving: Vector,
-    max_speed: Vector,
-    change: Vector,
-    closing: Vector,
-    rows: Vector,
-    limits: Vector,
-    count: int,
-    out: Vector,
+def follow(
+    arms: Records, heres: Records, states: Records, goals: Records, constraints: Records, count: int, out: Vector
 ) -> int:
-    """`Arm.step` into out (J,) [rad/s], for joints that move so (J,) and can soon change that by
-    change (J,) [rad/s], with the first `count` of rows (K, J) times out at most limits (K,) [m/s];
-    what is to be said of it.
-    """
-    joints, rows_of_tasks = len(q), len(tasks)
-    period, braking, closing_speed, far_damping, most, fastest_turn = closing
-    wanted, error, linear, turn = np.empty(rows_of_tasks), np.empty(3), np.empty(3), np.empty(3)
+    """`joint_step` toward the state's setpoint, for joints that move as the state's."""
+    state, goal = states[0], goals[0]
+    goal.position[:], goal.velocity[:] = state.setpoint[0], state.setpoint[1]
+    goal.orientation[:], goal.turning[:] = state.orientation, state.turning
+    goal.moving[:], goal.horizon_s = state.joints[1], arms[0].horizon_s
+    return joint_step(arms, heres, goals, constraints, count, out)
+
+
+@compiled
+def joint_step(arms: Records, heres: Records, goals: Records, constraints: Records, count: int, out: Vector) -> int:
+    """`Arm.step` into out (J,) [rad/s], under the first `count` constraints; flags."""
+    arm, here, goal = arms[0], heres[0], goals[0]
+    tasks, scale, damping = here.tasks, arm.scale, here.damping
+    count_of_tasks, joints = tasks.shape
+    wanted, error, linear, turn = np.empty(count_of_tasks), np.empty(3), np.empty(3), np.empty(3)
     distance = 0.0
     for i in range(3):
-        linear[i] = min(max(velocity[i], -FARTHEST), FARTHEST)
-        error[i] = min(max(position[i] - tool[i], -FARTHEST), FARTHEST) - period * linear[i]
+        linear[i] = min(max(goal.velocity[i], -FARTHEST), FARTHEST)
+        error[i] = min(max(goal.position[i] - here.position[i], -FARTHEST), FARTHEST) - arm.period_s * linear[i]
         distance += error[i] * error[i]
     distance = math.sqrt(distance)
     # in proportion to the error when near, braking evenly from afar
-    near = braking / POSITION_GAIN**2
+    near = arm.closing_braking / POSITION_GAIN**2
     rate = POSITION_GAIN
     if distance > near:
-        rate = min(math.sqrt(2.0 * braking * (distance - 0.5 * near)), closing_speed) / distance
+        rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
     excess = max(rate * distance - FAR_SPEED, 0.0)
-    damping += far_damping * excess * excess
+    damping += arm.far_damping * excess * excess
     for i in range(3):  # the error decays as it will be, not as it is
-        error[i] *= rate / (1.0 + POSITION_GAIN * period)
-    _add_closing(linear, error, most)
-    _turn(rotation, orientation, turning, fastest_turn, rows_of_tasks == 6, turn)
+        error[i] *= rate / (1.0 + POSITION_GAIN * arm.period_s)
+    _add_closing(linear, error, arm.max_tool_speed)
+    _turn(here.rotation, goal.orientation, goal.turning, arm.max_turn_speed, count_of_tasks == 6, turn)
     wanted[:3], wanted[3:] = linear, 0.0
-    for i in range(rows_of_tasks - 3):
+    for i in range(count_of_tasks - 3):
         for k in range(3):
-            wanted[3 + i] += TURN_LEVER * rotation[k, i] * turn[k]
-    said, scaled, home, bounds = 0, np.empty((rows_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
+            wanted[3 + i] += arm.turn_lever * here.rotation[k, i] * turn[k]
+    said, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
-        low, high = q[j] - within[0, j], within[1, j] - q[j]
+        low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
         if min(low, high) < NEAR_LIMIT:
             said |= NEAR
-        bounds[0, j] = -gain[j] * max(low, 0.0) / scale[j]
-        bounds[1, j] = gain[j] * max(high, 0.0) / scale[j]
-        home[j] = min(max(POSTURE_GAIN * (posture[j] - q[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
-        for i in range(rows_of_tasks):
+        bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
+        bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
+        home[j] = min(max(POSTURE_GAIN * (arm.posture[j] - here.joints[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
+        for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
-    scaled_rows = np.empty((count, joints))
+    rows, limits = np.empty((count, joints)), np.empty(count)
     for k in range(count):
+        limits[k] = constraints[k].planned
         for j in range(joints):
-            scaled_rows[k, j] = rows[k, j] * scale[j]
+            rows[k, j] = constraints[k].row[j] * scale[j]
     least_squares(scaled, wanted, home, damping, bounds, out)
-    kept = keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, out)
+    kept = keep_under(scaled, wanted, home, damping, bounds, rows, limits, out)
     if kept:
-        said |= APART
-    if not _can_have(out, moving, scale, max_speed, change):  # it turns as far as costs its position nothing
+        said |= SEPARATED
+    if not _can_have(arms, goals, out):  # it turns as far as costs its position nothing
         free = np.empty(joints)
         scaled[3:], wanted[3:] = 0.0, 0.0
         for j in range(joints):
-            home[j] = moving[j] / scale[j]
+            home[j] = goal.moving[j] / scale[j]
         least_squares(scaled, wanted, home, damping, bounds, free)
-        keep_under(scaled, wanted, home, damping, bounds, scaled_rows, limits, count, free)
+        keep_under(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not kept:  # what keeps distances was found for this solution, not for one on the way to it
-            _turn_less(out, free, moving, scale, max_speed, change)
-    excess = _excess(out, scale, max_speed)
+            _turn_less(arms, goals, out, free)
+    excess = _excess(arms, out)
     for j in range(joints):
         if math.isnan(excess):
             out[j] = 0.0
         else:
             out[j] *= scale[j] / max(excess, 1.0)
-        out[j] = np.rint(out[j] * STEPS) / STEPS
+        out[j] = np.rint(out[j] * ROUND_TO) / ROUND_TO
     return said | SPEED if excess > 1.0 + ROUNDING else said
 
 
 @compiled
-def _excess(out: Vector, scale: Vector, max_speed: Vector) -> float:
+def _excess(arms: Records, out: Vector) -> float:
     """How many times its greatest speed the fastest joint needs; NaN where one is not finite."""
     excess = 0.0
     for j in range(len(out)):
         if not math.isfinite(out[j]):
             return math.nan
-        excess = max(excess, abs(out[j] * scale[j]) / max_speed[j])
+        excess = max(excess, abs(out[j] * arms[0].scale[j]) / arms[0].max_velocity[j])
     return excess
 
 
 @compiled
-def _can_have(out: Vector, moving: Vector, scale: Vector, max_speed: Vector, change: Vector) -> bool:
-    """Whether joints that move so (J,) [rad/s] can soon have the velocities of a solution (J,)."""
+def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
+    """Whether the joints can soon have the velocities of a solution (J,)."""
+    arm, goal = arms[0], goals[0]
     for j in range(len(out)):
-        wanted = out[j] * scale[j]
-        if abs(wanted) > max_speed[j] or abs(wanted - moving[j]) > change[j]:
+        wanted = out[j] * arm.scale[j]
+        change = goal.horizon_s * arm.acceleration[j]
+        if abs(wanted) > arm.max_velocity[j] or abs(wanted - goal.moving[j]) > change:
             return False
     return True
 
 
 @compiled
-def _turn_less(out: Vector, free: Vector, moving: Vector, scale: Vector, max_speed: Vector, change: Vector) -> None:
+def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None:
     """Brings a solution (J,) as near to that of a tool that is free to turn as it has to be for
     joints that can have it.
     """
-    share = 1.0
+    arm, goal, share = arms[0], goals[0], 1.0
     for j in range(len(out)):
-        there, more = free[j] * scale[j], (out[j] - free[j]) * scale[j]
-        low = min(max(-max_speed[j], moving[j] - change[j]), there)
-        high = max(min(max_speed[j], moving[j] + change[j]), there)
+        there, more = free[j] * arm.scale[j], (out[j] - free[j]) * arm.scale[j]
+        change, top = goal.horizon_s * arm.acceleration[j], arm.max_velocity[j]
+        low = min(max(-top, goal.moving[j] - change), there)
+        high = max(min(top, goal.moving[j] + change), there)
         if there + more > high:
             share = min(share, (high - there) / more)
         elif there + more < low:

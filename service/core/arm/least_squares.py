@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.record import Vector
 
 LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
@@ -129,23 +129,22 @@ def keep_under(
     bounds: Vector,
     rows: Vector,
     limits: Vector,
-    count: int,
     x: Vector,
 ) -> bool:
-    """Brings the solution x (J,) of `least_squares` under rows (K, J) x <= limits (K,), of which
-    there are `count`; whether it was not there.
+    """Brings the solution x (J,) of `least_squares` under rows (K, J) x <= limits (K,); whether it
+    was not there.
 
     Bounds hold 0. Limits below 0, of what is to be left, are for where all can be kept: else they
     are taken to be 0. Were the method to end early even so, as its rounds are bounded, the joints
     are slowed down together until they keep them all.
     """
-    if _farthest(bounds, rows, limits, count, x, LEAST_EXCESS) < 0:
+    if _farthest(bounds, rows, limits, x, LEAST_EXCESS) < 0:
         return False
-    _solve_under(tasks, wanted, posture, damping, bounds, rows, limits, count, x)
-    if limits[:count].min() < 0.0 and _farthest(bounds, rows, limits, count, x, LEAST_EXCESS) >= 0:
+    _solve_under(tasks, wanted, posture, damping, bounds, rows, limits, x)
+    if len(limits) and limits.min() < 0.0 and _farthest(bounds, rows, limits, x, LEAST_EXCESS) >= 0:
         least = np.maximum(limits, 0.0)
-        _solve_under(tasks, wanted, posture, damping, bounds, rows, least, count, x)
-    share = _share_within(bounds, rows, limits, count, x)
+        _solve_under(tasks, wanted, posture, damping, bounds, rows, least, x)
+    share = _share_within(bounds, rows, limits, x)
     for j in range(len(x)):
         x[j] = min(max(share * x[j], bounds[0, j]), bounds[1, j])
     return True
@@ -160,7 +159,6 @@ def _solve_under(
     bounds: Vector,
     rows: Vector,
     limits: Vector,
-    count: int,
     x: Vector,
 ) -> None:
     """`keep_under` by the dual active-set method of Goldfarb and Idnani (Mathematical Programming
@@ -182,7 +180,7 @@ def _solve_under(
     entering, pushed = -1, 0.0
     for _ in range(ROUNDS):
         if entering < 0:
-            entering, pushed = _farthest(bounds, rows, limits, count, x, 0.1 * LEAST_EXCESS), 0.0
+            entering, pushed = _farthest(bounds, rows, limits, x, 0.1 * LEAST_EXCESS), 0.0
             if entering < 0:
                 break
         limit = _constraint(entering, bounds, rows, limits, normal)
@@ -220,14 +218,14 @@ def _solve_under(
 
 
 @compiled
-def _share_within(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector) -> float:
+def _share_within(bounds: Vector, rows: Vector, limits: Vector, x: Vector) -> float:
     """How much of x (J,) keeps bounds and limits, those below 0 taken to be 0."""
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]
         if abs(x[j]) > abs(bound) + LEAST_EXCESS:
             share = min(share, bound / x[j])
-    for k in range(count):
+    for k in range(len(limits)):
         along = 0.0
         for j in range(len(x)):
             along += rows[k, j] * x[j]
@@ -238,7 +236,7 @@ def _share_within(bounds: Vector, rows: Vector, limits: Vector, count: int, x: V
 
 
 @compiled
-def _farthest(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vector, least: float) -> int:
+def _farthest(bounds: Vector, rows: Vector, limits: Vector, x: Vector, least: float) -> int:
     """The number of the constraint that x (J,) passes by most, -1 if none by more than `least`:
     upper bounds first, then lower ones, then rows.
     """
@@ -248,7 +246,7 @@ def _farthest(bounds: Vector, rows: Vector, limits: Vector, count: int, x: Vecto
             found, most = j, x[j] - bounds[1, j]
         if bounds[0, j] - x[j] > most:
             found, most = joints + j, bounds[0, j] - x[j]
-    for k in range(count):
+    for k in range(len(limits)):
         beyond = -limits[k]
         for j in range(joints):
             beyond += rows[k, j] * x[j]

@@ -1,1 +1,43 @@
-"""Stage 1: samples of hands and arm, checked and filtered to a state at the tick."""
+"""Stage 1, intake: samples of hands and arm, checked and filtered to a state at the tick."""
+
+from __future__ import annotations
+
+from service.contract.records import PER_JOINT, SOURCES, Cause, Field
+
+MODES = 3  # of the hand estimator's motion models
+STATE = (
+    Field("hand_stamps_ns", "int64", (2,)),
+    Field("hand_ticks", "int64", (2,)),  # tick of the newest sample; -1: none yet
+    Field("arm_stamp_ns", "int64"),
+    Field("arm_tick", "int64"),
+    Field("arm_still_tick", "int64"),  # since which the arm has reported `arm_still_posture`
+    Field("sample_ticks", "int64", (len(SOURCES), 2)),  # the last two at which a sample could have been right
+    Field("jump_first_tick", "int64", (2,)),  # of a hand's samples that jumped, in a row
+    Field("jump_newest_tick", "int64", (2,)),
+    Field("jump_count", "int64", (2,)),
+    Field("even_samples", "int64", (2,)),  # how many of the past samples are evenly spaced
+    Field("noise_samples", "int64", (2,)),  # averaged in the noise variance
+    Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
+    Field("hand_velocity_lowpass", "float64", (2, 3)),  # without tremor [m/s]
+    Field("hand_stillness", "float64", (2,)),  # 0: on its way, 1: still
+    Field("mode_means", "float64", (2, MODES, 3, 3)),
+    Field("mode_covariances", "float64", (2, MODES, 3, 3)),
+    Field("mode_probabilities", "float64", (2, MODES)),
+    Field("noise_variance", "float64", (2,)),  # of each hand's samples, each axis [m²]
+    Field("sample_interval_s", "float64", (2,)),
+    Field("past_samples", "float64", (2, 3, 3)),  # newest first [m]
+    Field("jumped_to", "float64", (2, 3)),  # where the newest sample that jumped was [m]
+    Field("contested", "float64", (len(SOURCES),)),  # the share of the last second's samples that contradict the others
+    Field("arm_still_posture", "float64", (PER_JOINT,)),
+    Field("measured", "float64", (PER_JOINT,)),
+    Field("measured_velocities", "float64", (PER_JOINT,)),
+    Field("rejected", "uint32", (len(Cause),)),
+    Field("jump_is_swap", "uint8", (2,)),  # the hand jumped to where the other one had been
+)
+FRAME = (
+    Field("hand_stamp_ns", "int64"),  # of the newest sample in it; 0: none yet
+    Field("hands", "float64", (2, 3)),  # left and right, filtered, at this tick [m]
+    Field("hand_velocities", "float64", (2, 3)),
+    Field("hand_ages", "int32", (2,)),  # ticks since the newest sample; -1: none yet
+    Field("rejected", "uint32", (len(Cause),)),
+)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from service.contract.incidents import figures
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 
 PLAUSIBLE_M = (0.05, 2.5)  # hands and tool are so far from the base plate, in the unit that was meant
@@ -19,8 +20,3 @@ def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
     like = f", which looks like {meant[-1]}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
     return f"at {figures(position)}{like}; {rule}, at most {FARTHEST_M:g} m from the base plate accepted"
-
-
-def figures(values: Sequence[float]) -> str:
-    """Numbers for people: (980, -320, 60)."""
-    return f"({', '.join(f'{v:.4g}' for v in values)})"

@@ -11,9 +11,7 @@ and all share one noise variance, estimated from the third differences of the sa
 leaves nothing in them, white noise of variance r leaves 20 r an axis.
 
 Arrays of one hand: means (3, 3, 3) by mode, then position, velocity and acceleration [m, m/s,
-m/s²], by axis; covariances (3, 3, 3) by mode, alike for the axes; modes (3,) their probabilities;
-noise (4,) the variance [m²], how many past samples are evenly spaced (0 to 3), their interval [s],
-and how many differences have been averaged; past (3, 3) those samples [m], newest first.
+m/s²], by axis; covariances (3, 3, 3) by mode, alike for the axes; probabilities (3,) of the modes.
 """
 
 from __future__ import annotations
@@ -25,22 +23,27 @@ import numpy as np
 from scipy.linalg import expm
 
 from kmp.compiled import compiled
-from service.core.frame import Record, Records, Vector, as_array
-from service.core.intake.stillness import RESTING, rest_on, shares
+from service.core.intake import MODES
+from service.core.intake.stillness import STILL, smoothing, stillness_after
+from service.core.record import Record, Records, Vector, as_array, parameters
 
-MODES = 3
-REVERT_A, REVERT_V = 15.0, 100.0  # [1/s], [1/s²]
+REVERT_A = 15.0  # [1/s] of the acceleration
+REVERT_V = 100.0  # [1/s²] of the velocity
 INTENSITY = np.array([0.03, 3.0, 30.0])  # [m²/s⁵] of the modes
 PRIOR = np.array([0.4, 0.4, 0.2])  # their probabilities, when nothing is known
 SWITCH_RATE = 3.0  # [1/s] at which a mode is left
-LEAST_NOISE, MOST_NOISE = 7e-4, 5e-2  # [m] bounds of its standard deviation; below the least, hands tremble
-AVERAGED = 60.0  # samples over which the noise is averaged
-SURPRISE = 9.0  # times the noise variance: as much as one difference may say
-JUMP_M, JUMP_MPS, JUMP_NOISE = 0.04, 1.0, 6.0  # what is farther from where a hand was expected than this, and than this
-# for each second since it was seen, and than so many of its noise's standard deviations, has jumped
-START_SPEED, START_ACCELERATION = 0.3, 1.0  # [m/s], [m/s²] of a hand of which one sample is known
+LEAST_NOISE = 7e-4  # [m] of a tracker's standard deviation: below it, hands tremble
+MOST_NOISE = 5e-2  # [m]
+AVERAGED = 60  # samples over which the noise is averaged
+OUTLIER = 9.0  # times the noise variance: as much as one difference may count
+JUMP_M = 0.04  # jump gate: max(JUMP_M + JUMP_MPS * dt, JUMP_NOISE sigma)
+JUMP_MPS = 1.0  # [m/s]
+JUMP_NOISE = 6.0  # standard deviations
+START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
+START_ACCELERATION = 1.0  # [m/s²] likewise
 LEAST_PROBABILITY = 1e-4  # of a mode
-FARTHEST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
+MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
+ROUND_TO = 1e12  # of probabilities: machines that differ in the last bits agree
 
 
 class HandEstimator:
@@ -52,17 +55,18 @@ class HandEstimator:
         self._period_s = period_s
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
-    def _model_over(self, ticks: int) -> tuple[Vector, Vector, Vector]:
-        return *model(ticks * self._period_s), shares(ticks * self._period_s)
+    def _model_over(self, ticks: int) -> Records:
+        transition, noise = model(ticks * self._period_s)
+        return parameters(transition=transition, noise=noise, smoothing=smoothing(ticks * self._period_s))
 
     def begin(self, state: Record) -> None:
-        """Sets what no sample has told yet."""
-        state["noise"][:, 0] = self._noise
-        state["repose"] = RESTING
+        """Sets what no sample has reported yet."""
+        state["noise_variance"] = self._noise
+        state["hand_stillness"] = STILL
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Moves both hands on by some ticks; one that is not seen stands still."""
-        _advance_both(as_array(state), stale_ticks, *self._model(ticks))
+        _advance_both(as_array(state), stale_ticks, self._model(ticks))
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
@@ -74,7 +78,12 @@ def model(interval_s: float) -> tuple[Vector, Vector]:
     whole[:3, :3], whole[2, 5], whole[3:, 3:] = -dynamics, 1.0, dynamics.T
     grown = expm(whole * interval_s)
     transition = np.ascontiguousarray(grown[3:, 3:].T)
-    return transition, np.ascontiguousarray(transition @ grown[:3, 3:])
+    return _to_digits(transition), _to_digits(transition @ grown[:3, 3:])
+
+
+def _to_digits(matrix: Vector) -> Vector:
+    """To 12 digits, as LAPACK's last ones are another CPU's."""
+    return np.array([[float(f"{value:.11e}") for value in row] for row in matrix])
 
 
 @compiled
@@ -114,28 +123,31 @@ def _advance(means: Vector, covariances: Vector, transition: Vector, noise: Vect
 
 
 @compiled
-def _update_noise(noise: Vector, past: Vector, position: Vector, interval_s: float) -> None:
+def _update_noise(states: Records, side: int, position: Vector, interval_s: float) -> None:
     """The noise variance after one more sample; samples after a gap are compared with no earlier
     ones.
     """
-    count = int(noise[1])
-    if count >= 2 and abs(interval_s - noise[2]) > 0.5 * noise[2]:
+    state, past = states[0], states[0].past_samples[side]
+    count, variance = state.even_samples[side], state.noise_variance[side]
+    before_s = state.sample_interval_s[side]
+    if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
         count = 1
-    noise[2] = interval_s
+    state.sample_interval_s[side] = interval_s
     if count >= 3:
         square = 0.0
         for axis in range(3):
             third = position[axis] - 3.0 * past[0, axis] + 3.0 * past[1, axis] - past[2, axis]
             square += third * third
-        seen = min(square / 60.0, SURPRISE * noise[0])
-        noise[3] = min(noise[3] + 1.0, AVERAGED)
-        variance = noise[0] + (seen - noise[0]) / (noise[3] + 1.0)
-        noise[0] = min(max(variance, LEAST_NOISE**2), MOST_NOISE**2)
+        seen = min(square / 60.0, OUTLIER * variance)
+        samples = min(state.noise_samples[side] + 1, AVERAGED)
+        state.noise_samples[side] = samples
+        variance += (seen - variance) / (samples + 1.0)
+        state.noise_variance[side] = min(max(variance, LEAST_NOISE**2), MOST_NOISE**2)
     for axis in range(3):
         past[2, axis] = past[1, axis]
         past[1, axis] = past[0, axis]
         past[0, axis] = position[axis]
-    noise[1] = min(count + 1, 3)
+    state.even_samples[side] = min(count + 1, 3)
 
 
 @compiled
@@ -188,7 +200,7 @@ def _update(
             for column in range(row, 3):
                 left = p[row, column] - p[0, row] * p[0, column] / variance
                 covariances[i, row, column] = covariances[i, column, row] = left
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, FARTHEST_INNOVATION)
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MOST_INNOVATION)
         best = max(best, likelihood[i])
     for i in range(MODES):
         modes[i] = expected[i] * math.exp(likelihood[i] - best)
@@ -196,6 +208,8 @@ def _update(
     for i in range(MODES):
         modes[i] = max(modes[i], LEAST_PROBABILITY)
     _normalise(modes)
+    for i in range(MODES):
+        modes[i] = np.rint(modes[i] * ROUND_TO) / ROUND_TO
 
 
 @compiled
@@ -210,16 +224,18 @@ def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, transition: Vector, noise: Vector, shares: Vector) -> None:
-    state = states[0]
+def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
+    state, over = states[0], models[0]
     for side in range(2):
+        hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
-            _advance(state.means[side], state.covariances[side], transition, noise)
-            _combine(state.means[side], state.modes[side], state.hands[side])
+            _advance(state.mode_means[side], state.mode_covariances[side], over.transition, over.noise)
+            _combine(state.mode_means[side], state.mode_probabilities[side], hand)
         else:
-            state.means[side, :, 1:] = 0.0
-            state.hands[side, 1:] = 0.0
-        state.repose[side] = rest_on(state.hands[side, 1], shares, state.paces[side], state.repose[side])
+            state.mode_means[side, :, 1:] = 0.0
+            hand[1:] = 0.0
+        lowpass, stillness = state.hand_velocity_lowpass[side], state.hand_stillness[side]
+        state.hand_stillness[side] = stillness_after(hand[1], over.smoothing, lowpass, stillness)
 
 
 @compiled
@@ -235,7 +251,7 @@ def has_jumped(states: Records, side: int, position: Vector, interval_s: float) 
     after the one before.
     """
     state = states[0]
-    gate = max(JUMP_M + JUMP_MPS * interval_s, JUMP_NOISE * math.sqrt(state.noise[side, 0]))
+    gate = max(JUMP_M + JUMP_MPS * interval_s, JUMP_NOISE * math.sqrt(state.noise_variance[side]))
     off = 0.0
     for axis in range(3):
         off += (position[axis] - state.hands[side, 0, axis]) ** 2
@@ -248,12 +264,14 @@ def take(states: Records, side: int, position: Vector, interval_s: float, anew: 
     with it.
     """
     state = states[0]
-    noise, hand, means = state.noise[side], state.hands[side], state.means[side]
+    means, covariances = state.mode_means[side], state.mode_covariances[side]
+    probabilities = state.mode_probabilities[side]
     if anew:
-        noise[1] = 0.0
-    _update_noise(noise, state.past[side], position, interval_s)
+        state.even_samples[side] = 0
+    _update_noise(states, side, position, interval_s)
+    variance = state.noise_variance[side]
     if anew:
-        _start(means, state.covariances[side], state.modes[side], noise[0], position)
+        _start(means, covariances, probabilities, variance, position)
     else:
-        _update(means, state.covariances[side], state.modes[side], noise[0], position, interval_s)
-    _combine(means, state.modes[side], hand)
+        _update(means, covariances, probabilities, variance, position, interval_s)
+    _combine(means, probabilities, state.hands[side])

@@ -13,20 +13,28 @@ from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.channels import BY_KEY
 from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
-from service.contract.records import SOURCES, Cause
-from service.core.frame import Record, Records, Vector, as_array
+from service.contract.records import SIDES, SOURCES, Cause, Reason
+from service.core.frame import Event
 from service.core.intake.hand_estimator import HandEstimator, has_jumped, is_fresh, take
 from service.core.intake.plausibility import REPEATED, is_confirmed, is_contested, is_swapped, note, refusal
+from service.core.record import Record, Records, Vector, as_array, parameters
 from service.core.rotation import rotation
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
-FASTEST_JOINT = 100.0  # [rad/s] beyond it a measured joint is a mistake
-JUMP_RAD, JUMP_RADPS = 0.2, 5.0  # so far and so fast no joint gets from one sample to the next
+TWO_SOURCES = int(Reason.TWO_SOURCES)
+MAX_JOINT_SPEED = 100.0  # [rad/s] beyond it a measured joint is a mistake
+JUMP_RAD = 0.2  # jump gate of a joint: JUMP_RAD + JUMP_RADPS * dt
+JUMP_RADPS = 5.0  # [rad/s]
 FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
-REST_RAD, REST_S = 0.02, 0.1  # an arm is at rest that stayed within so much for so long
+STILL_RAD = 0.02  # an arm is at rest that stayed within so much ...
+STILL_S = 0.1  # ... for so long
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
+HANDS_KNOWN = 1  # what a step says: both hands are seen
+ARM_HEARD = 2  # the arm has reported its joints lately enough
+ARM_STILL = 4  # ... and has reported one posture for a while
+CONTESTED = 8  # a hand or the arm is reported by two sources
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -38,9 +46,9 @@ def _stale_ticks(key: str, settings: Settings) -> int:
     return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
 
 
-def rest_ticks(settings: Settings) -> int:
-    """The ticks over which an arm must tell one posture before it is believed."""
-    return math.ceil(round(REST_S / settings.period_s, 6))
+def still_ticks(settings: Settings) -> int:
+    """The ticks over which an arm must report one posture before it is believed."""
+    return math.ceil(round(STILL_S / settings.period_s, 6))
 
 
 class Refused(NamedTuple):
@@ -60,13 +68,18 @@ class Intake:
 
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands
-        self._period_s = settings.period_s
         self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
-        self._rest_ticks = rest_ticks(settings)
+        self._still_ticks = still_ticks(settings)
         self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
         limits = np.array([settings.joints.lower, settings.joints.upper])
-        self._plausible = limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]])
+        self._parameters = parameters(
+            period_s=settings.period_s,
+            stale_ticks=self._stale_ticks,
+            silent_ticks=self._silent_ticks,
+            still_ticks=self._still_ticks,
+            plausible_joints=limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]]),
+        )
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
         self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
         self._in_base = np.eye(3, 4)
@@ -77,9 +90,22 @@ class Intake:
         self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
 
     def begin(self, state: Record) -> None:
-        """Sets in a state of zeros what no sample has told yet."""
-        state["tick"] = state["hand_ticks"] = state["arm_tick"] = state["rest_tick"] = state["told_ticks"] = -1
+        """Sets in a state of zeros what no sample has reported yet."""
+        state["tick"] = state["hand_ticks"] = state["arm_tick"] = state["arm_still_tick"] = state["sample_ticks"] = -1
         self._estimator.begin(state)
+
+    def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
+        """Moves the state on by some ticks and takes the samples in; the flags HANDS_KNOWN,
+        ARM_HEARD, ARM_STILL and CONTESTED.
+        """
+        self.advance(state, ticks)
+        for event in samples:
+            if event.kind == "joints/state":
+                self.take_arm(state, event.value)
+            else:
+                self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+        known = int(_report(as_array(state), as_array(frame), self._parameters))
+        return known | CONTESTED * is_contested(state, already=int(state["reason"]) == TWO_SOURCES)
 
     def is_fresh(self, state: Record, side: int) -> bool:
         """Whether a hand has been seen, and lately enough."""
@@ -96,7 +122,7 @@ class Intake:
 
     def is_arm_at_rest(self, state: Record) -> bool:
         """Whether the arm is heard and has told one posture for a while, by whatever source."""
-        return self.is_arm_heard(state) and int(state["tick"]) - int(state["rest_tick"]) >= self._rest_ticks
+        return self.is_arm_heard(state) and int(state["tick"]) - int(state["arm_still_tick"]) >= self._still_ticks
 
     @staticmethod
     def is_contested(state: Record, *, already: bool) -> bool:
@@ -116,13 +142,12 @@ class Intake:
             return
         cause = _take_hand(
             as_array(state),
+            self._parameters,
             side,
             sample.stamp_ns,
             sample.position,
             sample.orientation,
             self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
-            self._stale_ticks,
-            self._period_s,
         )
         if cause >= 0:
             self._note(state, side, cause, sample)
@@ -135,15 +160,7 @@ class Intake:
             state["rejected"][Cause.INCOMPLETE] += 1
             self._note(state, ARM, Cause.INCOMPLETE, sample)
             return
-        cause = _take_arm(
-            as_array(state),
-            sample.stamp_ns,
-            np.array(position),
-            np.array(velocity),
-            self._plausible,
-            self._silent_ticks,
-            self._period_s,
-        )
+        cause = _take_arm(as_array(state), self._parameters, sample.stamp_ns, np.array(position), np.array(velocity))
         if cause >= 0:
             self._note(state, ARM, cause, sample)
 
@@ -154,40 +171,32 @@ class Intake:
 
 
 @compiled
-def _take_arm(
-    states: Records,
-    stamp_ns: int,
-    position: Vector,
-    velocity: Vector,
-    plausible: Vector,
-    silent_ticks: int,
-    period_s: float,
-) -> int:
-    """`Intake.take_arm`, with the least and the greatest plausible joints (2, J) [rad]: the cause
-    for which it was rejected, or -1.
-    """
-    state = states[0]
+def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
+    """`Intake.take_arm`: the cause for which it was rejected, or -1."""
+    state, given = states[0], parameters[0]
     passed = state.tick - state.arm_tick
-    fresh = state.arm_tick >= 0 and passed < silent_ticks
+    passed_s, silent_s = passed * given.period_s, given.silent_ticks * given.period_s
+    fresh = state.arm_tick >= 0 and passed < given.silent_ticks
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
         return NOT_FINITE
     near, off, moved = True, 0.0, 0.0
     for i in range(len(position)):
-        near = near and plausible[0, i] <= position[i] <= plausible[1, i] and abs(velocity[i]) <= FASTEST_JOINT
+        near = near and given.plausible_joints[0, i] <= position[i] <= given.plausible_joints[1, i]
+        near = near and abs(velocity[i]) <= MAX_JOINT_SPEED
         off = max(off, abs(position[i] - state.measured[i]))
-        moved = max(moved, abs(position[i] - state.rest[i]))
+        moved = max(moved, abs(position[i] - state.arm_still_posture[i]))
     cause = -1 if near else OUT_OF_RANGE
     if near:
-        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed * period_s, silent_ticks * period_s)
+        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s)
     if near and cause != REPEATED:
-        jumped = fresh and off > JUMP_RAD + JUMP_RADPS * passed * period_s
-        note(states, ARM, jumped, period_s)
+        jumped = fresh and off > JUMP_RAD + JUMP_RADPS * passed_s
+        note(states, ARM, jumped, given.period_s)
         if jumped and cause < 0:
             cause = JUMPED
-    if near and (moved > REST_RAD or not fresh):
-        state.rest[:] = position
-        state.rest_tick = state.tick
+    if near and (moved > STILL_RAD or not fresh):
+        state.arm_still_posture[:] = position
+        state.arm_still_tick = state.tick
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
@@ -199,18 +208,17 @@ def _take_arm(
 @compiled
 def _take_hand(
     states: Records,
+    parameters: Records,
     side: int,
     stamp_ns: int,
     position: tuple[float, float, float],
     turn: tuple[float, float, float, float],
     frame: Vector,
-    stale_ticks: int,
-    period_s: float,
 ) -> int:
     """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base: the cause for
     which it was rejected, or -1.
     """
-    state, in_base, norm, far = states[0], np.empty(3), 0.0, 0.0
+    state, given, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
     for k in range(4):
         norm += turn[k] * turn[k]
     for i in range(3):
@@ -218,6 +226,7 @@ def _take_hand(
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
+    stale_ticks, period_s = given.stale_ticks, given.period_s
     fresh = is_fresh(states, side, stale_ticks)
     since = state.tick - state.hand_ticks[side]
     jumped, cause = False, -1
@@ -234,13 +243,38 @@ def _take_hand(
             note(states, side, jumped, period_s)
             jumped = jumped or is_swapped(states, side, in_base, stale_ticks, period_s)
         if cause < 0 and jumped and not is_confirmed(states, side, in_base, stale_ticks, period_s):
-            cause = SWAPPED if state.doubts[side, 3] else JUMPED
+            cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
     take(states, side, in_base, since * period_s, jumped or not fresh)
-    state.doubts[side, 2:] = 0
-    state.doubts[1 - side, 3] = 0  # this hand is where it is said to be
+    state.jump_count[side] = state.jump_is_swap[side] = 0
+    state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
     state.hand_stamps_ns[side] = stamp_ns
     state.hand_ticks[side] = state.tick
     return -1
+
+
+@compiled
+def _report(states: Records, frames: Records, parameters: Records) -> int:
+    """Into the frame what is known of the hands; flags of what is."""
+    frame, state, given = frames[0], states[0], parameters[0]
+    left, right = state.hand_ticks[0], state.hand_ticks[1]
+    if left == right:
+        frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
+    else:
+        frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
+    for side in range(2):
+        seen = state.hand_ticks[side]
+        frame.hand_ages[side] = -1 if seen < 0 else state.tick - seen
+        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
+    frame.tick = state.tick
+    frame.rejected[:] = state.rejected
+    known = 0
+    if is_fresh(states, 0, given.stale_ticks) and is_fresh(states, 1, given.stale_ticks):
+        known |= HANDS_KNOWN
+    if state.arm_tick >= 0 and state.tick - state.arm_tick < given.silent_ticks:
+        known |= ARM_HEARD
+        if state.tick - state.arm_still_tick >= given.still_ticks:
+            known |= ARM_STILL
+    return known

@@ -19,24 +19,33 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from kmp.compiled import compiled
 from service.contract.records import Cause
-from service.core.frame import Record, Records, Vector
+from service.core.record import Record, Records, Vector
 
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
-CONFIRMED, CONFIRMED_S = 3, 0.02
-SWAPPED_M, SWAPPED_MPS, SWAPPED_S = 0.05, 0.2, 2.0  # so near to where the other one was, which may have moved on
-AGREE_M, AGREE_MPS = 0.03, 2.0  # samples of a hand that jumped agree as far as a fast hand moves
-CONTESTED, SETTLED = 0.25, 0.1
-SCATTERED_M, GATHERED_M = 0.012, 0.010  # standard deviation of a hand's samples, each axis
-MEMORY_S, MOST_S = 1.0, 1 / 30  # over which samples are averaged; as long counts one, whatever the pause before it
+CONFIRMED = 3  # samples in a row that agree
+CONFIRMED_S = 0.02  # over so long at least
+SWAPPED_M = 0.05  # so near to where the other hand was ...
+SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
+SWAPPED_S = 2.0  # after so long a swap is believed
+AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
+AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
+CONTESTED = 0.25  # share of the samples that jumped at which a source is contested
+SETTLED = 0.1  # share below which it is no more
+SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
+GATHERED_M = 0.010  # below which it is no more
+MEMORY_S = 1.0  # over which the share is averaged
+MOST_S = 1 / 30  # that one sample counts, whatever the pause before it
+ROUND_TO = 1e9  # of the share: machines that differ in the last bits agree
 
 
 def is_contested(state: Record, *, already: bool) -> bool:
     """Whether some source is contradicted by another; `already`: it was found so before."""
     share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED, SCATTERED_M)
-    noise = state["noise"]
-    return bool(max(state["contested"].tolist()) > share or max(noise[0, 0], noise[1, 0]) > scatter_m**2)
+    return bool(max(state["contested"].tolist()) > share or max(state["noise_variance"].tolist()) > scatter_m**2)
 
 
 @compiled
@@ -56,12 +65,12 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
     """Remembers how much a source is contradicted."""
     state = states[0]
-    ticks, share = state.told_ticks[source], state.contested[source]
+    ticks, share = state.sample_ticks[source], state.contested[source]
     if ticks[1] < state.tick:  # two in one tick count alike
         ticks[0], ticks[1] = ticks[1], state.tick
     passed_s = min((state.tick - ticks[0]) * period_s, MOST_S)
     share += (1.0 - math.exp(-passed_s / MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
-    state.contested[source] = share if share > 1e-6 else 0.0
+    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
 
 @compiled
@@ -70,10 +79,10 @@ def is_swapped(states: Records, side: int, position: Vector, stale_ticks: int, p
     from samples that were.
     """
     state = states[0]
-    doubts, seen = state.doubts[side], state.hand_ticks[side]
-    if doubts[3] and (state.tick - doubts[0]) * period_s >= SWAPPED_S:
+    is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
+    if is_swap and (state.tick - state.jump_first_tick[side]) * period_s >= SWAPPED_S:
         return False
-    if doubts[3] and _goes_on(states, side, position, stale_ticks, period_s):
+    if is_swap and _goes_on(states, side, position, stale_ticks, period_s):
         return True
     silent = seen >= 0 and stale_ticks <= state.tick - seen and (state.tick - seen) * period_s < SWAPPED_S
     return bool(silent and _is_at_other(states, side, position, period_s))
@@ -83,17 +92,17 @@ def is_swapped(states: Records, side: int, position: Vector, stale_ticks: int, p
 def is_confirmed(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
     """Whether a hand's sample (3,) [m] that jumped is to be believed, by those just before it."""
     state = states[0]
-    doubts = state.doubts[side]
-    if doubts[2] == 0 or not _goes_on(states, side, position, stale_ticks, period_s):
-        doubts[0], doubts[2], doubts[3] = state.tick, 0, 0
-    state.doubted[side, :] = position
-    doubts[1] = state.tick
-    doubts[2] += 1
-    unseen = state.hand_ticks[1 - side] < doubts[0]
-    if doubts[2] > 1 and unseen and _is_at_other(states, side, position, period_s):
-        doubts[3] = 1
-    enough_s = SWAPPED_S if doubts[3] else CONFIRMED_S
-    return bool(doubts[2] >= CONFIRMED and (state.tick - doubts[0] + 0.5) * period_s >= enough_s)
+    if state.jump_count[side] == 0 or not _goes_on(states, side, position, stale_ticks, period_s):
+        state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
+    state.jumped_to[side, :] = position
+    state.jump_newest_tick[side] = state.tick
+    state.jump_count[side] += 1
+    first, count = state.jump_first_tick[side], state.jump_count[side]
+    unseen = state.hand_ticks[1 - side] < first
+    if count > 1 and unseen and _is_at_other(states, side, position, period_s):
+        state.jump_is_swap[side] = 1
+    enough_s = SWAPPED_S if state.jump_is_swap[side] else CONFIRMED_S
+    return bool(count >= CONFIRMED and (state.tick - first + 0.5) * period_s >= enough_s)
 
 
 @compiled
@@ -108,10 +117,10 @@ def _is_at_other(states: Records, side: int, position: Vector, period_s: float) 
 
 @compiled
 def _goes_on(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
-    """Whether a sample is where a hand can be that was at the newest doubted one."""
+    """Whether a sample is where a hand can be that was at the newest one that jumped."""
     state = states[0]
-    passed = state.tick - state.doubts[side, 1]
-    near = _distance(position, state.doubted[side]) <= AGREE_M + AGREE_MPS * passed * period_s
+    passed = state.tick - state.jump_newest_tick[side]
+    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * period_s
     return bool(passed < stale_ticks and near)
 
 

@@ -17,12 +17,13 @@ import ruckig
 
 from kmp.compiled import compiled
 from service.config import JointSettings
-from service.core.frame import Vector
+from service.core.record import Records, Vector, parameters
 from service.core.stops import fastest_stop, stop_together
 
-STEPS = 1e9  # [1/rad] of the positions: rounded so that a replay on another kind of CPU agrees
+ROUND_TO = 1e9  # [1/rad] of the positions: machines that differ in the last bits agree
 LARGEST = 1e6  # of any number of a state that is calculated with
-BOUNDED, CHASED = 1, 2  # what `_toward` says: the wanted velocity was cut; some joint cannot have it in a tick
+BOUNDED = 1  # flag of a step: the wanted velocity was cut
+CHASED = 2  # some joint cannot have it in a tick
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
@@ -57,10 +58,15 @@ class Limiter:
 
     def __init__(self, limits: JointSettings, period_s: float) -> None:
         self._period = period_s
-        self._within = np.array([np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN])
-        self._limits = np.array([limits.velocity, limits.acceleration, limits.jerk])
-        self._limits[0] *= 1.0 - 1e-12  # leaves room for rounding
-        self._gain = approach_gain(limits)
+        self._parameters = parameters(
+            period_s=period_s,
+            lower=np.array(limits.lower) + MARGIN,
+            upper=np.array(limits.upper) - MARGIN,
+            max_velocity=np.array(limits.velocity) * (1.0 - 1e-12),  # leaves room for rounding
+            max_acceleration=np.array(limits.acceleration, np.float64),
+            max_jerk=np.array(limits.jerk, np.float64),
+            approach_gain=approach_gain(limits),
+        )
         count = len(limits.velocity)
         self._ruckig = ruckig.Ruckig(count)
         self._input = ruckig.InputParameter(count)
@@ -81,10 +87,10 @@ class Limiter:
         state[0], state[1], state[2] = q, dq, ddq
         if not is_usable(state):
             return _stuck(q)
-        met = _toward(state, velocity, self._within, self._gain, self._limits, self._period, wanted, moved)
+        met = _toward(state, velocity, self._parameters, wanted, moved)
         if met & CHASED:
             self._chase(state, wanted, moved)
-        safe = _make_safe(state, moved, self._within, self._limits, self._period)
+        safe = _make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=met > 0 or not safe)
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
@@ -96,9 +102,10 @@ class Limiter:
         state = np.stack((q, dq, ddq))
         if not is_usable(state):
             return _stuck(q)
-        moved = stop_together(state[1], state[2], self._limits[1], self._limits[2], self._period)
+        limits = self._parameters[0]
+        moved = stop_together(state[1], state[2], limits["max_acceleration"], limits["max_jerk"], self._period)
         moved[0] += q
-        _make_safe(state, moved, self._within, self._limits, self._period)
+        _make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=bool(moved[1].any()))
 
     def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
@@ -115,39 +122,32 @@ class Limiter:
 
 
 @compiled
-def _toward(
-    state: Vector,
-    velocity: Vector,
-    within: Vector,
-    gain: Vector,
-    limits: Vector,
-    dt: float,
-    wanted: Vector,
-    moved: Vector,
-) -> int:
+def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
     """Into `wanted` (J,) the velocity within speed limits, slower near position limits; into
     `moved` (3, J) each joint one tick on at the jerk that reaches it, NaN where a limit forbids.
 
     A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
     profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
     """
-    met, stopping = 0, False
+    given, met, stopping = parameters[0], 0, False
+    dt = given.period_s
     for i in range(len(velocity)):
         stopping = stopping or math.isnan(velocity[i])
     for i in range(len(velocity)):
         q, v, a = state[0, i], state[1, i], state[2, i]
-        max_speed = min(limits[0, i], gain[i] * max(within[1, i] - q, 0.0))
-        slowest = max(-limits[0, i], gain[i] * min(within[0, i] - q, 0.0))
-        wanted[i] = 0.0 if stopping else min(max(velocity[i], slowest), max_speed)
+        top, max_jerk = given.max_velocity[i], given.max_jerk[i]
+        highest = min(top, given.approach_gain[i] * max(given.upper[i] - q, 0.0))
+        lowest = max(-top, given.approach_gain[i] * min(given.lower[i] - q, 0.0))
+        wanted[i] = 0.0 if stopping else min(max(velocity[i], lowest), highest)
         if wanted[i] != velocity[i]:
             met |= BOUNDED
         acceleration = (wanted[i] - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
-        crest = v_then + acceleration * abs(acceleration) / (2.0 * limits[2, i])  # when acceleration has come to 0
+        crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # when acceleration has come to 0
         if (
-            abs(acceleration - a) <= limits[2, i] * dt
-            and abs(acceleration) <= limits[1, i]
-            and max(abs(v_then), abs(crest)) <= limits[0, i]
+            abs(acceleration - a) <= max_jerk * dt
+            and abs(acceleration) <= given.max_acceleration[i]
+            and max(abs(v_then), abs(crest)) <= top
         ):
             moved[0, i] = q + dt * (v + dt * (a / 3.0 + acceleration / 6.0))
             moved[1, i], moved[2, i] = v_then, acceleration
@@ -158,19 +158,20 @@ def _toward(
 
 
 @compiled
-def _make_safe(state: Vector, moved: Vector, within: Vector, limits: Vector, dt: float) -> bool:
+def _make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
     """Rounds the moved joints (3, J); those that could not stop within their position limits after
     it, or that are NaN, go on the fastest stop instead. Whether there were none.
     """
-    safe, stop = True, np.empty(6)
+    given, safe, stop = parameters[0], True, np.empty(6)
+    dt = given.period_s
     for i in range(moved.shape[1]):
-        moved[0, i] = np.rint(moved[0, i] * STEPS) / STEPS
-        fastest_stop(moved[1, i], moved[2, i], limits[1, i], limits[2, i], dt, stop)
-        lowest, highest = min(within[0, i], state[0, i]), max(within[1, i], state[0, i])
+        moved[0, i] = np.rint(moved[0, i] * ROUND_TO) / ROUND_TO
+        fastest_stop(moved[1, i], moved[2, i], given.max_acceleration[i], given.max_jerk[i], dt, stop)
+        lowest, highest = min(given.lower[i], state[0, i]), max(given.upper[i], state[0, i])
         if not (moved[0, i] + stop[3] >= lowest and moved[0, i] + stop[4] <= highest):
             safe = False
-            fastest_stop(state[1, i], state[2, i], limits[1, i], limits[2, i], dt, stop)
-            moved[0, i] = np.rint((state[0, i] + stop[2]) * STEPS) / STEPS
+            fastest_stop(state[1, i], state[2, i], given.max_acceleration[i], given.max_jerk[i], dt, stop)
+            moved[0, i] = np.rint((state[0, i] + stop[2]) * ROUND_TO) / ROUND_TO
             moved[1, i], moved[2, i] = stop[0], stop[1]
     return safe
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.config import Settings
-from service.core.frame import Vector
+from service.core.record import Records, Vector
 from service.core.rotation import rotation
-from service.core.separation.capsules import between_segments, place
+from service.core.separation.capsules import CAPSULE, between_segments, place
 from service.urdf import Joint, Shape, Urdf
 
 LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
@@ -27,15 +27,14 @@ class Body(NamedTuple):
     """Capsules of an arm of J joints, and how they move.
 
     `frames` (J, 3, 4): each joint in the frame of the one before, at 0; `axes` (J, 3) in its own.
-    `links` (N,): how many joints move a capsule; `ends` (N, 2, 3) [m] in the frame of the last of
-    these joints, or in base; `radii` (N,) [m]. `pairs` (P, 2): capsules that are kept apart.
+    `capsules` (N,): `link`, how many joints move it; `ends` (2, 3) [m] in the frame of the last of
+    these joints, or in base; `radius` [m]; `max_speed` [m/s], which no point of its axis passes.
+    `pairs` (P, 2): capsules that are kept apart.
     """
 
     frames: Vector
     axes: Vector
-    links: Vector
-    ends: Vector
-    radii: Vector
+    capsules: Records
     pairs: Any
 
 
@@ -65,27 +64,32 @@ def body_of(settings: Settings, description: str) -> Body:
     if math.hypot(*tool) > LEAST_TOOL:
         found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
     found.sort(key=lambda one: one[0])
-    links = np.array([number for number, _, _ in found])
-    radii = np.array([radius for _, _, radius in found])
-    body = Body(
-        np.ascontiguousarray(frames),
-        np.array([joint.axis for joint in chain]),
-        links,
-        np.array([ends for _, ends, _ in found]),
-        radii,
-        np.empty((0, 2), np.int64),
+    capsules = np.array(
+        [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in found], CAPSULE
     )
+    axes = np.array([joint.axis for joint in chain])
+    body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
     postures = np.array([settings.arm.posture, settings.joints.lower, settings.joints.upper])
-    placed, near = np.empty((len(postures), len(links), 2, 3)), np.empty(9)
+    placed, near = np.empty((len(postures), len(capsules), 2, 3)), np.empty(9)
     for q, ends in zip(postures, placed, strict=True):
-        place(q, body.frames, body.axes, links, body.ends, ends)
+        place(q, body.frames, body.axes, capsules, ends)
     pairs = []
+    links, radii = capsules["link"], capsules["radius"]
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
             if apart[0] > settings.obstacles.clearance and np.ptp(apart) > UNMOVED:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
+
+
+def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> float:
+    """A bound of the speed [m/s] of any point between the ends (2, 3) [m]."""
+    lever, speed = float(np.linalg.norm(ends, axis=1).max()), 0.0
+    for joint in range(link - 1, -1, -1):
+        speed += settings.joints.velocity[joint] * lever
+        lever += float(np.linalg.norm(frames[joint][:, 3]))
+    return speed
 
 
 def _origin(joint: Joint) -> Vector:

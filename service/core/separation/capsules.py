@@ -11,20 +11,23 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.record import Records, Vector
 
 LEAST = 1e-9  # [m] segments nearer than this meet; [m²] shorter ones are points
 HALVINGS = 40
+CAPSULE = np.dtype(
+    [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]
+)
 
 
 @compiled
-def place(q: Vector, frames: Vector, axes: Vector, links: Vector, ends: Vector, out: Vector) -> None:
+def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
     """Into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad]; its capsules are
     ordered by link.
     """
     turn, at = np.eye(3), np.zeros(3)
     own, moved, there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    capsule, count = 0, len(links)
+    capsule, count = 0, len(capsules)
     for link in range(len(q) + 1):
         if link > 0:
             frame = frames[link - 1]
@@ -44,12 +47,12 @@ def place(q: Vector, frames: Vector, axes: Vector, links: Vector, ends: Vector, 
                     turn[i, j] = 0.0
                     for k in range(3):
                         turn[i, j] += moved[i, k] * own[k, j]
-        while capsule < count and links[capsule] == link:
+        while capsule < count and capsules[capsule].link == link:
             for end in range(2):
                 for i in range(3):
                     out[capsule, end, i] = at[i]
                     for k in range(3):
-                        out[capsule, end, i] += turn[i, k] * ends[capsule, end, k]
+                        out[capsule, end, i] += turn[i, k] * capsules[capsule].ends[end, k]
             capsule += 1
 
 

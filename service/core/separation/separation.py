@@ -22,95 +22,104 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.requests import ViaPoint
-from service.core.frame import Record, Records, Vector, as_array
+from service.core.record import Record, Records, Vector, as_array, parameters
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
 
-FARTHEST = 3.0  # [m] no distance is told as greater
-IRRELEVANT = 1.5  # [m/s] nothing on the arm is as fast: pairs that may do this make no row
+FARTHEST = 3.0  # [m] no distance is reported as greater
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
-PEOPLE_ROOM, THINGS_ROOM = 0.01, 0.005  # [m] kept more where motion is planned ...
-PLAN_SHARE = 0.8  # ... and of the braking: its ramps need that
-COMES = 5.0  # [1/s] of the way to a thing's clearance; and back to it where it lacks, as small errors add up ...
-LEAVES = 0.02  # [m/s] ... at most so fast, twice as fast as joints may slip,
-LEVER = 0.1  # [m/s] ... and only by what the joints can move so fast
+PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
+THINGS_ROOM = 0.005  # [m] from things, likewise
+PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
+CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
+RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
+RETREAT_MIN_AUTHORITY = 0.1  # [m/s] only what the joints can move so fast is moved back
 SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
-NEAR_PLACE = 0.02  # [m] beside a place's radius, each axis
+NEAR_VIA_POINT = 0.02  # [m] beside a via-point's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
 CHANGE_S = 0.07  # over which a hand's acceleration fades
 STEADY = 0.1  # [m/s] slower hands tremble, and nothing is foreseen of them; all of it at twice that
 RAMP_S = 0.08  # of a braking, and until a hand's new velocity is known
 UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
+CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
+PEOPLE, THINGS = 0, 1  # of a rule's parameters
 
 
 class Separation:
-    """What the rule says at a tick: `rows` (K, J) of which the first `count` are in force, times
-    joint velocities at most `plan` (K,) [m/s] where motion is planned and `allowed` (K,) at all.
+    """What the rule says at a tick.
 
-    `told` (3,): distance of the nearest hand [m], the least speed that is allowed toward one, and
-    the greatest share of the setpoint's speed at which the tool could go along.
+    `constraints` (K,), of which the first `count` are in force: `row` (J,) times joint velocities
+    is at most `planned` [m/s] where motion is planned, and `allowed` [m/s] at all. `nearest_m` of
+    the hands, the least `speed_limit` [m/s] toward one, and `setpoint_share`, the greatest share of
+    the setpoint's speed at which the tool could go along.
     """
 
     def __init__(self, settings: Settings, urdf: str) -> None:
-        people, things, table = settings.people, settings.obstacles, settings.table
-        self._body = body_of(settings, urdf)
-        moving = np.flatnonzero(self._body.links)
-        self._first = int(moving[0])
+        people, things, table, limits = settings.people, settings.obstacles, settings.table, settings.joints
+        body = body_of(settings, urdf)
+        self.max_speed = float(body.capsules["max_speed"].max())
         centre, half = np.array(table.centre), np.array([*table.half_size, 0.0])
         boxes = [[centre - half - [0.0, 0.0, TABLE_DEPTH], centre + half]]
         boxes += [[np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)] for b in things.boxes]
         self._boxes = np.array(boxes)
+        self._capsules, self._pairs = body.capsules, body.pairs
         direction = np.array(people.toward_elbow)
-        self._hand = np.array([people.radius, *(people.length / np.linalg.norm(direction) * direction)])
-        reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
-        self._people = np.array(
-            [people.brake, reaction_s, people.clearance, people.contact_speed, people.unknown_speed]
+        self._parameters = parameters(
+            brake=np.array([people.brake, things.brake]),
+            reaction_s=np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, things.reaction_ms / 1000]),
+            clearance=np.array([people.clearance, things.clearance]),
+            room=np.array([PEOPLE_ROOM, THINGS_ROOM]),
+            contact_speed=float(people.contact_speed),
+            unknown_speed=float(people.unknown_speed),
+            hand_radius=float(people.radius),
+            forearm=people.length / np.linalg.norm(direction) * direction,
+            frames=body.frames,
+            axes=body.axes,
+            max_velocity=np.array(limits.velocity, np.float64),
+            first=int(np.flatnonzero(body.capsules["link"])[0]),
         )
-        self._things = np.array([things.brake, things.reaction_ms / 1000, things.clearance])
-        count, joints = len(self._body.links), len(settings.joints.names)
-        most = 2 * count * len(AHEAD_S) + 3 * count * len(boxes) + len(self._body.pairs)
-        self._fastest = np.array(settings.joints.velocity)
-        self.rows, self.plan, self.allowed = np.zeros((most, joints)), np.zeros(most), np.zeros(most)
-        self.told, self.count = np.array([FARTHEST, IRRELEVANT, 1.0]), 0
-        self._placed = np.zeros((2, count, 2, 3))
-        self._contacts = np.empty((0, 8))
+        capsules, joints = len(body.capsules), len(limits.names)
+        most = 2 * capsules * len(AHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
+        self._jerk = np.array(limits.jerk)
+        self.constraints = self.constraints_for(joints, most)
+        self._contacts = np.zeros(0, CONTACT)
+        self.count, self.nearest_m, self.speed_limit, self.setpoint_share = 0, FARTHEST, self.max_speed, 1.0
 
-    def expect(self, places: Iterable[ViaPoint]) -> None:
-        """From now on the tool may touch a hand at those of the taught places where it goes with
-        that hand.
-        """
-        found = [[*p.left, *p.right, p.radius, ("left", "right").index(p.follow)] for p in places if p.follow != "none"]
-        self._contacts = np.array(found).reshape(-1, 8)
+    @staticmethod
+    def constraints_for(joints: int, count: int) -> Records:
+        """So many constraints of an arm with so many joints."""
+        return np.zeros(count, [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)])
 
-    def look(self, state: Record, q: Vector, tool: Vector, jacobian: Vector) -> None:
-        """Finds what the rule says at joints q (J,) [rad], where the tool is at `tool` (3,) [m] and
-        has this Jacobian (6, J), for the state's hands.
+    def set_contacts(self, via_points: Iterable[ViaPoint]) -> None:
+        """From now on the tool may touch a hand at those of the via-points where it goes with that
+        hand.
         """
-        self.count = _look(
+        found = [
+            (np.array([p.left, p.right]), p.radius, ("left", "right").index(p.follow))
+            for p in via_points
+            if p.follow != "none"
+        ]
+        self._contacts = np.array(found, CONTACT) if found else np.zeros(0, CONTACT)
+
+    def step(self, state: Record, frame: Record, here: Records) -> None:
+        """Finds what the rule says for the state's hands at the arm's kinematics `here` (1,)."""
+        self.count, self.nearest_m, self.speed_limit, self.setpoint_share = _step(
             as_array(state),
-            q,
-            tool,
-            jacobian,
-            *self._body,
-            self._first,
+            here,
+            self._parameters,
+            self._capsules,
+            self._pairs,
             self._boxes,
-            self._hand,
-            self._people,
-            self._things,
             self._contacts,
-            self._fastest,
-            self._placed,
-            self.rows,
-            self.plan,
-            self.allowed,
-            self.told,
+            self.constraints,
         )
+        frame["hand_distance"], frame["hand_limit"] = self.nearest_m, self.speed_limit
 
-    def excess(self, velocity: Vector, acceleration: Vector, jerk: Vector) -> float:
+    def excess(self, velocity: Vector, acceleration: Vector) -> float:
         """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
-        as their acceleration comes to 0 with this jerk; at most 0 if they do not.
+        as their acceleration comes to 0; at most 0 if they do not.
         """
-        return float(_excess(self.rows, self.allowed, self.count, velocity, acceleration, jerk))
+        return float(_excess(self.constraints, self.count, velocity, acceleration, self._jerk))
 
 
 @compiled
@@ -124,106 +133,128 @@ def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: fl
 
 
 @compiled
-def _look(
+def _step(
     states: Records,
-    q: Vector,
-    tool: Vector,
-    jacobian: Vector,
-    frames: Vector,
-    axes: Vector,
-    links: Vector,
-    ends: Vector,
-    radii: Vector,
+    heres: Records,
+    parameters: Records,
+    capsules: Records,
     pairs: Vector,
-    first: int,
     boxes: Vector,
-    hand: Vector,
-    people: Vector,
-    things: Vector,
-    contacts: Vector,
-    max_speed: Vector,
-    placed: Vector,
-    rows: Vector,
-    plan: Vector,
-    allowed: Vector,
-    told: Vector,
-) -> int:
-    """`Separation.look`: rows that were found."""
-    state, near, forearm, count = states[0], np.empty(9), np.empty((2, 3)), 0
-    later, velocity, here, there = np.empty(len(q)), np.empty(3), placed[0], placed[1]
-    place(q, frames, axes, links, ends, here)
-    told[0], told[1], told[2] = FARTHEST, IRRELEVANT, 1.0
+    contacts: Records,
+    constraints: Records,
+) -> tuple[int, float, float, float]:
+    """`Separation.step`: how many constraints; nearest, speed limit and setpoint's share."""
+    state, here, given = states[0], heres[0], parameters[0]
+    joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
+    later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
+    now, then = placed[0], placed[1]
+    place(here.joints, given.frames, given.axes, capsules, now)
+    nearest_m, setpoint_share = FARTHEST, 1.0
+    speed_limit = capsules[0].max_speed
+    for capsule in range(len(capsules)):
+        speed_limit = max(speed_limit, capsules[capsule].max_speed)
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
         variance = 0.0
-        for mode in range(state.modes.shape[1]):
-            variance += state.modes[side, mode] * state.covariances[side, mode, 1, 1]
+        for mode in range(state.mode_probabilities.shape[1]):
+            variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
         known, receives = variance <= UNSURE * UNSURE, _receives(contacts, state.hands, side)
         moment = _swiftness(state.hands[side, 1]) if known else 0.0
         for k in range(len(AHEAD_S) if moment > 0.0 else 1):
             ahead = moment * AHEAD_S[k]
-            parts = here if k == 0 else there
+            parts = now if k == 0 else then
             if k > 0:
-                for j in range(len(q)):
-                    later[j] = q[j] + ahead * state.joints[1, j]
-                place(later, frames, axes, links, ends, there)
+                for j in range(joints):
+                    later[j] = here.joints[j] + ahead * state.joints[1, j]
+                place(later, given.frames, given.axes, capsules, then)
             faster = CHANGE_S * (1.0 - math.exp(-ahead / CHANGE_S))
             for i in range(3):
                 v, a = state.hands[side, 1, i], state.hands[side, 2, i]
                 velocity[i] = v + faster * a
                 moved = ahead * v + CHANGE_S * (ahead - faster) * a
                 forearm[0, i] = state.hands[side, 0, i] + moved
-                forearm[1, i] = forearm[0, i] + hand[1 + i]
-            braked = people[0] * max(ahead - RAMP_S, 0.0)
-            for capsule in range(first, len(links)):
-                distance = between_segments(parts[capsule], forearm, near) - radii[capsule] - hand[0]
+                forearm[1, i] = forearm[0, i] + given.forearm[i]
+            braked = given.brake[PEOPLE] * max(ahead - RAMP_S, 0.0)
+            for capsule in range(given.first, len(capsules)):
+                part, constraint = capsules[capsule], constraints[count]
+                distance = between_segments(parts[capsule], forearm, near) - part.radius - given.hand_radius
                 coming = 0.0
                 for i in range(3):
                     coming -= near[6 + i] * velocity[i]
-                coming = max(coming, 0.0) if known else people[4]
-                least = people[3] if receives and links[capsule] == len(q) else 0.0
+                coming = max(coming, 0.0) if known else given.unknown_speed
+                least = given.contact_speed if receives and part.link == joints else 0.0
                 if k == 0:
-                    most = max(least, allowed_speed(distance, coming, people[0], people[1], people[2]))
-                    told[0], told[1] = min(told[0], distance), min(told[1], most)
-                if _add(near, distance, coming, least, braked, people, PEOPLE_ROOM, plan, allowed, count):
+                    most = max(least, _allowed(parameters, PEOPLE, distance, coming))
+                    nearest_m, speed_limit = min(nearest_m, distance), min(speed_limit, most)
+                planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+                if planned < part.max_speed:
+                    constraint.planned = planned
+                    constraint.allowed = max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + SLIP
                     if k > 0:
-                        _carry_back(near, there[capsule], here[capsule])
-                    _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
-                    if links[capsule] == len(q):
-                        told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                    count += _may_pass(rows[count], plan[count], max_speed)
-    for capsule in range(first, len(links)):
+                        _carry_back(near, then[capsule], now[capsule])
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
+    for capsule in range(given.first, len(capsules)):
+        part = capsules[capsule]
         for box in range(len(boxes)):
-            inner = nearest_to_box(here[capsule], boxes[box])
+            inner = nearest_to_box(now[capsule], boxes[box])
             for where in range(3):  # the ends too: a capsule that lies along a face may tip
                 share = inner if where == 0 else where - 1.0
-                distance = to_box(here[capsule], share, boxes[box], near) - radii[capsule]
+                distance = to_box(now[capsule], share, boxes[box], near) - part.radius
+                planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
                 twice = where > 0 and share == inner
-                if not twice and _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
-                    plan[count] = min(plan[count], max(COMES * (distance - things[2]), -LEAVES))
-                    _bring_together(rows[count], near, 0, tool, jacobian, links[capsule], 1.0)
-                    if plan[count] < 0.0 and not _may_pass(rows[count], LEVER, max_speed):
-                        plan[count] = 0.0
-                    if links[capsule] == len(q):
-                        told[2] = min(told[2], _share(near, plan[count], state.setpoint[1]))
-                    count += _may_pass(rows[count], plan[count], max_speed)
+                if not twice and planned < part.max_speed:
+                    constraint = constraints[count]
+                    constraint.allowed = _allowed(parameters, THINGS, distance, 0.0) + SLIP
+                    back = max(CLEARANCE_GAIN * (distance - given.clearance[THINGS]), -RETREAT_SPEED)
+                    planned = min(planned, back)
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    if planned < 0.0 and not _may_pass(constraints, count, RETREAT_MIN_AUTHORITY, given.max_velocity):
+                        planned = 0.0
+                    constraint.planned = planned
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
     for pair in range(len(pairs)):
-        one, other = pairs[pair, 0], pairs[pair, 1]
-        distance = between_segments(here[one], here[other], near) - radii[one] - radii[other]
-        if _add(near, distance, 0.0, 0.0, 0.0, things, THINGS_ROOM, plan, allowed, count):
-            _bring_together(rows[count], near, 0, tool, jacobian, links[one], 1.0)
-            _bring_together(rows[count], near, 3, tool, jacobian, links[other], -1.0)
-            count += _may_pass(rows[count], plan[count], max_speed)
-    return count
+        one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
+        distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
+        planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
+        if planned < one.max_speed + other.max_speed:
+            constraint = constraints[count]
+            constraint.planned, constraint.allowed = planned, _allowed(parameters, THINGS, distance, 0.0) + SLIP
+            _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
+            _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
+            count += _may_pass(constraints, count, planned, given.max_velocity)
+    return count, nearest_m, speed_limit, setpoint_share
 
 
 @compiled
-def _may_pass(row: Vector, limit: float, max_speed: Vector) -> int:
-    """1 if joints within their greatest speeds can pass a limit along a row (J,), else 0."""
+def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
+    """Speed [m/s] that a rule allows."""
+    given = parameters[0]
+    return allowed_speed(distance, coming, given.brake[rule], given.reaction_s[rule], given.clearance[rule])
+
+
+@compiled
+def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
+    """Speed [m/s] that is planned with: less than the rule allows, but at least `least`, and what
+    is `braked` until then.
+    """
+    given = parameters[0]
+    brake, clearance = PLAN_SHARE * given.brake[rule], given.clearance[rule] + given.room[rule]
+    planned = allowed_speed(distance, coming, brake, given.reaction_s[rule], clearance)
+    return max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
+
+
+@compiled
+def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) -> int:
+    """1 if joints within their greatest velocities can pass a limit along a constraint, else 0."""
     most = 0.0
-    for j in range(len(row)):
-        most += abs(row[j]) * max_speed[j]
+    for j in range(len(max_velocity)):
+        most += abs(constraints[k].row[j]) * max_velocity[j]
     return 1 if most > limit else 0
 
 
@@ -243,42 +274,17 @@ def _share(near: Vector, limit: float, velocity: Vector) -> float:
 
 
 @compiled
-def _receives(contacts: Vector, hands: Vector, side: int) -> bool:
-    """Whether the hands are at a taught place where the tool goes with this one."""
-    for at in range(len(contacts)):
-        if contacts[at, 7] == side:
+def _receives(contacts: Records, hands: Vector, side: int) -> bool:
+    """Whether the hands are at a via-point where the tool goes with this one."""
+    for contact in contacts:
+        if contact.side == side:
             far = 0.0
             for hand in range(2):
                 for i in range(3):
-                    far = max(far, abs(hands[hand, 0, i] - contacts[at, 3 * hand + i]))
-            if far <= contacts[at, 6] + NEAR_PLACE:
+                    far = max(far, abs(hands[hand, 0, i] - contact.hands[hand, i]))
+            if far <= contact.radius + NEAR_VIA_POINT:
                 return True
     return False
-
-
-@compiled
-def _add(
-    near: Vector,
-    distance: float,
-    coming: float,
-    least: float,
-    braked: float,
-    rule: Vector,
-    room: float,
-    plan: Vector,
-    allowed: Vector,
-    count: int,
-) -> bool:
-    """Writes the limits of a pair behind `count` others: what the rule says, but at least `least`,
-    and what is `braked` until then; not if nothing can be so fast, and then false.
-    """
-    planned = allowed_speed(distance, coming, PLAN_SHARE * rule[0], rule[1], rule[2] + room)
-    planned = max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
-    if planned >= IRRELEVANT:
-        return False
-    plan[count] = planned
-    allowed[count] = max(least, allowed_speed(distance, coming, rule[0], rule[1], rule[2])) + braked + SLIP
-    return True
 
 
 @compiled
@@ -297,10 +303,13 @@ def _carry_back(near: Vector, then: Vector, now: Vector) -> None:
 
 
 @compiled
-def _bring_together(row: Vector, near: Vector, at: int, tool: Vector, jacobian: Vector, link: int, sign: float) -> None:
-    """Adds to row (J,) the speed along the normal, times the sign, of the point near[at:at + 3] of
-    a link that the first joints move.
+def _bring_together(
+    constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
+) -> None:
+    """Adds to a constraint's row the speed along the normal, times the sign, of the point
+    near[at:at + 3] of a link that the first joints move.
     """
+    row, tool, jacobian = constraints[k].row, heres[0].position, heres[0].jacobian
     if sign > 0.0:
         row[:] = 0.0
     x, y, z = near[at] - tool[0], near[at + 1] - tool[1], near[at + 2] - tool[2]
@@ -314,13 +323,14 @@ def _bring_together(row: Vector, near: Vector, at: int, tool: Vector, jacobian: 
 
 
 @compiled
-def _excess(rows: Vector, allowed: Vector, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> float:
+def _excess(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> float:
     """`Separation.excess`."""
-    most = -IRRELEVANT
+    most = -math.inf
     for k in range(count):
+        constraint = constraints[k]
         now = crest = 0.0
         for j in range(len(dq)):
-            now += rows[k, j] * dq[j]
-            crest += rows[k, j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
-        most = max(most, max(now, crest) - allowed[k])
+            now += constraint.row[j] * dq[j]
+            crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
+        most = max(most, max(now, crest) - constraint.allowed)
     return most

@@ -9,12 +9,15 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.record import Records, Vector
+from service.core.setpoint import HULL_SPANS
 from service.core.stops import fastest_stop
 
-HULL_TIME_S, HULL_SPANS, HULL_MARGIN = 0.35, 7, 0.03  # [m]; of the spans one is always being filled
+HULL_TIME_S = 0.35  # the setpoint stays near the targets of so long
+HULL_MARGIN = 0.03  # [m] around these
 RETURN_SHARE = 1 / 16  # of the speed it may have with which a setpoint comes back at least, each axis
-ON_BOUND, ROUNDING = 1e-9, 1e-12  # [m] beyond a bound, or away from it, that are rounding
+ON_BOUND = 1e-9  # [m] beyond a bound that are rounding
+ROUNDING = 1e-12  # [m] away from a bound that are rounding
 BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
 
 
@@ -47,11 +50,10 @@ def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector)
 
 
 @compiled
-def what_is_wrong(
-    setpoint: Vector, before: Vector, hull: Vector, box: Vector, lowest: Vector, limits: Vector, dt: float
-) -> int:
-    """Which of BOUNDS a step from `before` (3, 3) is."""
-    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
+    """Which of BOUNDS a step from `before` (3, 3) breaks."""
+    given = parameters[0]
+    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
     if not np.isfinite(setpoint).all():
         return 1
     speed = hardest_now = hardest_before = change = 0.0
@@ -63,10 +65,10 @@ def what_is_wrong(
         return 2
     if hardest_now > max(max_acceleration, hardest_before) + 1e-9:
         return 3
-    if change > (max_jerk + 1e-6) * dt:
+    if change > (max_jerk + 1e-6) * given.period_s:
         return 4
     low, high = np.empty(3), np.empty(3)
-    bounds(hull, box, lowest, low, high)
+    bounds(hull, box, given.lowest, low, high)
     farthest = 0.5 * max_speed * max_speed / max_acceleration + max_speed  # of a stop from outside, generously
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
@@ -78,25 +80,19 @@ def what_is_wrong(
 
 @compiled
 def take_safe(
-    setpoint: Vector,
-    ahead: Vector,
-    limits: Vector,
-    costs: Vector,
-    slow: float,
-    low: Vector,
-    high: Vector,
-    dt: float,
+    setpoint: Vector, ahead: Vector, parameters: Records, costs: Vector, slow: float, low: Vector, high: Vector
 ) -> bool:
     """Moves a setpoint (3, 3) to `ahead` if it keeps every bound after that; else one period on its
     fastest stop, and false. An axis that would not come back does so.
     """
-    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+    given = parameters[0]
+    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
     back = RETURN_SHARE * max_speed
     dearest = 0.0
     for i in range(3):
         for joint in range(costs.shape[2]):
             dearest = max(dearest, abs(costs[0, i, joint]))
-    due = back * slow / max(1.0, dearest * max_speed) * dt
+    due = back * slow / max(1.0, dearest * max_speed) * given.period_s
     stays = True
     for i in range(3):
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
@@ -107,32 +103,25 @@ def take_safe(
                 continue
             here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
             if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + ROUNDING:
-                _fall_back(setpoint, ahead, i, low[i], high[i], max_acceleration, max_jerk, back, dt)
+                _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
     if stays and speed_to_come(ahead[1], ahead[2], max_jerk, back) <= max_speed:
         setpoint[:] = ahead
         return True
     if speed_to_come(setpoint[1], setpoint[2], max_jerk, back) > max_speed:
         back = 0.0  # it began too fast: no axis moves on before that is over
     for i in range(3):
-        _fall_back(setpoint, setpoint, i, low[i], high[i], max_acceleration, max_jerk, back, dt)
+        _fall_back(setpoint, setpoint, parameters, i, low[i], high[i], back)
     return False
 
 
 @compiled
 def _fall_back(
-    setpoint: Vector,
-    out: Vector,
-    axis: int,
-    low: float,
-    high: float,
-    max_acceleration: float,
-    max_jerk: float,
-    back: float,
-    dt: float,
+    setpoint: Vector, out: Vector, parameters: Records, axis: int, low: float, high: float, back: float
 ) -> None:
     """Into out (3, 3) one axis a period on along its fastest stop; or, where that ends beyond a
     bound, along the fastest change to `back` [m/s] inwards.
     """
+    max_acceleration, max_jerk, dt = parameters[0].max_acceleration, parameters[0].max_jerk, parameters[0].period_s
     over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND
     under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND - low
     if over and under:  # it crosses the box

@@ -10,7 +10,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.core.frame import Record, Vector
+from service.core.record import Record, Vector
 from service.core.rotation import axis_of, quaternion_of, swing, turn_between, turn_on
 
 GAIN = 12.0  # [1/s] of a small error's decay

@@ -23,27 +23,26 @@ from scipy.linalg import solve_continuous_are
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.core.frame import Record, Vector
-from service.core.setpoint.bounds import (
-    BOUNDS,
-    HULL_SPANS,
-    HULL_TIME_S,
-    bounds,
-    remember,
-    take_safe,
-    what_is_wrong,
-)
-from service.core.setpoint.workspace import Target
+from service.core.record import Record, Records, Vector, as_array, parameters
+from service.core.setpoint import HULL_SPANS
+from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, bounds, remember, take_safe, what_is_wrong
+from service.core.skill.workspace import Target
 
-REVERT_A, REVERT_V = 5.0, 150.0  # [1/s], [1/s²] with which the tracker expects the target's motion to end
+REVERT_A = 5.0  # [1/s] with which the tracker expects a target's acceleration to end
+REVERT_V = 150.0  # [1/s²] with which it expects a target's velocity to end
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
-STOP_TIME = 0.009  # [s] times the target's speed more, for no hand stops at once ...
-STOP_BRAKE = 16.0  # [m/s²] ... nor brakes harder than this
+STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
+STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
-SHARE, SPEED_SHARE = 0.91, 0.97  # of acceleration and jerk, and of speed, that is planned with
+SHARE = 0.91  # of acceleration and jerk that is planned with
+SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
-PLANNED, STOPPED, WRONG = 1, 2, 3  # what a step says: a bound was met in planning; the stop was begun; one was passed
+GAP_FREE = 0.003  # [m] a tool so far behind its setpoint slows it ...
+GAP_SLOW = 0.012  # [m] ... more so by every so far
+PLANNED = 1  # a step met a bound in planning
+STOPPED = 2  # the stop was begun
+WRONG = 3  # a bound was passed
 DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
 
 
@@ -54,11 +53,15 @@ class SetpointGenerator:
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
-        self._period_s = settings.period_s
-        self._gains = tracker_gains(tool.jerk_weight)
-        self._limits = np.array([tool.max_speed, tool.max_acceleration, tool.max_jerk])
-        self._least = np.array([reach.min_x, -np.inf, reach.min_z])
-        self._span_ticks = max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s))
+        self._parameters = parameters(
+            period_s=settings.period_s,
+            gains=tracker_gains(tool.jerk_weight),
+            max_speed=float(tool.max_speed),
+            max_acceleration=float(tool.max_acceleration),
+            max_jerk=float(tool.max_jerk),
+            lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
+            span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),
+        )
 
     def begin(self, state: Record, setpoint: Vector) -> None:
         """Puts the setpoint where the tool is, before there are targets."""
@@ -74,33 +77,21 @@ class SetpointGenerator:
         velocity, acceleration and jerk cost of each joint's limit, 1 for all of it. slow: share of
         the speed that is allowed, as the arm is behind.
         """
-        ticks, said = _lead(
-            state["setpoint"],
-            state["hull"],
-            int(state["hull_ticks"]),
-            self._span_ticks,
-            target.position,
-            target.velocity,
-            target.acceleration,
-            box,
-            self._least,
-            self._gains,
-            self._limits,
-            costs,
-            slow,
-            self._period_s,
-        )
-        state["hull_ticks"] = ticks
-        return int(said)
+        motion = target.position, target.velocity, target.acceleration
+        return int(_lead(as_array(state), *motion, self._parameters, box, costs, slow))
+
+    def slow_down(self, state: Record, here: Records, share: float) -> float:
+        """Share of the greatest speed for a setpoint that is ahead of the tool, and that may keep
+        only a share of its own speed.
+        """
+        return float(slow_down(state["setpoint"], here["position"][0], share, float(self._parameters["max_speed"][0])))
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
         """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
 
         They hold by the way a step is made; this looks again, from outside.
         """
-        return BOUNDS[
-            what_is_wrong(state["setpoint"], before, state["hull"], box, self._least, self._limits, self._period_s)
-        ]
+        return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
 
 
 def tracker_gains(jerk_weight: float) -> Vector:
@@ -120,74 +111,62 @@ def tracker_gains(jerk_weight: float) -> Vector:
 
 
 @compiled
-def _lead(
-    setpoint: Vector,
-    hull: Vector,
-    ticks: int,
-    span_ticks: int,
-    position: Vector,
-    velocity: Vector,
-    acceleration: Vector,
-    box: Vector,
-    lowest: Vector,
-    gains: Vector,
-    limits: Vector,
-    costs: Vector,
-    slow: float,
-    dt: float,
-) -> tuple[int, int]:
-    """One step, in place; ticks in the newest span, and what the step says."""
-    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
-    target[0], target[1], target[2] = position, velocity, acceleration
-    ticks = remember(hull, ticks, position, span_ticks)
-    bounds(hull, box, lowest, low, high)
-    met = _step(setpoint, target, gains, limits, costs, slow, low, high, dt)
-    if what_is_wrong(setpoint, before, hull, box, lowest, limits, dt):
-        setpoint[:] = before
-        return ticks, WRONG
-    return ticks, met
+def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) -> float:
+    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
+    where it comes back; and for one that may keep only a share of its own speed.
+    """
+    along = gap = 0.0
+    for i in range(3):
+        ahead = setpoint[0, i] - tool[i]
+        along += ahead * setpoint[1, i]
+        gap += ahead * ahead
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
+    if share < 1.0:
+        speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
+        slow = min(slow, share * speed / max_speed)
+    return slow
 
 
 @compiled
-def _step(
-    setpoint: Vector,
-    target: Vector,
-    gains: Vector,
-    limits: Vector,
+def _lead(
+    states: Records,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    parameters: Records,
+    box: Vector,
     costs: Vector,
     slow: float,
-    low: Vector,
-    high: Vector,
-    dt: float,
 ) -> int:
-    """The setpoint (3, 3) one period on, in place."""
-    jerk, ahead = np.empty(3), np.empty((3, 3))
-    met = _track(setpoint, target, gains, limits, costs, slow, dt, jerk)
+    """`SetpointGenerator.step`."""
+    state, given, setpoint = states[0], parameters[0], states[0].setpoint
+    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
+    target[0], target[1], target[2] = position, velocity, acceleration
+    state.hull_ticks = remember(state.hull, state.hull_ticks, position, given.span_ticks)
+    bounds(state.hull, box, given.lowest, low, high)
+    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
+    met = _track(setpoint, target, parameters, costs, slow, jerk)
     for i in range(3):
         x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
-    if take_safe(setpoint, ahead, limits, costs, slow, low, high, dt):
-        return met
-    return STOPPED
+    if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
+        met = STOPPED
+    if what_is_wrong(setpoint, before, state.hull, box, parameters):
+        setpoint[:] = before
+        return WRONG
+    return met
 
 
 @compiled
-def _track(
-    setpoint: Vector,
-    target: Vector,
-    gains: Vector,
-    limits: Vector,
-    costs: Vector,
-    slow: float,
-    dt: float,
-    jerk: Vector,
-) -> int:
+def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, jerk: Vector) -> int:
     """The tracker's jerk (3,), less of it along the motion where the stop or the speed asks for
     that.
     """
-    max_speed, max_acceleration, max_jerk = limits[0], limits[1], limits[2]
+    given = parameters[0]
+    gains, dt = given.gains, given.period_s
+    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
     speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
     target_speed = math.sqrt(target[1, 0] ** 2 + target[1, 1] ** 2 + target[1, 2] ** 2)
     feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
@@ -196,7 +175,7 @@ def _track(
         if feasible == 1.0:  # what a target does beyond the speed limit is not followed
             jerk[i] += gains[2] * target[2, i]
         jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
-    _limit_jerk(jerk, setpoint[2], max_acceleration, max_jerk, costs, dt)
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
     if speed <= LEAST_SPEED:
         return 0
     along = np.empty(3)
@@ -233,7 +212,7 @@ def _track(
         return 0
     for i in range(3):
         jerk[i] += (chosen - u) * along[i]
-    _limit_jerk(jerk, setpoint[2], max_acceleration, max_jerk, costs, dt)
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
     return PLANNED
 
 
@@ -260,14 +239,12 @@ def _largest(costs: Vector, motion: Vector) -> float:
 
 
 @compiled
-def _limit_jerk(
-    jerk: Vector, acceleration: Vector, max_acceleration: float, max_jerk: float, costs: Vector, dt: float
-) -> None:
+def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
     """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of axes and
     joints.
     """
-    ahead = np.empty(3)
-    excess = 0.0
+    given, ahead, excess = parameters[0], np.empty(3), 0.0
+    max_acceleration, max_jerk, dt = given.max_acceleration, given.max_jerk, given.period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
         excess = max(excess, abs(ahead[i]) / max_acceleration)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.contract.requests import ViaPoint
-from service.core.frame import Vector
+from service.core.record import Vector
 
 MOST_CORNERS = 3  # places that a hand may go between
 NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a place

@@ -12,7 +12,7 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.record import Vector
 from service.core.rotation import turn_on
 
 TURN_STEPS, COVARIANCE_STEPS, CLOSURE_STEPS = 1e6, 1e10, 1e6  # [1/rad], [1/rad²] to which predictions are rounded

@@ -16,8 +16,8 @@ from kmp import KMP
 from kmp.compiled import compiled
 from kmp.query import MotionPrediction
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.frame import Vector
-from service.core.intake.stillness import RESTING
+from service.core.intake.stillness import STILL
+from service.core.record import Vector
 from service.core.skill.places import Places, Task
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.task_parameterized import Moving, Placed
@@ -82,7 +82,7 @@ class Skill:
         hands: Vector,
         velocities: Vector,
         accelerations: Vector,
-        rest: Vector = RESTING,
+        rest: Vector = STILL,
         *,
         before: Known | None = None,
     ) -> Prediction:

@@ -17,8 +17,8 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.core.frame import Vector
-from service.core.intake.stillness import RESTING
+from service.core.intake.stillness import STILL
+from service.core.record import Vector
 from service.core.skill.places import Indices, Layout, Task
 from service.core.skill.via_points import NEAR as NEAR_TAUGHT
 
@@ -165,7 +165,7 @@ class Placed:
 
 
 def _resting(hands: Vector, rest: Vector | None) -> Vector:
-    return np.tile(RESTING, (len(hands), 1)) if rest is None else rest
+    return np.tile(STILL, (len(hands), 1)) if rest is None else rest
 
 
 def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vector:
@@ -179,7 +179,7 @@ def with_hands(hands: Vector, shares: Vector, task: Task, layout: Layout) -> Vec
 
 
 @compiled
-def _nearest(point: Vector, corners: Vector, count: int, out: Vector) -> float:
+def barycentric_weights(point: Vector, corners: Vector, count: int, out: Vector) -> float:
     """Barycentric coordinates (3,), at least 0 and 1 in sum, of the point between `count` corners
     that is nearest to a point; its distance.
     """
@@ -217,7 +217,7 @@ def _inputs(hands: Vector, rest: Vector, corners: Vector, inputs: Indices, out: 
         while count < 3 and inputs[side, count] >= 0:
             count += 1
         first = 3 * side
-        off[side] = _nearest(hands[first : first + 3], corners[side], count, share)
+        off[side] = barycentric_weights(hands[first : first + 3], corners[side], count, share)
         nearest = math.inf
         for i in range(count):
             nearest = min(nearest, ((hands[first : first + 3] - corners[side, i]) ** 2).sum())

@@ -5,9 +5,11 @@ outside in every step.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from service.config import Settings, ToolSettings
-from service.core.frame import Record, Vector
+from service.core.controller import Controller
+from service.core.record import Record, Vector
 from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_SPANS,
@@ -17,7 +19,8 @@ from service.core.setpoint.bounds import (
     speed_to_come,
 )
 from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.setpoint.workspace import Target
+from service.core.skill.skill import Skill
+from service.core.skill.workspace import Target
 
 
 def margin(tool: ToolSettings) -> float:
@@ -66,3 +69,10 @@ class Explained(SetpointGenerator):
         assert left.min() >= -1e-6, (left, said)
         self.closest = min(self.closest, left.min())
         return said
+
+
+def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:
+    """A controller whose setpoint generator asserts its bound."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.core.controller.SetpointGenerator", Explained)
+        return Controller(settings, skill, urdf=urdf)

@@ -13,7 +13,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Reach
-from service.core.frame import Vector
+from service.core.record import Vector
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
 

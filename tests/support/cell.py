@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
-from tests_paths import ROOT
 
 from service.client import Client, open_session
 from service.contract import cdr, messages
 from service.launch import Launched, launched
+from support.paths import ROOT
 
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from wam import URDF
 
 from service.config import Settings
 from service.contract.records import Mode, Reason
 from service.core.arm.arm import Arm
-from service.core.frame import Vector
+from service.core.record import Vector
+from support.wam import URDF
 
 SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s

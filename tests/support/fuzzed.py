@@ -10,21 +10,21 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
-from bounds import bounds_hold
-from explained import Explained
-from hostile_bytes import mutated
-from in_process import LEFT, RIGHT
-from wam import JOINT_NAMES
 
 from service.config import robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.controller import Controller
-from service.core.frame import Frame, Vector
+from service.core.frame import Frame
+from service.core.record import Vector
 from service.learning.skill_file import decoded
 from service.recording.recording import Recording
 from service.recording.replay import replay, ticks
+from support.bounds import bounds_hold
+from support.explained import explained_controller
+from support.hostile_bytes import mutated
+from support.in_process import LEFT, RIGHT
+from support.wam import JOINT_NAMES
 
 QUIET_S = 1.0  # of every two, in which nothing is spoilt
 ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")
@@ -70,8 +70,7 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
     assert result.exact, result.text()
     recording = Recording.open(path)
     skill = decoded(recording.skill, origin=str(path), recorded=True)
-    controller = Controller(recording.settings, skill, urdf=robot_description(recording.settings))
-    controller._setpoint = Explained(recording.settings)
+    controller = explained_controller(recording.settings, skill, urdf=robot_description(recording.settings))
     frames: list[Frame] = []
     measured: list[Vector] = []
     for tick in ticks(recording):

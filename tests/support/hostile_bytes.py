@@ -1,7 +1,7 @@
 """Whatever bytes come: each decoder answers them with a value or a refusal in words, never with
 anything else.
 
-`python tests/hostile_bytes.py DECODER [RUNS]` searches with atheris, guided by coverage,
+`python tests/support/hostile_bytes.py DECODER [RUNS]` searches with atheris, guided by coverage,
 in an environment that has it; `test_hostile_bytes` mutates the same seeds.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 if __name__ == "__main__":
     import atheris
 
-    sys.path.insert(0, str(Path(__file__).parents[1]))
+    sys.path.insert(0, str(Path(__file__).parents[2]))
     with atheris.instrument_imports(include=["service.contract"]):
         import service.contract.cdr
         import service.contract.requests  # noqa: F401

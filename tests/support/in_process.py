@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
-from wam import JOINT_NAMES
 
 from service.config import Settings
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick
 from sim.closed_loop import hand_event, joints_event
 from sim.script import HandScript
+from support.wam import JOINT_NAMES
 
 ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]

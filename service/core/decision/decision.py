@@ -1,0 +1,183 @@
+"""The mode of a tick and the reason for it: whether the arm is ready and does what it is told,
+whether hands are known and where the skill is sure.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.config import Settings
+from service.contract.records import Mode, Reason
+from service.core.frame import Event
+from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
+from service.core.record import Record, Records, Vector, as_array, parameters
+
+READY = 1  # an arm within its limits
+RETURNING = 2  # an arm on its way into them
+RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
+TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
+GATE_EASE = 0.9  # of the threshold: what has been found far must come clearly nearer again
+
+# Plain numbers, as compiled functions and their callers need them.
+HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
+NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
+FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
+OPERATOR, NOT_READY = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY)
+ARM_ERROR, ARM_SILENT, TOOL_SPEED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT), int(Reason.TOOL_SPEED)
+STARTS_ASSUMED = 1  # what a step says: the arm is taken to be at the configured posture
+STARTS_MEASURED = 2  # the arm appeared, where it is measured
+
+
+class Decision:
+    """Mode and reason, in the state. `measured`: how far the arm is off its command [rad], and the
+    tool's speed [m/s], measured; at a fault what it was found by.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        limits = settings.joints
+        self._lower, self._upper = np.array(limits.lower, np.float64), np.array(limits.upper, np.float64)
+        self._parameters = parameters(
+            lower=self._lower,
+            upper=self._upper,
+            period_s=settings.period_s,
+            is_assumed=int(settings.arm.source == "assumed"),
+            max_error_rad=float(settings.arm.fault_error_rad),
+            fault_speed=float(settings.tool.fault_speed),
+        )
+        self.measured = (0.0, 0.0)
+
+    def step(self, state: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
+        """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
+        STARTS_MEASURED.
+
+        known: the flags that `Intake.step` gave. gate_m: what the skill compares with its
+        threshold, NaN where it predicts nothing.
+        """
+        starts, error, speed = _step(as_array(state), here, self._parameters, known, gate_m, threshold)
+        if error >= 0.0:
+            self.measured = error, speed
+        return int(starts)
+
+    def inwards(self, state: Record) -> Vector | None:
+        """Velocities (J,) [rad/s] of an arm on its way into its limits, None of any other."""
+        if state["arm_ready"] != RETURNING or state["reason"] != NOT_READY or state["operator_hold"]:
+            return None
+        q = state["joints"][0]
+        way: Vector = RETURN_RADPS * ((q < self._lower).astype(np.float64) - (q > self._upper))
+        return way
+
+    def take(self, state: Record, event: Event) -> None:
+        """A hold, resume, reset or fault that somebody asks for. Raises ValueError for others."""
+        match event.kind:
+            case "hold" | "resume":
+                state["operator_hold"] = event.kind == "hold"
+            case "reset":
+                if state["mode"] == FAULT:
+                    state["mode"], state["arm_ready"] = HOLD, 0
+            case "fault":
+                if state["mode"] != FAULT:
+                    self.fail(state, Reason.SERVICE)
+            case _:
+                raise ValueError(f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}")
+
+    def fail(self, state: Record, reason: Reason, *, speed: float | None = None) -> None:
+        """At fault from now on, for a `speed` [m/s] of the tool where that is why."""
+        state["mode"], state["reason"] = FAULT, reason
+        if speed is not None:
+            self.measured = self.measured[0], speed
+
+
+@compiled
+def _step(
+    states: Records, heres: Records, parameters: Records, known: int, gate_m: float, threshold: float
+) -> tuple[int, float, float]:
+    """`Decision.step`, and what was measured; -1: nothing."""
+    state = states[0]
+    if state.mode == FAULT:
+        return 0, -1.0, -1.0
+    starts, fault, error, speed = _arm(states, heres, parameters, known)
+    if fault != NONE:
+        state.mode, state.reason = FAULT, fault
+        return starts, error, speed
+    if known & CONTESTED:
+        reason = TWO_SOURCES
+    elif state.arm_ready != READY:
+        reason = NOT_READY
+    elif state.operator_hold:
+        reason = OPERATOR
+    elif math.isnan(gate_m):
+        reason = NO_HANDS if min(state.hand_ticks[0], state.hand_ticks[1]) < 0 else STALE_HAND
+    else:
+        ease = GATE_EASE if state.reason == FAR else 1.0
+        reason = FAR if gate_m > ease * threshold else NONE
+    state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+    return starts, error, speed
+
+
+@compiled
+def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
+    """Whether the arm starts, what is wrong with it, its error and speed as measured."""
+    state, given, heard = states[0], parameters[0], known & ARM_HEARD
+    if given.is_assumed:
+        starts = 0 if state.arm_ready else STARTS_ASSUMED
+        state.arm_ready = READY
+        return starts, NONE, -1.0, -1.0
+    moving = False
+    for joint in range(state.joints.shape[1]):
+        moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    if not state.arm_ready:
+        # what still moves comes to rest first; what was reported must have been one posture
+        if not known & ARM_STILL or moving:
+            return 0, NONE, -1.0, -1.0
+        state.arm_ready = RETURNING if _is_outside(state.measured, parameters) else READY
+        state.slow_tick = state.tick
+        return STARTS_MEASURED, NONE, -1.0, -1.0
+    if not heard:
+        if state.mode == FOLLOW or moving:
+            return 0, ARM_SILENT, -1.0, -1.0
+        state.arm_ready = 0
+        return 0, NONE, -1.0, -1.0
+    if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
+        state.arm_ready = READY
+    error, speed = measured_error(states, heres)
+    if error > given.max_error_rad:
+        return 0, ARM_ERROR, error, speed
+    if speed <= given.fault_speed:
+        state.slow_tick = state.tick
+    fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
+    return 0, fault, error, speed
+
+
+@compiled
+def _is_outside(joints: Vector, parameters: Records) -> bool:
+    """Whether a joint (J,) [rad] is outside its limits."""
+    outside = False
+    for j in range(len(joints)):
+        outside = outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
+    return outside
+
+
+@compiled
+def measured_error(states: Records, heres: Records) -> tuple[float, float]:
+    """How far the joints are from where they are measured, the farthest [rad]; how fast the tool is
+    measured [m/s], by the tasks at the commanded joints, no farther than that error from there.
+    """
+    state, here = states[0], heres[0]
+    error = speed = 0.0
+    for joint in range(len(here.joints)):
+        error = max(error, abs(here.joints[joint] - state.measured[joint]))
+    for axis in range(3):
+        along = 0.0
+        for joint in range(len(here.joints)):
+            along += here.tasks[axis, joint] * state.measured_velocities[joint]
+        speed += along * along
+    return error, math.sqrt(speed)
+
+
+@compiled
+def write_decision(states: Records, frames: Records) -> None:
+    """Into the frame what was decided."""
+    frames[0].mode, frames[0].reason = states[0].mode, states[0].reason

@@ -1,0 +1,177 @@
+"""What the experiments measure is what the service runs: the same hands make the same bits in a
+`Controller` of one's own as in each family of experiments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("movement_primitives", reason="ProMPs need movement_primitives")
+
+from service.config import Settings, robot_description
+from service.contract import cdr
+from service.contract.messages import BASE, PoseStamped
+from service.contract.records import SIDES, Mode
+from service.contract.requests import TOLERANCE_M
+from service.core.controller import Controller
+from service.core.frame import Event, Tick
+from service.core.skill.skill import Skill
+from service.learning.skill_file import decoded
+from service.learning.via_points import adapted
+from service.shipped import recordings, shipped_skill
+from sim.experiments import followers, rehearsal, rivals
+from sim.experiments.moving_hands import stops
+from sim.experiments.open_loop import targets
+from sim.experiments.skills import LearnedByService
+from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen, served
+from sim.people import person
+from sim.scene import Scene
+from sim.script import HandScript
+from sim.sessions import session
+from sim.teach import places_of
+
+PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "gate_m")
+ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
+
+
+def of_the_service(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> np.ndarray:
+    """The frames of a controller that no experiment had a hand in."""
+    controller = Controller(settings, skill, urdf=robot_description(settings))
+    return np.array([controller.step(tick) for tick in ticks])
+
+
+def sample(side: str, at: list[float], stamp_ns: int) -> Event:
+    x, y, z = at
+    pose = PoseStamped(stamp_ns, BASE, (x, y, z), (0.0, 0.0, 0.0, 1.0))
+    return Event(f"hands/{side}", cdr.encode_pose(pose), pose)
+
+
+@pytest.fixture(scope="module")
+def shown() -> Seen:
+    """A session in which the service holds too, and meets its limit of a target's acceleration."""
+    return seen(session(person("tuning", 0), 0, group="tuning", sigma_m=0.005))
+
+
+@pytest.fixture(scope="module")
+def taught(shown: Seen) -> Skill:
+    return adapted(shipped_skill(), places_of(shown.session.told), tolerance=TOLERANCE_M)
+
+
+@pytest.fixture(scope="module")
+def wanted(shown: Seen, taught: Skill) -> np.ndarray:
+    """The service's frames, from what the trackers say in the order in which it comes."""
+    inboxes: list[list[Event]] = [[] for _ in shown.times]
+    for side, (stamps, samples) in zip(SIDES, shown.session.samples(), strict=True):
+        for stamp, at in zip(stamps, samples, strict=True):
+            arrives = int(np.ceil(stamp * RATE_HZ - 1e-9))
+            if arrives < len(inboxes):
+                inboxes[arrives].append(sample(side, at.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp))))
+    ticks = [Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes)]
+    return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ))
+
+
+class TestPeople:
+    """`people`: every method's trial is a run of the service."""
+
+    def test_what_is_called_ours_is_what_the_controller_predicts_and_decides(
+        self, shown: Seen, wanted: np.ndarray
+    ) -> None:
+        placed = LearnedByService(shipped_skill(), start=True).place(shown.session.told)
+        found = served(placed, shown)
+        for name in (*PREDICTED, "mode", "reason", "setpoint", "tool"):
+            assert found[name].tobytes() == wanted[name].tobytes(), name
+        assert 0 < (wanted["mode"] == Mode.FOLLOW).sum() < len(wanted)
+
+    def test_the_outcome_is_counted_from_these_frames(self, shown: Seen, taught: Skill, wanted: np.ndarray) -> None:
+        found = judge(taught, shown)
+        judged = shown.times > 0.5
+        held = wanted["mode"] != Mode.FOLLOW
+        good = judged & ~shown.due
+        assert found.held == held[judged].mean()
+        variances = np.trace(wanted["covariance"][good], axis1=1, axis2=2)
+        assert found.predicted_mm == 1000 * np.sqrt(variances.mean())
+        delay = round(found.delay_s * RATE_HZ)
+        teacher = np.concatenate([np.repeat(shown.tool[:1], delay, axis=0), shown.tool[: len(wanted) - delay]])
+        assert found.path_mm == 1000 * np.sqrt(np.mean(np.sum((wanted["target"] - teacher)[good] ** 2, axis=1)))
+
+    def test_hands_are_estimated_as_the_controller_does(self, shown: Seen, wanted: np.ndarray) -> None:
+        assert shown.estimates[:, 0].tobytes() == wanted["hands"].tobytes()
+        assert shown.estimates[:, 1].tobytes() == wanted["hand_velocities"].tobytes()
+
+    def test_a_rival_that_predicts_as_ours_gets_the_target_that_ours_has(
+        self, shown: Seen, taught: Skill, wanted: np.ndarray
+    ) -> None:
+        class Copy:
+            """Our means and covariances as a rival's: only how they move is the experiments'."""
+
+            memoryless = True
+
+            def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
+                return taught.mean(hands, rest)
+
+            def predict(self, hands: np.ndarray, rest: np.ndarray) -> Predicted:
+                far = taught.deviations(hands) > taught.threshold
+                return Predicted(self.mean(hands, rest), taught.covariances(hands, rest), far)
+
+        found = served(Copy(), shown)
+        both = (wanted["mode"] == Mode.FOLLOW) & (found["mode"] == Mode.FOLLOW)
+        assert both.mean() > 0.8
+        assert np.abs(wanted["target_acceleration"][both]).max() == 3.0  # the service's own limit is met
+        for name in PREDICTED[:3]:
+            assert found[name][both].tobytes() == wanted[name][both].tobytes(), name
+
+
+def test_motion_follows_through_the_controller() -> None:
+    skill = shipped_skill()
+    hands = stops(skill.hands.mean(axis=0), count=1, rate_hz=30, noise=0.002)[0]
+    found = followers.ours(skill, Settings())(hands)
+    settle, period_s = followers.SETTLE_TICKS, followers.PERIOD_S
+    arrives = np.ceil(hands.stamps / period_s - 1e-9).astype(int) + settle
+    ticks = []
+    for k in range(settle + len(hands.truth)):
+        rows = [hands.samples[np.flatnonzero(arrives == k)[-1]]] if k in arrives else []
+        rows = [hands.truth[0]] if k < settle and k % 5 == 0 and not rows else rows
+        said = [(side, part) for row in rows for side, part in zip(SIDES, (row[:3], row[3:]), strict=True)]
+        ticks.append(Tick(k, tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in said)))
+    wanted = of_the_service(replace(skill, threshold=np.inf), ticks, ASSUMED)[settle:]
+    for name, array in (("target", found.target), ("setpoint", found.setpoint), ("tool", found.tool)):
+        assert array is not None
+        assert array.tobytes() == wanted[name].tobytes(), name
+
+
+@pytest.mark.parametrize("adapt", [rivals.ours, lambda skill: lambda scene: lambda bench: skill])
+def test_what_is_rehearsed_is_what_the_controller_does(
+    adapt: Callable[[Skill], rivals.Adapt], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`statistics`, `phase`, `orientation`, `separation`, and `hands` in process."""
+    known: list[Tick] = []
+    run = rehearsal.run
+
+    def kept(ticks: Iterable[Tick]) -> Iterator[Tick]:
+        for tick in ticks:
+            known.append(tick)
+            yield tick
+
+    monkeypatch.setattr(rehearsal, "run", lambda controller, ticks, taps: run(controller, kept(ticks), taps))
+    scene, skill = Scene(), shipped_skill()
+    done = rehearsal.rehearse(HandScript(scene, seed=3, speed=2.0), adapt(skill)(scene), rate_hz=125, keep=True)
+    taught = skill if adapt is not rivals.ours else adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
+    wanted = of_the_service(taught, known, msgspec.structs.replace(Settings(), rate_hz=125))
+    assert done.frames.tobytes() == wanted.tobytes()
+    assert (wanted["mode"] == Mode.FOLLOW).mean() > 0.5
+
+
+@pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
+def test_an_open_loop_target_is_where_the_controller_leads_the_tool(file: str) -> None:
+    """`demonstrations`, `hands` beside the paper, and what `motion` measures against."""
+    known = decoded((recordings() / file).read_bytes(), origin=file)
+    rows = known.hands[:: max(1, len(known.hands) // 8)] + 0.004
+    for row, target in zip(rows, targets(known, rows), strict=True):
+        inbox = [sample(side, at, 1) for side, at in zip(SIDES, row.reshape(2, 3).tolist(), strict=True)]
+        wanted = of_the_service(known, [Tick(0, tuple(inbox))], ASSUMED)["target"]
+        assert np.round(target, 6).tobytes() == wanted[0].tobytes()

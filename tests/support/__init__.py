@@ -1,0 +1,1 @@
+"""What tests of several modules share, imported as `support.<module>`; no test imports another."""
