@@ -24,6 +24,7 @@ from service.contract import cdr
 from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, run
 from service.core.frame import Event, Frame, Tick, differences, order
+from service.core.outputs import outgoing
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
 from service.recording.mcap_file import RecordingError
@@ -122,7 +123,8 @@ def record(
             frames.append(frame)
             after = controller.state if len(frames) % STATE_EVERY == 0 else None
             time_ns = START_NS + tick.index * round(settings.period_s * 1e9)
-            recorder.write(tick, frame, time_ns=time_ns, state=after)
+            outputs = outgoing(frame, time_ns, settings.joints.names)
+            recorder.write(tick, frame, time_ns=time_ns, state=after, outputs=outputs)
 
         run(controller, source, [keep, follow])
     return frames

@@ -1,27 +1,27 @@
-"""What goes out with a frame, live and in a recording alike: on which channels, which bytes."""
+"""What a tick publishes: under which keys, which bytes. Made once, and recorded as published."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 from service.contract import cdr
-from service.contract.channels import Channel, sent_by_the_loop
+from service.contract.channels import sent_by_the_loop
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.core.frame import Frame
 from service.core.skill.pose import CLOSED, UNKNOWN
 
+Outputs: TypeAlias = Sequence[tuple[str, bytes]]
+"""Keys below the cell, and what is published there."""
 
-def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Iterator[tuple[Channel, bytes]]:
-    """What goes out with a frame, and on which channels; `joints` are the names of the commanded
-    ones.
 
-    Live and in a recording alike. Nothing is commanded before the arm is ready, and nothing aimed
-    at without both hands.
+def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
+    """What is published of a frame; `joints` are the names of the commanded ones.
+
+    Nothing is commanded before the arm is ready, and no target is there without both hands.
     """
-    for channel in sent_by_the_loop(int(frame["tick"])):
-        payload = _OUTPUTS[channel.key](frame, stamp_ns, joints)
-        if payload is not None:
-            yield channel, payload
+    made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in sent_by_the_loop(int(frame["tick"])))
+    return [(key, payload) for key, payload in made if payload is not None]
 
 
 def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:

@@ -25,7 +25,7 @@ from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
 from service.core.controller import Controller, run
 from service.core.frame import STAGES, Event, Frame, Tick, frame_layout, order, timed
-from service.core.outputs import outgoing
+from service.core.outputs import Outputs, outgoing
 from service.core.record import blank
 from service.core.separation.separation import FARTHEST
 from service.core.warm_up import warm_up
@@ -57,6 +57,7 @@ STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SLOWEST_START_S = 120.0  # of the skill worker, on a busy machine
 LONG_START_S = 3.0
+STAGE_NUMBERS = {stage: number for number, stage in enumerate(STAGES)}
 MOST_NOTES = 100  # a second
 LONGEST_LATENCY_MS = 1000.0  # a longer one means that the clocks differ
 
@@ -126,6 +127,7 @@ class Daemon:
         self._late_ns = self._began_ns = 0
         self._newest = -1  # tick
         self._laps: list[tuple[str, int]] = []
+        self._outputs: Outputs = ()  # of the newest tick
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
@@ -249,14 +251,15 @@ class Daemon:
     def _publish(self, tick: Tick, frame: Frame) -> None:
         now_ns = time.time_ns()
         attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
-        for channel, payload in outgoing(frame, self._clock.stamp_ns, self._settings.joints.names):
-            self._streams.publish(channel.key, payload, attachment)
+        self._outputs = outgoing(frame, self._clock.stamp_ns, self._settings.joints.names)
+        for key, payload in self._outputs:
+            self._streams.publish(key, payload, attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
         stages, before, latency_ms = [0.0] * len(STAGES), self._began_ns, 0.0
         for stage, at in self._laps:
-            stages[STAGES.index(stage)] = (at - before) / 1e3
+            stages[STAGE_NUMBERS[stage]] = (at - before) / 1e3
             before = at
         if 0 in frame["hand_ages"].tolist():
             latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
@@ -269,7 +272,9 @@ class Daemon:
         timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
         self._lateness.add(late_us)
         self._work.add(work_us)
-        self._scribe.send(tick, frame, timing, state=lambda: self._controller.state, skill=self._file)
+        self._scribe.send(
+            tick, frame, timing, state=lambda: self._controller.state, skill=self._file, outputs=self._outputs
+        )
 
     @property
     def _file(self) -> bytes:

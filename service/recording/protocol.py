@@ -10,19 +10,21 @@ import msgspec
 import numpy as np
 
 from service.config import Settings
-from service.contract.channels import EVENT_KINDS, EVENT_NUMBERS
+from service.contract.channels import CHANNELS, EVENT_KINDS, EVENT_NUMBERS
 from service.core.frame import TIMING, Event, Tick, frame_layout, state_layout
+from service.core.outputs import Outputs
 from service.core.record import Record
 
 LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
 LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
 
 _TICK, NOTE = 1, 2
-HEAD = struct.Struct("<BBHIq")  # type, flags of what follows, number of events, ticks lost before, index
-_EVENT = struct.Struct("<BI")  # kind, bytes
+HEAD = struct.Struct("<BBHHIq")  # type, flags of what follows, number of events, of outputs, ticks lost before, index
+_EVENT = struct.Struct("<BI")  # kind of an event or number of an output, bytes
 _HAS_STATE, _HAS_SKILL = 1, 2
 _ELSEWHERE = 0xFFFFFFFF  # as a size: the bytes are in a memory file that is sent along
 _SKILL = EVENT_NUMBERS["skill"]
+OUTPUT_KEYS = tuple(channel.key for channel in CHANNELS if channel.direction == "out")
 
 
 class TickMessage(NamedTuple):
@@ -34,9 +36,19 @@ class TickMessage(NamedTuple):
     state: Record | None
     skill: bytes | None
     lost: int
+    outputs: Outputs = ()
 
 
-def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, lost: int, with_skill: bool) -> bytes:
+def pack(
+    tick: Tick,
+    frame: Record,
+    timing: Record,
+    *,
+    state: Record | None,
+    lost: int,
+    with_skill: bool,
+    outputs: Outputs = (),
+) -> bytes:
     """One message about a tick, without the bytes of skills."""
     head, bodies = [b""], []
     for event in tick.inbox:
@@ -47,7 +59,10 @@ def pack(tick: Tick, frame: Record, timing: Record, *, state: Record | None, los
             head.append(_EVENT.pack(kind, len(event.payload)))
             bodies.append(event.payload)
     follows = (_HAS_STATE if state is not None else 0) | (_HAS_SKILL if with_skill else 0)
-    head[0] = HEAD.pack(_TICK, follows, len(tick.inbox), lost, tick.index)
+    for key, payload in outputs:
+        head.append(_EVENT.pack(OUTPUT_KEYS.index(key), len(payload)))
+        bodies.append(payload)
+    head[0] = HEAD.pack(_TICK, follows, len(tick.inbox), len(outputs), lost, tick.index)
     bodies += (frame.tobytes(), timing.tobytes())
     if state is not None:
         bodies.append(state.tobytes())
@@ -59,24 +74,27 @@ def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage:
     order.
     """
     frame_type, state_type = frame_layout(joints), state_layout(joints)
-    _, follows, count, lost, index = HEAD.unpack_from(message)
-    kinds = [_EVENT.unpack_from(message, HEAD.size + i * _EVENT.size) for i in range(count)]
-    at, files, inbox = HEAD.size + count * _EVENT.size, iter(skills), []
-    for kind, size in kinds:
+    _, follows, count, sent, lost, index = HEAD.unpack_from(message)
+    kinds = [_EVENT.unpack_from(message, HEAD.size + i * _EVENT.size) for i in range(count + sent)]
+    at, files, inbox, outputs = HEAD.size + (count + sent) * _EVENT.size, iter(skills), [], []
+    for kind, size in kinds[:count]:
         payload = next(files) if size == _ELSEWHERE else message[at : at + size]
         at += 0 if size == _ELSEWHERE else size
         inbox.append(Event(EVENT_KINDS[kind], payload, None))
+    for number, size in kinds[count:]:
+        outputs.append((OUTPUT_KEYS[number], message[at : at + size]))
+        at += size
     frame: Record = np.frombuffer(message, frame_type, 1, at)[0]
     timing: Record = np.frombuffer(message, TIMING, 1, at + frame_type.itemsize)[0]
     at += frame_type.itemsize + TIMING.itemsize
     state: Record | None = np.frombuffer(message, state_type, 1, at)[0] if follows & _HAS_STATE else None
     skill = next(files) if follows & _HAS_SKILL else None
-    return TickMessage(Tick(index, tuple(inbox)), frame, timing, state, skill, lost)
+    return TickMessage(Tick(index, tuple(inbox)), frame, timing, state, skill, lost, tuple(outputs))
 
 
 def pack_note(key: str, text: str, time_ns: int) -> bytes:
     """One message with a text for the recording, under `<cell>/<key>`."""
-    return HEAD.pack(NOTE, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode()
+    return HEAD.pack(NOTE, 0, 0, 0, 0, time_ns) + json.dumps([key, text[:LONGEST_NOTE]]).encode()
 
 
 def unpack_note(message: bytes) -> tuple[str, str, int] | None:
@@ -84,7 +102,7 @@ def unpack_note(message: bytes) -> tuple[str, str, int] | None:
     if message[0] != NOTE:
         return None
     key, text = json.loads(message[HEAD.size :])
-    return key, text, HEAD.unpack_from(message)[4]
+    return key, text, HEAD.unpack_from(message)[5]
 
 
 class ScribeSetup(msgspec.Struct, frozen=True):

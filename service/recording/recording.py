@@ -25,7 +25,7 @@ from service.contract import cdr, channels
 from service.contract.messages import BASE, Quaternion, SceneObject, Transform, Vector3
 from service.contract.records import SIDES
 from service.core.frame import Tick, encode
-from service.core.outputs import outgoing
+from service.core.outputs import Outputs
 from service.core.record import Record
 from service.demonstrations.pose_streams import ENDINGS
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
@@ -118,8 +118,9 @@ class Recorder:
         state: Record | None = None,
         skill: bytes | None = None,
         lost: int = 0,
+        outputs: Outputs = (),
     ) -> None:
-        """Writes a tick and its frame.
+        """Writes a tick, its frame, and what it published by key.
 
         After `lost` ticks that could not be recorded, `state` (after this tick) and `skill` (in
         force) let a replay continue. The skill is written only if it differs from the last one.
@@ -144,8 +145,8 @@ class Recorder:
         if skill is not None and skill != self._skill:
             self._skill = skill
             put("skill_in_force", cdr.encode_skill(skill), time_ns)
-        for channel, payload in outgoing(frame, time_ns, self._settings.joints.names):
-            put(channel.key, payload, time_ns)
+        for key, payload in outputs:
+            put(key, payload, time_ns)
         if tick.index % channels.BY_KEY["/tf"].every == 0:
             put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
         if self._file.part_ends():

@@ -25,6 +25,7 @@ import msgspec
 from service import child
 from service.config import Settings
 from service.core.frame import Tick
+from service.core.outputs import Outputs
 from service.core.record import Record
 from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, pack, pack_note
 
@@ -116,8 +117,17 @@ class Scribe:
                 os.close(self._memory.pop(next(iter(self._memory)))[1])
         return known[1]
 
-    def send(self, tick: Tick, frame: Record, timing: Record, *, state: Callable[[], Record], skill: bytes) -> None:
-        """Sends a tick.
+    def send(
+        self,
+        tick: Tick,
+        frame: Record,
+        timing: Record,
+        *,
+        state: Callable[[], Record],
+        skill: bytes,
+        outputs: Outputs = (),
+    ) -> None:
+        """Sends a tick, and what it published by key.
 
         Never waits; a tick that cannot be sent is counted. `state` is called once a second, and
         after a loss.
@@ -135,7 +145,7 @@ class Scribe:
         with_state = send_all or self._since_state >= self._settings.rate_hz
         after, owed = state() if with_state else None, self._owed
         lost = self._gap + owed - self._marked
-        message = pack(tick, frame, timing, state=after, lost=lost, with_skill=send_all)
+        message = pack(tick, frame, timing, state=after, lost=lost, with_skill=send_all, outputs=outputs)
         try:
             skills = [event.payload for event in tick.inbox if event.kind == "skill"]
             if send_all:

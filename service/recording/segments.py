@@ -237,6 +237,7 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None
         state=received.state,
         skill=received.skill,
         lost=missing,
+        outputs=received.outputs,
     )
     if missing:
         recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)

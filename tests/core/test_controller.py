@@ -310,7 +310,7 @@ def test_every_kind_of_event_has_a_case_and_any_other_is_refused(taught: Skill) 
 
 def test_every_output_has_a_function(taught: Skill) -> None:
     frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
-    assert [channel.key for channel, _ in outgoing(frame, 0, ASSUMED.joints.names)] == [
+    assert [key for key, _ in outgoing(frame, 0, ASSUMED.joints.names)] == [
         "joints/command",
         "tool/setpoint",
     ]

@@ -156,7 +156,7 @@ def test_orientation_covariance_and_gripper_go_out_with_a_frame() -> None:
     frame = blank(FRAME)
     frame["covariance"], frame["orientation_covariance"] = np.eye(3), np.arange(9).reshape(3, 3)
     frame["orientation"], frame["setpoint_orientation"] = (0, 0, 0, 1), (0, 1, 0, 0)
-    sent = {channel.key: payload for channel, payload in outgoing(frame, 1, Settings().joints.names)}
+    sent = dict(outgoing(frame, 1, Settings().joints.names))
     assert "gripper/command" not in sent  # nothing is known of one
     covariance = np.array(cdr.decode_pose_with_covariance(sent["tool/target"]).covariance).reshape(6, 6)
     np.testing.assert_array_equal(covariance[3:, 3:], np.arange(9).reshape(3, 3))
@@ -164,6 +164,6 @@ def test_orientation_covariance_and_gripper_go_out_with_a_frame() -> None:
     assert cdr.decode_pose(sent["tool/setpoint"]).orientation == (0, 1, 0, 0)
     for gripper, position in ((OPEN, 0.0), (CLOSED, 1.0)):
         frame["gripper"] = gripper
-        sent = {channel.key: payload for channel, payload in outgoing(frame, 1, Settings().joints.names)}
+        sent = dict(outgoing(frame, 1, Settings().joints.names))
         command = cdr.decode_joints(sent["gripper/command"])
         assert (command.names, command.position) == (("gripper",), (position,))
