@@ -8,11 +8,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 try:
-    from numba import njit
+    from numba import config, njit
 except ImportError:
     njit = None
 
 AVAILABLE = njit is not None
+PLAIN = njit is None or bool(config.DISABLE_JIT)
+"""Whether functions run as plain Python, as a debugger wants them."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 

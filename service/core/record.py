@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kmp.compiled import PLAIN
 from service.contract.records import Layout
 
 Vector: TypeAlias = NDArray[np.float64]
@@ -22,10 +23,18 @@ def dtype_of(layout: Layout, joints: int) -> DType:
     return np.dtype([(field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints)) for field in layout])
 
 
+def structured(count: int, fields: Any) -> Records:
+    """So many records of zeros, whose fields compiled functions, and their plain Python, read by
+    name.
+    """
+    records = np.zeros(count, fields)
+    return records.view(np.recarray) if PLAIN else records
+
+
 def parameters(**values: ArrayLike) -> Records:
     """The parameters of a stage: numbers and arrays by name, as one record (1,)."""
     arrays = {name: np.asarray(value) for name, value in values.items()}
-    record = np.zeros(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
+    record = structured(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
     for name, array in arrays.items():
         record[name][0] = array
     return record
@@ -46,7 +55,7 @@ def copied(record: Record) -> Record:
 def as_array(record: Record) -> Records:
     """The memory (1,) of a record that `blank` or `copied` made, as compiled functions take it."""
     memory: Any = record.base
-    return memory  # type: ignore[no-any-return]
+    return memory.view(np.recarray) if PLAIN else memory  # type: ignore[no-any-return]
 
 
 def frozen(record: Record) -> Record:

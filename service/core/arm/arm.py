@@ -15,7 +15,7 @@ from service.config import Settings
 from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe, follow, joint_costs, joint_step
 from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
 from service.core.limiter.limiter import MARGIN, approach_gain
-from service.core.record import Record, Records, Vector, as_array, parameters
+from service.core.record import Record, Records, Vector, as_array, parameters, structured
 from service.core.rotation import quaternion_of
 from service.core.separation.separation import Separation
 
@@ -174,7 +174,7 @@ class Arm:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        here = np.zeros(1, self._kinematics)
+        here = structured(1, self._kinematics)
         here["joints"][0], here["position"][0] = q, placement.translation
         describe(self.parameters, here, np.ascontiguousarray(jacobian), placement.rotation.copy())
         return Kinematics(here)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.config import Settings
-from service.core.record import Records, Vector
+from service.core.record import Records, Vector, structured
 from service.core.rotation import rotation
 from service.core.separation.capsules import CAPSULE, between_segments, place
 from service.urdf import Joint, Shape, Urdf
@@ -64,9 +64,8 @@ def body_of(settings: Settings, description: str) -> Body:
     if math.hypot(*tool) > LEAST_TOOL:
         found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
     found.sort(key=lambda one: one[0])
-    capsules = np.array(
-        [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in found], CAPSULE
-    )
+    capsules = structured(len(found), CAPSULE)
+    capsules[:] = [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in found]
     axes = np.array([joint.axis for joint in chain])
     body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
     postures = np.array([settings.arm.posture, settings.joints.lower, settings.joints.upper])

@@ -22,7 +22,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.requests import ViaPoint
-from service.core.record import Record, Records, Vector, as_array, parameters
+from service.core.record import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.body import body_of
 from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
 
@@ -82,13 +82,13 @@ class Separation:
         most = 2 * capsules * len(AHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
         self._jerk = np.array(limits.jerk)
         self.constraints = self.constraints_for(joints, most)
-        self._contacts = np.zeros(0, CONTACT)
+        self._contacts = structured(0, CONTACT)
         self.count, self.nearest_m, self.speed_limit, self.setpoint_share = 0, FARTHEST, self.max_speed, 1.0
 
     @staticmethod
     def constraints_for(joints: int, count: int) -> Records:
         """So many constraints of an arm with so many joints."""
-        return np.zeros(count, [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)])
+        return structured(count, [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)])
 
     def set_contacts(self, via_points: Iterable[ViaPoint]) -> None:
         """From now on the tool may touch a hand at those of the via-points where it goes with that
@@ -99,7 +99,8 @@ class Separation:
             for p in via_points
             if p.follow != "none"
         ]
-        self._contacts = np.array(found, CONTACT) if found else np.zeros(0, CONTACT)
+        self._contacts = structured(len(found), CONTACT)
+        self._contacts[:] = found
 
     def step(self, state: Record, frame: Record, here: Records) -> None:
         """Finds what the rule says for the state's hands at the arm's kinematics `here` (1,)."""

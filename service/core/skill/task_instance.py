@@ -15,7 +15,7 @@ from kmp import KMP
 from kmp.compiled import compiled
 from kmp.kernel_row import add_weighted
 from service.core.intake.stillness import STILL
-from service.core.record import Record, Records, Vector
+from service.core.record import Record, Records, Vector, structured
 from service.core.skill.barycentric import STEP_S, TASK, all_hand_weights, hand_weights, moving_weights
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Motion, round_to
 from service.core.skill.task import Task, TaskParameters
@@ -62,7 +62,7 @@ class TaskInstance:
         cls, task: Task, parameters: TaskParameters, primitive: KMP | None = None, errors: Vector | None = None
     ) -> TaskInstance:
         """A KMP of a task's weights, and its errors; without those it knows inputs alone."""
-        tasks, via_points = np.zeros(1, TASK), np.zeros(len(task.names), VIA_POINT)
+        tasks, via_points = structured(1, TASK), structured(len(task.names), VIA_POINT)
         tasks["corners"], tasks["inputs"], tasks["std"] = parameters.hands, task.inputs, parameters.std
         via_points["tool"], via_points["corners"], via_points["follow"] = parameters.tool, task.corners, task.follow
         rows, nothing = np.empty((0, task.width + len(task.names) + 2)), np.empty((0, task.width + 3))
