@@ -151,9 +151,5 @@ def keys_by_topic(cell: str, suffixes: Iterable[str]) -> dict[str, str]:
     return {name: suffix for suffix in suffixes for name in (topic(cell, suffix), key(cell, suffix))}
 
 
-def sent_by_the_loop(tick: int) -> tuple[Channel, ...]:
-    """The channels on which a tick's output goes out."""
-    return tuple(channel for channel in _STREAMS if tick % channel.every == 0)
-
-
-_STREAMS = tuple(channel for channel in CHANNELS if channel.direction == "out" and channel.every)
+STREAMS = tuple(channel for channel in CHANNELS if channel.direction == "out" and channel.every)
+"""On which a tick is published: each `every` so many."""

@@ -12,21 +12,29 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.records import Flag, Reason
-from service.core.arm.arm import Arm, Kinematics, write_tool
-from service.core.decision.decision import FAULT, FOLLOW, STARTS_MEASURED, Decision, write_decision
-from service.core.frame import Event, Frame, Lap, Tick, frame_layout, no_lap, state_layout
+from service.core.arm.arm import Arm, Kinematics
+from service.core.decision.decision import FOLLOW, STARTS_MEASURED, Decision
+from service.core.frame import (
+    Event,
+    Frame,
+    Lap,
+    Record,
+    Tick,
+    as_array,
+    blank,
+    copied,
+    frame_layout,
+    frozen,
+    state_layout,
+)
 from service.core.intake.intake import HANDS_KNOWN, Intake
-from service.core.limiter.stage import LimiterStage, write_joints
-from service.core.record import Record, Records, as_array, blank, copied, frozen
+from service.core.limiter.limiter import LimiterStage
 from service.core.separation.separation import Separation
-from service.core.setpoint.setpoint import WRONG
-from service.core.setpoint.stage import SetpointStage, write_setpoint
+from service.core.setpoint.setpoint import WRONG, SetpointStage
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Skill
-from service.core.skill.stage import SkillStage, Wanted
+from service.core.skill.skill import Skill, SkillStage, Wanted
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
@@ -34,6 +42,10 @@ SEPARATED = int(Flag.SEPARATION)
 SAMPLES = ("hands/left", "hands/right", "joints/state")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
+
+
+def no_lap(stage: str) -> None:
+    """Measures nothing: outside of the daemon nobody asks how long a stage took."""
 
 
 def start_state(settings: Settings, skill: Skill) -> Record:
@@ -100,16 +112,17 @@ class Controller:
         lap("intake")
         wanted = self._skill.step(state, frame) if known & HANDS_KNOWN else None
         lap("skill")
-        here = self._decide(known, math.nan if wanted is None else wanted.gate_m)
+        here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
-        moving = self._limiter.is_moving(state)
         self._separation.step(state, frame, here.record)
         lap("separation")
-        flags = self._hold(lap) if wanted is None or state["mode"] != FOLLOW else self._follow(wanted, here, lap)
         if wanted is None:
+            self._hold(frame, lap)
             self._skill.nothing(state, frame)
-        commanded = moving or (state["arm_ready"] and state["mode"] != FAULT)
-        _write(self._memory, as_array(frame), self._at().record, flags, int(commanded))
+        elif state["mode"] != FOLLOW:
+            self._hold(frame, lap)
+        else:
+            self._follow(frame, wanted, here, lap)
         return frozen(frame)
 
     def _take_in(self, tick: Tick, frame: Frame) -> int:
@@ -130,63 +143,56 @@ class Controller:
         self._skill.adopt(self._state, skill)
         self._separation.set_contacts(skill.via_points)
 
-    def _decide(self, known: int, gate_m: float) -> Kinematics:
+    def _decide(self, frame: Frame, known: int, gate_m: float) -> Kinematics:
         """Decides; the arm's kinematics, where it is or has just appeared."""
-        state = self._state
-        starts = self.decision.step(state, self._at().record, known, gate_m=gate_m, threshold=self.skill.threshold)
+        state, here, threshold = self._state, self._at(), self.skill.threshold
+        starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
         if starts:
-            self._setpoint.begin(state, self._at())
-        return self._at()
+            here = self._at()
+            self._setpoint.begin(state, frame, here)
+        return here
 
-    def _follow(self, wanted: Wanted, here: Kinematics, lap: Lap) -> int:
-        """Moves setpoint and joints on; flags. A setpoint that passes a bound, or a tool that
-        cannot be kept slow enough, is a fault.
+    def _follow(self, frame: Frame, wanted: Wanted, here: Kinematics, lap: Lap) -> None:
+        """Moves setpoint and joints on. A setpoint that passes a bound, or a tool that cannot be
+        kept slow enough, is a fault.
         """
         state, separation = self._state, self._separation
-        met = self._setpoint.step(state, wanted, here, self.skill.workspace, separation.setpoint_share)
+        met = self._setpoint.step(state, frame, wanted, here, self.skill.workspace, separation.setpoint_share)
         if met == WRONG:
-            self.decision.fail(state, Reason.SETPOINT)
+            self.decision.fail(state, frame, Reason.SETPOINT)
         lap("setpoint")
         solution = self._arm.follow(state, here, separation)
         lap("arm")
-        moved = self._limiter.step(state, solution.velocity, separation)
+        moved = self._limiter.step(state, frame, solution.velocity, separation)
         self._here = moved.here
         if moved.too_fast:
-            self.decision.fail(state, Reason.TOOL_SPEED, speed=moved.too_fast)
-        lap("limiter")
+            self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)
+            frame["commanded"] = moved.moving
         flags = CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
         flags |= LIMITED * (met > 0 or solution.speed_limited or moved.limited)
-        return flags | SEPARATED * (solution.separated or moved.separated)
+        frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
+        lap("limiter")
 
-    def _hold(self, lap: Lap) -> int:
+    def _hold(self, frame: Frame, lap: Lap) -> None:
         """Brakes the joints, or brings them into their limits; the setpoints stay with the tool."""
         state, inwards = self._state, self.decision.inwards(self._state)
         if inwards is None:
-            moved = self._limiter.stop(state, self._separation)
+            moved = self._limiter.stop(state, frame, self._separation)
         else:
-            moved = self._limiter.step(state, inwards, self._separation)
+            moved = self._limiter.step(state, frame, inwards, self._separation)
         self._here = moved.here
         lap("limiter")
-        self._setpoint.begin(state, moved.here)
+        self._setpoint.begin(state, frame, moved.here)
         lap("setpoint")
-        return 0
 
     def _at(self) -> Kinematics:
         """The arm at the state's joints, computed once for the same ones."""
-        joints = self._state["joints"][0]
-        if self._here is None or self._here.joints.tobytes() != joints.tobytes():
-            self._here = self._arm.at(joints)
-        return self._here
-
-
-@compiled
-def _write(states: Records, frames: Records, heres: Records, flags: int, commanded: int) -> None:
-    write_decision(states, frames)
-    write_setpoint(states, frames)
-    write_tool(heres, frames)
-    write_joints(states, frames, flags, commanded)
+        joints, here = self._state["joints"][0], self._here
+        if here is None or here.record["joints"][0].tobytes() != joints.tobytes():
+            here = self._here = self._arm.at(joints)
+        return here
 
 
 def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:

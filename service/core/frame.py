@@ -1,21 +1,77 @@
 """Event, Tick, Frame, State: what goes into the core, what comes out, and what it remembers.
 
-Frame and State are assembled from what each stage declares in its package.
+Frame and State are records, NumPy structured arrays of one element, which compiled functions take
+whole. They are assembled from what each stage declares in its package.
 """
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from kmp.compiled import PLAIN
 from service.contract import cdr
-from service.contract.records import Field, assembled, definition
+from service.contract.records import Field, Layout, assembled, definition
 from service.core import arm, decision, intake, limiter, separation, setpoint, skill
-from service.core.record import DType, Record, dtype_of
+
+Vector: TypeAlias = NDArray[np.float64]
+Record: TypeAlias = np.void
+Records: TypeAlias = NDArray[np.void]
+DType: TypeAlias = np.dtype[np.void]
+
+
+@functools.cache
+def dtype_of(layout: Layout, joints: int) -> DType:
+    """The memory of a layout for an arm with so many joints: NumPy's own order, little endian."""
+    return np.dtype([(field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints)) for field in layout])
+
+
+as_array: Callable[[Record], Records] = operator.attrgetter("base")
+"""The memory (1,) of a record that `blank` or `copied` made, as compiled functions take it."""
+
+
+def structured(count: int, fields: Any) -> Records:
+    """So many records of zeros, whose fields compiled functions, and their plain Python, read by
+    name.
+    """
+    records = np.zeros(count, fields)
+    return records.view(np.recarray) if PLAIN else records
+
+
+def parameters(**values: ArrayLike) -> Records:
+    """The parameters of a stage: numbers and arrays by name, as one record (1,)."""
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    record = structured(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
+    for name, array in arrays.items():
+        record[name][0] = array
+    return record
+
+
+def blank(layout: DType) -> Record:
+    """A record of zeros, to be filled."""
+    record: Record = structured(1, layout)[0]
+    return record
+
+
+def copied(record: Record) -> Record:
+    """A copy with memory of its own, as `blank` makes it."""
+    copy = blank(record.dtype)
+    as_array(copy)[:] = record
+    return copy
+
+
+def frozen(record: Record) -> Record:
+    """A copy that cannot be changed."""
+    copy: Record = np.frombuffer(record.tobytes(), record.dtype)[0]
+    return copy
+
 
 Frame: TypeAlias = Record  # of the layout `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
@@ -35,10 +91,6 @@ TIMING_FIELDS = (
     Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
-
-
-def no_lap(stage: str) -> None:
-    """Measures nothing: outside of the daemon nobody asks how long a stage took."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 from service.contract import cdr
-from service.contract.channels import sent_by_the_loop
+from service.contract.channels import STREAMS
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.core.frame import Frame
 from service.core.skill.pose import CLOSED, UNKNOWN
@@ -20,7 +20,8 @@ def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
 
     Nothing is commanded before the arm is ready, and no target is there without both hands.
     """
-    made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in sent_by_the_loop(int(frame["tick"])))
+    tick = int(frame["tick"])
+    made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in STREAMS if tick % one.every == 0)
     return [(key, payload) for key, payload in made if payload is not None]
 
 

@@ -12,12 +12,33 @@ from zenoh.handlers import RingChannel
 from service.client import publisher
 from service.config import Settings
 from service.contract import channels, ros2
-from service.contract.messages import WireError
+from service.contract.messages import JointState, PoseStamped, WireError
 from service.core.frame import Event
-from service.daemon.input_monitor import Arrivals
 from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+
+
+class Arrivals:
+    """What came in on one channel. The loop writes, other threads read."""
+
+    __slots__ = ("at_ns", "count", "malformed", "newest", "why")
+
+    def __init__(self) -> None:
+        self.count = self.malformed = self.at_ns = 0
+        self.newest: PoseStamped | JointState | None = None
+        self.why = ""
+
+    def take(self, message: PoseStamped | JointState, at_ns: int) -> None:
+        """One message, and when it came by the system clock [ns]."""
+        self.newest, self.at_ns = message, at_ns
+        self.count += 1
+
+    def refuse(self, why: str) -> None:
+        """Bytes that are no message."""
+        self.why = why
+        self.count += 1
+        self.malformed += 1
 
 
 class CellStreams:

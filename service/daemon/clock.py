@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.contract.requests import Percentiles
-from service.core.record import Vector
+from service.core.frame import Vector
 
 SPIN_NS = 100_000  # of busy waiting before a deadline, under real-time scheduling only
 PREPARE_NS = 450_000  # before a deadline the next tick is prepared

@@ -24,9 +24,8 @@ from service.contract.records import Reason
 from service.contract.requests import Status, encode_json
 from service.contract.roles import access_control
 from service.core.controller import Controller, run
-from service.core.frame import STAGES, Event, Frame, Tick, frame_layout, order, timed
+from service.core.frame import STAGES, Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import Outputs, outgoing
-from service.core.record import blank
 from service.core.separation.separation import FARTHEST
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread

@@ -16,35 +16,14 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
+from service.core.frame import Record
 from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_OUTSIDE, MAX_JOINT_SPEED, Refused
-from service.core.record import Record
+from service.daemon.cell_streams import Arrivals
 
 WINDOW_S = 1.0  # over which rates and clocks are taken
 TELL_EVERY_S = 10.0  # counts of what goes on being rejected
 KEYS = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
-
-
-class Arrivals:
-    """What came in on one channel. The loop writes, other threads read."""
-
-    __slots__ = ("at_ns", "count", "malformed", "newest", "why")
-
-    def __init__(self) -> None:
-        self.count = self.malformed = self.at_ns = 0
-        self.newest: PoseStamped | JointState | None = None
-        self.why = ""
-
-    def take(self, message: PoseStamped | JointState, at_ns: int) -> None:
-        """One message, and when it came by the system clock [ns]."""
-        self.newest, self.at_ns = message, at_ns
-        self.count += 1
-
-    def refuse(self, why: str) -> None:
-        """Bytes that are no message."""
-        self.why = why
-        self.count += 1
-        self.malformed += 1
 
 
 class _History:

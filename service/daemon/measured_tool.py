@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.config import Settings
 from service.contract.messages import Vector3
 from service.core.arm.arm import Arm
-from service.core.record import Record
+from service.core.frame import Record
 
 OLDEST_S = 0.2  # of the measured joints
 

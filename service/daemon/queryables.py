@@ -30,7 +30,7 @@ from service.contract.requests import (
     encode_json,
 )
 from service.core.frame import Event, Frame, order
-from service.core.skill.workspace import is_reachable
+from service.core.skill.skill import is_reachable
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.saved_via_points import SavedViaPoints

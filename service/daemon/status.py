@@ -14,10 +14,9 @@ from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
 from service.core.controller import Controller
 from service.core.decision.decision import RETURNING
-from service.core.frame import Frame
-from service.core.intake.plausibility import SCATTERED_M, SETTLED
-from service.core.record import Record
-from service.core.rotation import off_target
+from service.core.frame import Frame, Record
+from service.core.geometry import off_target
+from service.core.intake.intake import SCATTERED_M, SETTLED
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames

@@ -19,8 +19,8 @@ from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
 from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
 from service.contract.requests import ViaPoint, encode_json
+from service.core.frame import Vector
 from service.core.intake.intake import FARTHEST_M, UNIT_M
-from service.core.record import Vector
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses

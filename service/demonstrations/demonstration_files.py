@@ -11,7 +11,7 @@ import numpy as np
 from service import palette
 from service.config import Settings
 from service.contract.channels import JOINTS, POSE
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
 from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
 from service.learning.demonstration import LEAST_M, Demonstration

@@ -16,10 +16,10 @@ from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING, topic
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
 from service.contract.requests import encode_json
+from service.core.frame import Vector
+from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
-from service.core.record import Vector
-from service.core.rotation import rotation
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, Track, chosen
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing

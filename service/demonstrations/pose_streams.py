@@ -18,7 +18,7 @@ from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import BASE, PoseStamped, WireError, in_order
 from service.contract.requests import Add, ViaPoint, decode_request
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
 from service.recording.mcap_file import RecordingError, existing
 from service.recording.mcap_reader import FileFault, Messages

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from service.config import Settings
 from service.core.arm.arm import Arm
-from service.core.record import Vector
+from service.core.frame import Vector
 
 MOST_HZ = 100  # of poses; arms publish their joints more often than a demonstration needs
 

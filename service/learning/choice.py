@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP, GaussianKernel, Gaussians
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 ELLS = 2.0 ** np.arange(-1.0, 4.0)  # [1/m²] beyond these, via-points bend everything or nothing

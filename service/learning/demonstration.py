@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.contract.messages import BASE
 from service.contract.requests import ViaPoint
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kmp import KMP
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
 from service.learning.skill_file import HIGHEST_GATE_M
 

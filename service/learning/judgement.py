@@ -12,8 +12,8 @@ import numpy as np
 
 from service.config import Reach
 from service.contract.messages import BASE
-from service.core.record import Vector
-from service.core.skill.workspace import is_reachable
+from service.core.frame import Vector
+from service.core.skill.skill import is_reachable
 from service.learning.choice import REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate

@@ -15,7 +15,7 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task

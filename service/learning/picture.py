@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from service import palette
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.learning.choice import mahalanobis
 from service.learning.gate import nonsense
 from service.learning.learn import Evidence

@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
-from service.core.record import Vector
-from service.core.rotation import angles
-from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
+from service.core.frame import Vector
+from service.core.geometry import angles
+from service.core.setpoint.setpoint import decided
+from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation
 from service.learning.choice import Choice, Parameters, rms
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned

@@ -13,8 +13,8 @@ import numpy as np
 from kmp import KMP, Gaussians
 from kmp.orientation import OrientationKMP, log
 from service.contract.requests import ViaPoint
-from service.core.record import Vector
-from service.core.rotation import angles
+from service.core.frame import Vector
+from service.core.geometry import angles
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
 from service.learning.pose import flat_gripper, flat_orientation, is_flat

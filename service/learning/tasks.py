@@ -16,12 +16,11 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
 from service.contract.requests import ViaPoint
-from service.core.intake.stillness import stillness_of
-from service.core.record import Vector
+from service.core.frame import Vector
+from service.core.intake.hand_estimator import stillness_of
 from service.core.skill.model import Model
 from service.core.skill.task import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, NamedViaPoints, Task, TaskParameters
-from service.core.skill.task_instance import TaskInstance
-from service.core.skill.task_parameterized import TaskParameterized
+from service.core.skill.task_parameterized import TaskInstance, TaskParameterized
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M, Gate, gate_between, nonsense

@@ -14,7 +14,7 @@ import numpy as np
 
 from kmp import ViaPointMissed
 from service.contract.requests import ViaPoint, ViaPointInForce
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through

@@ -11,9 +11,8 @@ import numpy as np
 
 from service.config import Settings
 from service.contract.channels import CHANNELS, EVENT_KINDS, EVENT_NUMBERS
-from service.core.frame import TIMING, Event, Tick, frame_layout, state_layout
+from service.core.frame import TIMING, Event, Record, Tick, frame_layout, state_layout
 from service.core.outputs import Outputs
-from service.core.record import Record
 
 LONGEST_NOTE = 16_384  # characters; JSON may need six bytes for each
 LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead

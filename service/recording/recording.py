@@ -24,9 +24,8 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import BASE, Quaternion, SceneObject, Transform, Vector3
 from service.contract.records import SIDES
-from service.core.frame import Tick, encode
+from service.core.frame import Record, Tick, encode
 from service.core.outputs import Outputs
-from service.core.record import Record
 from service.demonstrations.pose_streams import ENDINGS
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recording.mcap_reader import FileFault, Messages

@@ -24,9 +24,8 @@ import msgspec
 
 from service import child
 from service.config import Settings
-from service.core.frame import Tick
+from service.core.frame import Record, Tick
 from service.core.outputs import Outputs
-from service.core.record import Record
 from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, pack, pack_note
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from service.config import Settings
-from service.core.record import Record
+from service.core.frame import Record
 from service.recording.paths import MB, RecordingPaths
 from service.recording.protocol import TickMessage
 from service.recording.recording import Recorder

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from service.config import Settings
 from service.contract import cdr, channels
 from service.contract.messages import WireError
-from service.core.frame import TIMING, decode, frame_layout, state_layout
-from service.core.record import Record
+from service.core.frame import TIMING, Record, decode, frame_layout, state_layout
 from service.recording.mcap_file import RecordingError
 from service.recording.mcap_reader import Messages
 

@@ -17,8 +17,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from service.contract import cdr
-from service.core.frame import TIMING, frame_layout
-from service.core.record import Record, Records, Vector
+from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
 from service.recording.recording import Recording

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from service import palette
 from service.contract.records import SIDES, Mode
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.report.report import Report
 from service.report.tables import Table, comparison, names_of, summary, tables
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.contract.requests import ViaPoint
-from service.core.record import Records, Vector
+from service.core.frame import Records, Vector
 from service.report.columns import Columns, runs
 
 NEAR_M = 0.03  # hands nearer than this, or than its radius, to where a place was taught are there

@@ -26,8 +26,7 @@ from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES
 from service.core.controller import Controller
-from service.core.frame import Event, Tick
-from service.core.record import Vector
+from service.core.frame import Event, Tick, Vector
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon.clock import SPIN_NS, Deadlines, ask_for_real_time

@@ -14,11 +14,9 @@ from scipy.spatial.transform import Rotation
 from service.config import Settings
 from service.contract.incidents import word
 from service.contract.records import SIDES, Mode, Reason
-from service.core.frame import STAGES, TIMING
-from service.core.record import Record
-from service.core.rotation import off_target
+from service.core.frame import STAGES, TIMING, Record
+from service.core.geometry import between_segments, off_target, place
 from service.core.separation.body import body_of
-from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import FARTHEST
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN

@@ -26,7 +26,7 @@ from service.config import Settings
 from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import SceneObject, WireError, in_order
-from service.core.record import Record
+from service.core.frame import Record
 from service.learning.demonstration import Demonstration
 from service.recording.paths import skills_folder
 from service.recording.recording import OBJECTS

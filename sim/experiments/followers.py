@@ -17,9 +17,8 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from service.config import Settings, robot_description
 from service.contract.records import SIDES, Flag
 from service.core.arm.arm import Arm, Closing
-from service.core.frame import Tick
+from service.core.frame import Tick, Vector
 from service.core.limiter.limiter import Limiter
-from service.core.record import Vector
 from service.core.skill.skill import Skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.moving_hands import PERIOD_S, Moving

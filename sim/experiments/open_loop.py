@@ -17,14 +17,11 @@ from numpy.typing import NDArray
 
 from service.config import Settings, robot_description
 from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick
-from service.core.intake.stillness import STILL
-from service.core.record import Record
-from service.core.skill.barycentric import STEP_S
+from service.core.frame import Frame, Record, Tick
+from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Known, Prediction, Skill
-from service.core.skill.task_instance import CALM_MPS, MAX_MPS2
-from service.core.skill.workspace import clamp
+from service.core.skill.skill import Known, Prediction, Skill, clamp
+from service.core.skill.task_parameterized import CALM_MPS, MAX_MPS2, STEP_S
 from sim.experiments.results import Array
 
 Law: TypeAlias = Callable[[Array], Array]

@@ -19,8 +19,8 @@ from scipy.spatial.distance import cdist
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
-from service.core.skill.barycentric import STEP_S
 from service.core.skill.skill import Skill
+from service.core.skill.task_parameterized import STEP_S
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import StoredSkill

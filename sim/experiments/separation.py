@@ -18,8 +18,8 @@ from scipy.ndimage import maximum_filter1d
 from kmp.compiled import compiled
 from service.config import Settings, robot_description
 from service.contract.records import Flag
+from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
-from service.core.separation.capsules import between_segments, place
 from service.core.separation.separation import SLIP, Separation, allowed_speed
 from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents

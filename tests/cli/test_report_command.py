@@ -15,7 +15,7 @@ import pytest
 from service import palette
 from service.cli.main import main
 from service.config import Settings
-from service.core.record import blank
+from service.core.frame import blank
 from service.recording.recording import Recorder, Recording
 from service.report.page import thinned
 from support.paths import RECORDINGS, ROOT

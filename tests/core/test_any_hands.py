@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from service.contract.records import SIDES, Cause, Mode
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import Tick, order
-from service.core.record import Vector
+from service.core.frame import Tick, Vector, order
 from service.learning.skill_file import decoded
 from support.in_process import ASSUMED, LEFT, RIGHT, hand
 from support.paths import RECORDINGS

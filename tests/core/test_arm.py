@@ -20,7 +20,7 @@ from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
 from service.core.arm.arm import Arm
 from service.core.limiter.limiter import Limiter
-from service.core.skill.workspace import clamp
+from service.core.skill.skill import clamp
 from support.wam import JOINT_NAMES, URDF
 
 Vector = npt.NDArray[np.float64]

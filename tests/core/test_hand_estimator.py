@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from service.config import HandSettings
+from service.core.frame import Vector
 from service.core.intake import hand_estimator
 from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE, model
-from service.core.record import Vector
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 

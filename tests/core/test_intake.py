@@ -12,7 +12,7 @@ import pytest
 from service.config import HandSettings
 from service.contract.messages import PoseStamped
 from service.contract.records import Cause
-from service.core.rotation import rotation
+from service.core.geometry import rotation
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
 

@@ -21,8 +21,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.frame import Event, Frame, Tick, order
-from service.core.record import Vector
+from service.core.frame import Event, Frame, Tick, Vector, order
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.scene import Scene

@@ -10,7 +10,7 @@ from service.core.arm.arm import DAMPING, TURN_LEVER
 from service.core.arm.inverse_kinematics import describe, tool_speeds
 from service.core.arm.least_squares import least_squares
 from service.core.decision.decision import measured_error
-from service.core.record import parameters
+from service.core.frame import parameters
 from service.core.setpoint.setpoint import GAP_FREE, GAP_SLOW, slow_down
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.contract.records import Field
-from service.core.record import Record, Vector
+from service.core.frame import Record, Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import Model, Motion
 from service.core.skill.skill import MODELS, STATE_FIELDS, Skill

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick
+from service.core.frame import Tick, Vector, copied
 from service.core.intake import plausibility
-from service.core.record import Vector, as_array, copied
 from service.core.skill.skill import Skill
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from support.tracked import LEFT as LEFT_SIDE
@@ -337,8 +336,8 @@ def test_compiled_and_plain_memory_agree() -> None:
         ticks, answers = int(random.integers(0, 12)), []
         for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
             state["tick"] += ticks
-            way(plausibility.note)(as_array(state).view(np.recarray), 0, jumped, 0.002)
-            answers.append(way(plausibility.is_confirmed)(as_array(state).view(np.recarray), 0, at, 50, 0.002))
+            way(plausibility.note)(state.base.view(np.recarray), 0, jumped, 0.002)
+            answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), 0, at, 50, 0.002))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
         for name in ("jump_first_tick", "jump_newest_tick", "jump_count", "jump_is_swap"):

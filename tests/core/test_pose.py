@@ -16,12 +16,11 @@ from service.config import Settings
 from service.contract import cdr
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import state_layout
+from service.core.frame import blank, state_layout
+from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.limiter import Limiter
 from service.core.outputs import outgoing
-from service.core.record import blank
-from service.core.rotation import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
-from service.core.setpoint.orientation import SPEED_SHARE, OrientationSetpoint
+from service.core.setpoint.setpoint import SPEED_SHARE, OrientationSetpoint
 from service.core.skill.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.intake.stillness import stillness_of
-from service.core.record import Vector
+from service.core.frame import Vector
+from service.core.intake.hand_estimator import stillness_of
 
 HZ = 125
 

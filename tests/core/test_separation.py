@@ -20,11 +20,9 @@ from service.contract.records import Flag, Mode
 from service.core.arm.arm import Arm, Kinematics
 from service.core.arm.least_squares import keep_under, least_squares
 from service.core.controller import Controller, start_state
-from service.core.frame import Tick, frame_layout
-from service.core.record import Vector, blank
-from service.core.rotation import quaternion_of
+from service.core.frame import Tick, Vector, blank, frame_layout
+from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from service.core.separation.body import body_of
-from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
 from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted

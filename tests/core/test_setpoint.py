@@ -14,12 +14,19 @@ from hypothesis import strategies as st
 
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
+from service.core.frame import Vector, blank, copied
 from service.core.intake.intake import Intake
-from service.core.record import Vector, blank, copied
-from service.core.setpoint.bounds import HULL_MARGIN, HULL_TIME_S, RETURN_SHARE, speed_to_come
-from service.core.setpoint.setpoint import SetpointGenerator, stop_distance, tracker_gains
-from service.core.skill.workspace import Target
-from service.core.stops import fastest_stop
+from service.core.setpoint.bounds import (
+    HULL_MARGIN,
+    HULL_TIME_S,
+    RETURN_SHARE,
+    fastest_stop,
+    speed_to_come,
+    stop_distance,
+    tracker_gains,
+)
+from service.core.setpoint.setpoint import SetpointGenerator
+from service.core.skill.skill import Target
 from support.explained import Explained, margin
 from support.wam import STATE
 

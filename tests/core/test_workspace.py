@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.config import Reach
-from service.core.record import Vector
-from service.core.skill.workspace import clamp, is_reachable
+from service.core.frame import Vector
+from service.core.skill.skill import clamp, is_reachable
 
 REACH = Reach()
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])

@@ -15,8 +15,7 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
 from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, frame_layout
-from service.core.record import blank
+from service.core.frame import Event, Frame, Tick, blank, frame_layout
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEYS, InputMonitor, evidence
 from service.daemon.status import CellStatus

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.contract.requests import RequestError, ViaPoint, decode_request
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.script import HandMotions, HandScript

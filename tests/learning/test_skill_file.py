@@ -15,7 +15,7 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures

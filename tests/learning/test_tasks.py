@@ -14,10 +14,9 @@ import pytest
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
-from service.core.skill.barycentric import nearest_between
 from service.core.skill.skill import Skill
 from service.core.skill.task import MOST_CORNERS
-from service.core.skill.task_parameterized import TaskParameterized
+from service.core.skill.task_parameterized import TaskParameterized, nearest_between
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded

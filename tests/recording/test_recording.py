@@ -22,8 +22,7 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
-from service.core.frame import Event, Tick, definitions, encode
-from service.core.record import blank
+from service.core.frame import Event, Tick, blank, definitions, encode
 from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError

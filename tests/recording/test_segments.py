@@ -20,8 +20,7 @@ import pytest
 from service.cli.main import main
 from service.config import Files, Settings
 from service.core.controller import Controller, run
-from service.core.frame import TIMING, Frame, Tick
-from service.core.record import blank
+from service.core.frame import TIMING, Frame, Tick, blank
 from service.core.skill.skill import Skill
 from service.recording.paths import RecordingPaths
 from service.recording.recording import Recording

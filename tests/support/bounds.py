@@ -7,7 +7,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.records import Mode, Reason
 from service.core.arm.arm import Arm
-from service.core.record import Vector
+from service.core.frame import Vector
 from support.wam import URDF
 
 SETTINGS = Settings()

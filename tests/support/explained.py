@@ -9,7 +9,7 @@ import pytest
 
 from service.config import Settings, ToolSettings
 from service.core.controller import Controller
-from service.core.record import Record, Vector
+from service.core.frame import Record, Vector
 from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_SPANS,
@@ -19,8 +19,7 @@ from service.core.setpoint.bounds import (
     speed_to_come,
 )
 from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.skill.skill import Skill
-from service.core.skill.workspace import Target
+from service.core.skill.skill import Skill, Target
 
 
 def margin(tool: ToolSettings) -> float:
@@ -74,5 +73,5 @@ class Explained(SetpointGenerator):
 def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:
     """A controller whose setpoint generator asserts its bound."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.core.setpoint.stage.SetpointGenerator", Explained)
+        patch.setattr("service.core.setpoint.setpoint.SetpointGenerator", Explained)
         return Controller(settings, skill, urdf=urdf)

@@ -15,8 +15,7 @@ from service.config import robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.frame import Frame
-from service.core.record import Vector
+from service.core.frame import Frame, Vector
 from service.learning.skill_file import decoded
 from service.recording.recording import Recording
 from service.recording.replay import replay, ticks

@@ -11,8 +11,7 @@ import rerun as rr
 
 from service.config import Settings
 from service.contract import cdr, messages
-from service.core.frame import TIMING, Event, Tick
-from service.core.record import Record, blank
+from service.core.frame import TIMING, Event, Record, Tick, blank
 from service.recording.recording import Recorder
 from service.recording.scribe import Scribe
 from support.wam import FRAME, JOINT_NAMES, STATE

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.contract.requests import ViaPoint
-from service.core.record import Vector
+from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn

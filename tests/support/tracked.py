@@ -9,8 +9,8 @@ import numpy as np
 from service.config import HandSettings, Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
+from service.core.frame import Record, Vector, blank
 from service.core.intake.intake import Intake
-from service.core.record import Record, Vector, blank
 from support.wam import JOINT_NAMES, STATE
 
 PERIOD_S = 0.002

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from service.contract.records import Field, Layout
+from service.contract.records import Layout
 
 STATE: Layout = ()
-FRAME = (
-    Field("tool", "float64", (3,)),  # where the commanded joints put the tool [m]
-    Field("tool_orientation", "float64", (4,)),  # how the commanded joints turn the tool
-)
+FRAME: Layout = ()

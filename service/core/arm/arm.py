@@ -10,13 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from kmp.compiled import compiled
-from service.config import Settings
+from service.config import JointSettings, Settings
 from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe, follow, joint_costs, joint_step
 from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
-from service.core.limiter.limiter import MARGIN, approach_gain
-from service.core.record import Record, Records, Vector, as_array, parameters, structured
-from service.core.rotation import quaternion_of
+from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.separation import Separation
 
 # Chosen on the WAM, whose tool reaches 0.88 m from its shoulder, and scaled by the arm's reach.
@@ -34,6 +31,8 @@ SPARING = 0.2  # power of a joint's acceleration limit by which its speed is wei
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
 PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
+
+MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
 class Solution(NamedTuple):
@@ -158,6 +157,7 @@ class Arm:
                 ("jacobian", np.float64, (6, joints)),
             ]
         )
+        self._blank = structured(1, self._kinematics)
         self._goal = parameters(
             position=np.zeros(3),
             velocity=np.zeros(3),
@@ -174,7 +174,7 @@ class Arm:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        here = structured(1, self._kinematics)
+        here = self._blank.copy()
         here["joints"][0], here["position"][0] = q, placement.translation
         describe(self.parameters, here, np.ascontiguousarray(jacobian), placement.rotation.copy())
         return Kinematics(here)
@@ -234,13 +234,6 @@ class Arm:
         return _solution(out, joint_step(self.parameters, self.at(q).record, self._goal, constraints, count, out))
 
 
-@compiled
-def write_tool(heres: Records, frames: Records) -> None:
-    """Into the frame where the commanded joints put the tool."""
-    frames[0].tool[:] = heres[0].position
-    quaternion_of(heres[0].rotation, frames[0].tool_orientation)
-
-
 def _solution(velocity: Vector, flags: int) -> Solution:
     velocity.setflags(write=False)
     return Solution(velocity, bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
@@ -250,3 +243,13 @@ def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
     """The model with the named joints only, the others locked at 0."""
     locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
     return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+
+
+def approach_gain(limits: JointSettings) -> Vector:
+    """Greatest speed toward a position limit per distance to it, (J,) [1/s].
+
+    Braking along it takes at most half of the acceleration and a quarter of the jerk.
+    """
+    velocity = np.array(limits.velocity)
+    gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))
+    return gain

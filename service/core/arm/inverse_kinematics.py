@@ -13,8 +13,8 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.arm.least_squares import factorise, keep_under, least_squares, substitute
-from service.core.record import Records, Vector
-from service.core.rotation import axis_of, quaternion_of, swing, turn_between
+from service.core.frame import Records, Vector
+from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
 POSITION_GAIN = 50.0  # [1/s] of a small error's decay

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.record import Vector
+from service.core.frame import Vector
 
 LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step

@@ -11,9 +11,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.records import Mode, Reason
-from service.core.frame import Event
+from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
-from service.core.record import Record, Records, Vector, as_array, parameters
 
 READY = 1  # an arm within its limits
 RETURNING = 2  # an arm on its way into them
@@ -49,7 +48,7 @@ class Decision:
         )
         self.measured = (0.0, 0.0)
 
-    def step(self, state: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
+    def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
         """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
         STARTS_MEASURED.
 
@@ -57,6 +56,7 @@ class Decision:
         threshold, NaN where it predicts nothing.
         """
         starts, error, speed = _step(as_array(state), here, self._parameters, known, gate_m, threshold)
+        frame["mode"], frame["reason"] = state["mode"], state["reason"]
         if error >= 0.0:
             self.measured = error, speed
         return int(starts)
@@ -79,13 +79,13 @@ class Decision:
                     state["mode"], state["arm_ready"] = HOLD, 0
             case "fault":
                 if state["mode"] != FAULT:
-                    self.fail(state, Reason.SERVICE)
+                    state["mode"], state["reason"] = FAULT, Reason.SERVICE
             case _:
                 raise ValueError(f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}")
 
-    def fail(self, state: Record, reason: Reason, *, speed: float | None = None) -> None:
-        """At fault from now on, for a `speed` [m/s] of the tool where that is why."""
-        state["mode"], state["reason"] = FAULT, reason
+    def fail(self, state: Record, frame: Record, reason: Reason, *, speed: float | None = None) -> None:
+        """At fault from this tick on, for a `speed` [m/s] of the tool where that is why."""
+        state["mode"], state["reason"] = frame["mode"], frame["reason"] = FAULT, reason
         if speed is not None:
             self.measured = self.measured[0], speed
 
@@ -175,9 +175,3 @@ def measured_error(states: Records, heres: Records) -> tuple[float, float]:
             along += here.tasks[axis, joint] * state.measured_velocities[joint]
         speed += along * along
     return error, math.sqrt(speed)
-
-
-@compiled
-def write_decision(states: Records, frames: Records) -> None:
-    """Into the frame what was decided."""
-    frames[0].mode, frames[0].reason = states[0].mode, states[0].reason

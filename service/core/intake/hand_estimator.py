@@ -12,6 +12,9 @@ leaves nothing in them, white noise of variance r leaves 20 r an axis.
 
 Arrays of one hand: means (3, 3, 3) by mode, then position, velocity and acceleration [m, m/s,
 m/s²], by axis; covariances (3, 3, 3) by mode, alike for the axes; probabilities (3,) of the modes.
+
+Stillness, 0 to 1, tells a hand that waits at a via-point from one on its way: it comes slowly and
+goes at once, and neither a tremor nor a turn on the way is still.
 """
 
 from __future__ import annotations
@@ -23,9 +26,47 @@ import numpy as np
 from scipy.linalg import expm
 
 from kmp.compiled import compiled
+from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.intake import MODES
-from service.core.intake.stillness import STILL, smoothing, stillness_after
-from service.core.record import Record, Records, Vector, as_array, parameters
+
+LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
+STILL_SPEED = 0.05  # [m/s] a hand this fast is on its way
+RISE_S = 0.2  # in which a hand comes to be still
+FALL_S = 0.03  # in which it is still no more
+ROUND_TO = 1e9  # of what is remembered: machines that differ in the last bits agree
+STILL = np.ones(2)  # both hands
+
+
+def smoothing(period_s: float) -> Vector:
+    """By how much (3,) the lowpass velocity, rising and falling stillness change in a period."""
+    return 1.0 - np.exp(-period_s / np.array([LOWPASS_S, RISE_S, FALL_S]))
+
+
+@compiled
+def stillness_after(velocity: Vector, smoothing: Vector, lowpass: Vector, stillness: float) -> float:
+    """The stillness of a hand a period later, when it moves so (3,) [m/s]; `lowpass` (3,) is its
+    velocity without tremor, moved on too.
+    """
+    square = 0.0
+    for axis in range(3):
+        lowpass[axis] = np.rint((lowpass[axis] + smoothing[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO) / ROUND_TO
+        square += lowpass[axis] * lowpass[axis]
+    share = square / STILL_SPEED**2
+    now = math.exp(-share * share)
+    after = stillness + (smoothing[1] if now > stillness else smoothing[2]) * (now - stillness)
+    return float(np.rint(after * ROUND_TO) / ROUND_TO)
+
+
+def stillness_of(velocities: Vector, period_s: float) -> Vector:
+    """The stillness (T, 2) of both hands that moved so (T, 6) [m/s], from stillness."""
+    out, stillness = np.empty((len(velocities), 2)), STILL.copy()
+    changed, lowpass = smoothing(period_s), np.zeros((2, 3))
+    for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
+        for side in (0, 1):
+            stillness[side] = stillness_after(velocity[side], changed, lowpass[side], stillness[side])
+        row[:] = stillness
+    return out
+
 
 REVERT_A = 15.0  # [1/s] of the acceleration
 REVERT_V = 100.0  # [1/s²] of the velocity
@@ -43,7 +84,7 @@ START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is 
 START_ACCELERATION = 1.0  # [m/s²] likewise
 LEAST_PROBABILITY = 1e-4  # of a mode
 MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
-ROUND_TO = 1e12  # of probabilities: machines that differ in the last bits agree
+ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
 
 
 class HandEstimator:
@@ -209,7 +250,7 @@ def _update(
         modes[i] = max(modes[i], LEAST_PROBABILITY)
     _normalise(modes)
     for i in range(MODES):
-        modes[i] = np.rint(modes[i] * ROUND_TO) / ROUND_TO
+        modes[i] = np.rint(modes[i] * ROUND_PROBABILITY_TO) / ROUND_PROBABILITY_TO
 
 
 @compiled

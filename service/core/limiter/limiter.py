@@ -16,15 +16,19 @@ import numpy as np
 import ruckig
 
 from kmp.compiled import compiled
-from service.config import JointSettings
-from service.core.record import Records, Vector, parameters
-from service.core.stops import fastest_stop, stop_together
+from service.config import JointSettings, Settings
+from service.core.arm.arm import MARGIN, Arm, Kinematics, approach_gain
+from service.core.arm.inverse_kinematics import tool_speeds
+from service.core.decision.decision import FAULT
+from service.core.frame import Record, Records, Vector, as_array, parameters
+from service.core.geometry import quaternion_of
+from service.core.separation.separation import Separation
+from service.core.setpoint.bounds import fastest_stop, stop_together
 
 ROUND_TO = 1e9  # [1/rad] of the positions: machines that differ in the last bits agree
 LARGEST = 1e6  # of any number of a state that is calculated with
 BOUNDED = 1  # flag of a step: the wanted velocity was cut
 CHASED = 2  # some joint cannot have it in a tick
-MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
 class Limited(NamedTuple):
@@ -36,16 +40,6 @@ class Limited(NamedTuple):
     velocity: Vector
     acceleration: Vector
     limited: bool
-
-
-def approach_gain(limits: JointSettings) -> Vector:
-    """Greatest speed toward a position limit per distance to it, (J,) [1/s].
-
-    Braking along it takes at most half of the acceleration and a quarter of the jerk.
-    """
-    velocity = np.array(limits.velocity)
-    gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))
-    return gain
 
 
 class Limiter:
@@ -193,3 +187,96 @@ def _stuck(q: Vector) -> Limited:
 def _frozen(moved: Vector, *, limited: bool) -> Limited:
     moved.setflags(write=False)
     return Limited(moved[0], moved[1], moved[2], limited)
+
+
+NEAR_SPEED = 0.95  # of the tool's greatest; what the joints turn in a tick changes it by less than the rest
+
+
+class Moved(NamedTuple):
+    """What came of a step: where the arm is then; whether a limit kept the joints from what was
+    wanted, and whether that was separation; the tool's speed [m/s] where it is too fast, else 0.
+    """
+
+    here: Kinematics
+    limited: bool
+    separated: bool
+    too_fast: float
+    moving: bool  # before
+
+
+class LimiterStage:
+    """Moves the state's joints (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
+
+    def __init__(self, settings: Settings, arm: Arm) -> None:
+        self._arm, self._max_speed = arm, settings.tool.max_speed
+        self._limiter = Limiter(settings.joints, settings.period_s)
+        self._still, self._jerk = np.zeros(len(settings.joints.names)), np.array(settings.joints.jerk)
+
+    def begin(self, state: Record, joints: Vector) -> None:
+        """The joints (J,) [rad] at rest where the arm is."""
+        state["joints"] = 0.0
+        state["joints"][0] = joints
+
+    def step(self, state: Record, frame: Record, wanted: Vector, separation: Separation) -> Moved:
+        """Moves the joints on toward wanted velocities (J,) [rad/s].
+
+        They brake where the tool would pass its greatest speed, and one that does all the same is
+        too fast; and where they would approach something too fast, unless that brakes less.
+        """
+        q, dq, ddq = state["joints"]
+        moved = self._limiter.step(q, dq, ddq, wanted)
+        limited, excess = moved.limited, separation.excess(*moved[1:3])
+        separated = excess > 0.0
+        if separated:
+            stop = self._limiter.stop(q, dq, ddq)
+            separated = separation.excess(*stop[1:3]) < excess
+            moved, limited = (stop, True) if separated else (moved, limited)
+        here, too_fast = self._arm.at(moved.position), 0.0
+        if self._comes_to(moved, here) > self._max_speed:
+            moved, limited = self._limiter.stop(q, dq, ddq), True
+            here = self._arm.at(moved.position)
+            speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
+            too_fast = speed if speed > self._max_speed else 0.0
+        moving = _take(as_array(state), as_array(frame), here.record, *moved[:3])
+        return Moved(here, limited, separated, too_fast, moving)
+
+    def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
+        """The joints one period on their way to rest, together; or each as it can, where that
+        approaches things less.
+        """
+        q, dq, ddq = state["joints"]
+        moved = self._limiter.stop(q, dq, ddq)
+        excess = separation.excess(*moved[1:3])
+        if excess > 0.0:
+            other = self._limiter.step(q, dq, ddq, self._still)
+            moved = other if separation.excess(*other[1:3]) < excess else moved
+        here = self._arm.at(moved.position)
+        moving = _take(as_array(state), as_array(frame), here.record, *moved[:3])
+        return Moved(here, limited=False, separated=False, too_fast=0.0, moving=moving)
+
+    def _comes_to(self, moved: Limited, here: Kinematics) -> float:
+        """The greatest speed [m/s] that the tool comes to if the joints stop after a step; near the
+        limit also as the arm will stand then, for what joints do to the tool changes on the way.
+        """
+        speed: float = tool_speeds(here.record, *moved[1:3], self._jerk)[1]
+        if not NEAR_SPEED * self._max_speed < speed <= self._max_speed:
+            return speed
+        stop = self._limiter.stop(*moved[:3])
+        then = self._arm.at(stop.position).record
+        return max(speed, tool_speeds(then, *stop[1:3], self._jerk)[1])
+
+
+@compiled
+def _take(
+    states: Records, frames: Records, heres: Records, position: Vector, velocity: Vector, acceleration: Vector
+) -> bool:
+    """Into state and frame the joints, and where they put the tool; whether they moved before."""
+    state, frame, here, moving = states[0], frames[0], heres[0], False
+    for joint in range(len(position)):
+        moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    state.joints[0, :], state.joints[1, :], state.joints[2, :] = position, velocity, acceleration
+    frame.joints[:], frame.joint_velocities[:], frame.joint_accelerations[:] = position, velocity, acceleration
+    frame.commanded = moving or (state.arm_ready and state.mode != FAULT)
+    frame.tool[:] = here.position
+    quaternion_of(here.rotation, frame.tool_orientation)
+    return moving

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.config import Settings
-from service.core.record import Records, Vector, structured
-from service.core.rotation import rotation
-from service.core.separation.capsules import CAPSULE, between_segments, place
+from service.core.frame import Records, Vector, structured
+from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.urdf import Joint, Shape, Urdf
 
 LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it

@@ -22,9 +22,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.requests import ViaPoint
-from service.core.record import Record, Records, Vector, as_array, parameters, structured
+from service.core.frame import Record, Records, Vector, as_array, parameters, structured
+from service.core.geometry import between_segments, nearest_to_box, place, to_box
 from service.core.separation.body import body_of
-from service.core.separation.capsules import between_segments, nearest_to_box, place, to_box
 
 FARTHEST = 3.0  # [m] no distance is reported as greater
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free

@@ -1,5 +1,6 @@
 """Where a setpoint may go and how fast: the box around the last targets, the step that can still
-stop in it, and what comes back to it. docs/bounds.md has the proof.
+stop in it, and what comes back to it; docs/bounds.md has the proof. And the stops themselves, of
+one axis or of several that come to rest together.
 """
 
 from __future__ import annotations
@@ -7,11 +8,105 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.linalg import solve_continuous_are
 
 from kmp.compiled import compiled
-from service.core.record import Records, Vector
+from service.core.frame import Records, Vector
 from service.core.setpoint import HULL_SPANS
-from service.core.stops import fastest_stop
+
+LEAST_SHARE, HALVINGS = 1e-3, 40  # of its acceleration with which an axis waits for the slowest; how that is found
+
+
+@compiled
+def fastest_stop(
+    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float, dt: float, out: Vector
+) -> None:
+    """The fastest stop of one axis within `max_acceleration` and `max_jerk`.
+
+    out (6,): velocity, acceleration and way after dt, least and greatest way until rest, duration.
+    """
+    then = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
+    sign = -1.0 if then > 0.0 else 1.0  # with it the stop is a push in positive direction
+    v, a = sign * velocity, sign * acceleration
+    peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
+    hold = 0.0
+    if a > max_acceleration:  # beyond its limit it comes down to that first
+        peak = max_acceleration
+        hold = max(-v - a * a / (2.0 * max_jerk), 0.0) / max_acceleration
+    elif peak > max_acceleration:
+        peak = max_acceleration
+        hold = (-v + (a * a - 2.0 * max_acceleration * max_acceleration) / (2.0 * max_jerk)) / max_acceleration
+    else:
+        peak = max(peak, a)
+    x = t = low = high = 0.0
+    found = False
+    after_x = after_v = after_a = 0.0
+    for phase in range(3):
+        if phase == 0:
+            jerk, lasts = (max_jerk, (peak - a) / max_jerk) if a <= peak else (-max_jerk, (a - peak) / max_jerk)
+        elif phase == 1:
+            jerk, lasts = 0.0, hold
+        else:
+            jerk, lasts = -max_jerk, peak / max_jerk
+        if lasts <= 0.0:
+            continue
+        if not found and dt <= t + lasts:
+            h = dt - t
+            after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
+            after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
+            found = True
+        # the least and greatest way inside the phase are where the velocity is 0
+        disc = a * a - 2.0 * jerk * v
+        for root in (-1.0, 1.0):
+            h = 0.0
+            if jerk != 0.0 and disc >= 0.0:
+                h = (-a + root * math.sqrt(disc)) / jerk
+            elif jerk == 0.0 and a != 0.0:
+                h = -v / a
+            if 0.0 < h < lasts:
+                way = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
+                low, high = min(low, way), max(high, way)
+        x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
+        v += lasts * (a + lasts * jerk / 2.0)
+        a += lasts * jerk
+        t += lasts
+        low, high = min(low, x), max(high, x)
+    if not found:
+        after_x, after_v, after_a = x, 0.0, 0.0
+    out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
+    out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)
+    out[5] = t
+
+
+@compiled
+def stop_together(
+    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, dt: float
+) -> Vector:
+    """One dt of a stop at whose end all axes (J,) come to rest at once, as soon as the slowest can.
+
+    (3, J): ways, velocities, accelerations. The others brake less than they could, so that what
+    they move together slows down on its way.
+    """
+    count = len(velocities)
+    out, stop = np.zeros((3, count)), np.zeros(6)
+    duration = 0.0
+    for i in range(count):
+        fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], dt, stop)
+        duration = max(duration, stop[5])
+    for i in range(count):
+        low, share = LEAST_SHARE, 1.0
+        if velocities[i] != 0.0 or accelerations[i] != 0.0:
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + share)
+                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], dt, stop)
+                if stop[5] <= duration:
+                    share = middle
+                else:
+                    low = middle
+        fastest_stop(velocities[i], accelerations[i], share * max_acceleration[i], max_jerk[i], dt, stop)
+        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
+    return out
+
 
 HULL_TIME_S = 0.35  # the setpoint stays near the targets of so long
 HULL_MARGIN = 0.03  # [m] around these
@@ -19,6 +114,9 @@ RETURN_SHARE = 1 / 16  # of the speed it may have with which a setpoint comes ba
 ON_BOUND = 1e-9  # [m] beyond a bound that are rounding
 ROUNDING = 1e-12  # [m] away from a bound that are rounding
 BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
+DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
+REVERT_V = 150.0  # [1/s²] with which it expects a target's velocity to end
+REVERT_A = 5.0  # [1/s] with which the tracker expects a target's acceleration to end
 
 
 @compiled
@@ -153,3 +251,37 @@ def speed_to_come(velocity: Vector, acceleration: Vector, max_jerk: float, least
         then = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * max_jerk)
         total += max(abs(velocity[i]), abs(then), least) ** 2
     return math.sqrt(total)
+
+
+@compiled
+def stop_distance(speed: float, acceleration: float, brake: float, change: float) -> float:
+    """Way [m] to rest along the motion, braking by `brake` [m/s²] after ramps of jerk `change`
+    [m/s³].
+    """
+    if acceleration >= 0.0:
+        t = acceleration / change
+        speed_then = speed + 0.5 * acceleration * t
+        way = t * (speed + acceleration * t / 3.0)
+    else:  # as if the braking had begun from the crest before
+        t = min(-acceleration, brake) / change
+        speed_then = speed + 0.5 * change * t * t
+        way = -(speed_then * t - change * t * t * t / 6.0)
+    if speed_then >= brake * brake / change:
+        return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+    return way + speed_then * math.sqrt(speed_then / change)
+
+
+def tracker_gains(jerk_weight: float) -> Vector:
+    """Gains (5,) of the error, of target velocity and acceleration, and of the setpoint's.
+
+    For the jerk that minimises the integral of error² + jerk_weight [s⁶] jerk² while the target's
+    acceleration reverts to 0 as REVERT_A and REVERT_V say.
+    """
+    a = np.zeros((5, 5))  # error, target velocity and acceleration, setpoint velocity and acceleration
+    a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = 1.0, -1.0, 1.0, -REVERT_V, -REVERT_A, 1.0
+    b = np.zeros((5, 1))
+    b[4, 0] = 1.0
+    cost = np.zeros((5, 5))
+    cost[0, 0] = 1.0
+    riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
+    return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], DECIMALS))

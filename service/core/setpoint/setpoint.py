@@ -19,17 +19,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.core.record import Record, Records, Vector, as_array, parameters
+from service.core.arm.arm import Arm, Kinematics
+from service.core.arm.inverse_kinematics import joint_costs
+from service.core.frame import Record, Records, Vector, as_array, parameters
+from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, bounds, remember, take_safe, what_is_wrong
-from service.core.skill.workspace import Target
+from service.core.setpoint.bounds import (
+    BOUNDS,
+    HULL_TIME_S,
+    bounds,
+    remember,
+    stop_distance,
+    take_safe,
+    tracker_gains,
+    what_is_wrong,
+)
+from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN
+from service.core.skill.skill import Target, Wanted
 
-REVERT_A = 5.0  # [1/s] with which the tracker expects a target's acceleration to end
-REVERT_V = 150.0  # [1/s²] with which it expects a target's velocity to end
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
@@ -43,7 +53,6 @@ GAP_SLOW = 0.012  # [m] ... more so by every so far
 PLANNED = 1  # a step met a bound in planning
 STOPPED = 2  # the stop was begun
 WRONG = 3  # a bound was passed
-DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
 
 
 class SetpointGenerator:
@@ -92,22 +101,6 @@ class SetpointGenerator:
         They hold by the way a step is made; this looks again, from outside.
         """
         return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
-
-
-def tracker_gains(jerk_weight: float) -> Vector:
-    """Gains (5,) of the error, of target velocity and acceleration, and of the setpoint's.
-
-    For the jerk that minimises the integral of error² + jerk_weight [s⁶] jerk² while the target's
-    acceleration reverts to 0 as REVERT_A and REVERT_V say.
-    """
-    a = np.zeros((5, 5))  # error, target velocity and acceleration, setpoint velocity and acceleration
-    a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = 1.0, -1.0, 1.0, -REVERT_V, -REVERT_A, 1.0
-    b = np.zeros((5, 1))
-    b[4, 0] = 1.0
-    cost = np.zeros((5, 5))
-    cost[0, 0] = 1.0
-    riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
-    return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], DECIMALS))
 
 
 @compiled
@@ -266,19 +259,142 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
         jerk[i] = min(most, max(least, jerk[i]))
 
 
+TURN_GAIN = 12.0  # [1/s] of a small error's decay
+TURN_BRAKE_SHARE = 0.7  # of the acceleration, with which a large one's turn is planned to end
+TURN_SPEED_SHARE = 0.9  # of the tool's greatest: the arm needs the rest to catch up
+ROUND_TO = 1e9  # [s/rad] of the angular velocity: rounded so that a replay on another kind of CPU agrees
+
+
+class OrientationSetpoint:
+    """Turns the state's orientation (4,), at an angular velocity (3,) [rad/s], toward targets."""
+
+    def __init__(self, settings: Settings) -> None:
+        tool = settings.tool
+        self._limits = np.array([TURN_SPEED_SHARE * tool.max_turn_speed, tool.max_turn_acceleration])
+        self._about = float(tool.orientation == "full")
+        self._period_s = settings.period_s
+
+    def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
+        """Puts it where the tool is, before there are targets: rotation (3, 3), turning (3,)
+        [rad/s].
+        """
+        quaternion_of(rotation, state["orientation"])
+        state["turning"] = turning
+
+    def step(self, state: Record, orientation: Vector, turning: Vector) -> None:
+        """Turns it one period on toward an orientation (4,) that turns itself (3,) [rad/s].
+
+        Where the settings say that a direction is followed, +z goes the shortest way.
+        """
+        _turn(state["orientation"], state["turning"], orientation, turning, self._about, self._limits, self._period_s)
+
+
 @compiled
-def stop_distance(speed: float, acceleration: float, brake: float, change: float) -> float:
-    """Way [m] to rest along the motion, braking by `brake` [m/s²] after ramps of jerk `change`
-    [m/s³].
+def _turn(
+    quaternion: Vector,
+    turning: Vector,
+    target: Vector,
+    target_turning: Vector,
+    about: float,
+    limits: Vector,
+    dt: float,
+) -> None:
+    """One period, in place."""
+    error, wanted, axis, target_axis = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    axis_of(quaternion, axis)
+    along = 0.0
+    if about > 0.0:
+        turn_between(quaternion, target, error)
+    else:
+        axis_of(target, target_axis)
+        swing(axis, target_axis, error)
+        for i in range(3):
+            along += target_turning[i] * axis[i]
+    angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
+    # in proportion to the error when near, braking evenly from afar
+    brake, rate = TURN_BRAKE_SHARE * limits[1], TURN_GAIN
+    near = brake / TURN_GAIN**2
+    if angle > near:
+        rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
+    speed = 0.0
+    for i in range(3):
+        wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
+        speed += wanted[i] * wanted[i]
+    slower = min(1.0, limits[0] / max(math.sqrt(speed), 1e-12))
+    change = 0.0
+    for i in range(3):
+        wanted[i] = slower * wanted[i] - turning[i]
+        change += wanted[i] * wanted[i]
+    share = min(1.0, limits[1] * dt / max(math.sqrt(change), 1e-12))
+    for i in range(3):
+        turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
+        wanted[i] = dt * turning[i]
+    turn_on(quaternion, wanted)
+
+
+OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
+MOVES_S = 0.5  # for so long it is let be once it was told to move
+THERE_M = 0.01  # a tool that is no farther off is where it is to be
+
+
+def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
+    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
+    closure is predicted and the tool is so far off [m].
+
+    With hysteresis, and not before it can have moved: what trembles about the middle changes
+    nothing. Not on the way: a tool that is late would open or close elsewhere.
     """
-    if acceleration >= 0.0:
-        t = acceleration / change
-        speed_then = speed + 0.5 * acceleration * t
-        way = t * (speed + acceleration * t / 3.0)
-    else:  # as if the braking had begun from the crest before
-        t = min(-acceleration, brake) / change
-        speed_then = speed + 0.5 * change * t * t
-        way = -(speed_then * t - change * t * t * t / 6.0)
-    if speed_then >= brake * brake / change:
-        return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
-    return way + speed_then * math.sqrt(speed_then / change)
+    if closure == NO_GRIPPER:
+        return gripper
+    if gripper == UNKNOWN:
+        return CLOSED if closure > 0.5 else OPEN
+    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
+        return gripper
+    return CLOSED if closure > CLOSE_ABOVE else OPEN
+
+
+class SetpointStage:
+    """Leads the state's setpoints within the workspace's box (2, 3) [m] of the skill in force."""
+
+    def __init__(self, settings: Settings, arm: Arm) -> None:
+        self._arm, self._period_s = arm, settings.period_s
+        self._costs = np.empty((3, 3, len(settings.joints.names)))
+        self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
+
+    def begin(self, state: Record, frame: Record, here: Kinematics) -> None:
+        """The setpoints where the commanded joints have the tool."""
+        velocities = state["joints"][1]
+        self._position.begin(state, np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)]))
+        self._orientation.begin(state, here.rotation, here.jacobian[3:] @ velocities)
+        _write(as_array(state), as_array(frame))
+
+    def step(self, state: Record, frame: Record, wanted: Wanted, here: Kinematics, box: Vector, share: float) -> int:
+        """Leads the setpoints one period on; what `SetpointGenerator.step` says. `share` is that of
+        the setpoint's speed at which separation lets the tool go along.
+        """
+        slow = self._position.slow_down(state, here.record, share)
+        joint_costs(self._arm.parameters, here.record, self._costs)
+        met = self._position.step(state, wanted.target, box, self._costs, slow)
+        self._orientation.step(state, wanted.orientation, wanted.turning)
+        self._grip(state, wanted, here)
+        _write(as_array(state), as_array(frame))
+        return met
+
+    def _grip(self, state: Record, wanted: Wanted, here: Kinematics) -> None:
+        """Opens or closes the gripper as the skill asks, once the tool is where it is to be."""
+        before, closure = int(state["gripper"]), float(state["closure"])
+        since_s = self._period_s * int(state["tick"] - state["gripper_tick"])
+        off = math.dist(wanted.target.position.tolist(), here.record["position"][0].tolist())
+        state["gripper"] = decided(before, closure, since_s=since_s, off=off)
+        if state["gripper"] != before:
+            state["gripper_tick"] = state["tick"]
+
+
+@compiled
+def _write(states: Records, frames: Records) -> None:
+    """Into the frame where the setpoints are."""
+    state, frame = states[0], frames[0]
+    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
+    frame.setpoint_acceleration[:] = state.setpoint[2]
+    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
+    frame.gripper = state.gripper

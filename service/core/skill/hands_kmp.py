@@ -13,13 +13,13 @@ from kmp import KMP, Gaussians
 from kmp.compiled import compiled
 from service.contract.records import Layout
 from service.contract.requests import ViaPoint
-from service.core.record import Record, Vector
+from service.core.frame import Record, Vector
+from service.core.geometry import round_to
 from service.core.skill.model import (
     COVARIANCE_ROUND_TO,
     MOTION_ROUND_TO,
     Arrays,
     Motion,
-    round_to,
     standard_deviation,
     standard_deviations,
 )

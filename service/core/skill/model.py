@@ -13,7 +13,7 @@ from kmp import KMP
 from kmp.compiled import compiled
 from service.contract.records import Layout
 from service.contract.requests import ViaPoint
-from service.core.record import Record, Vector
+from service.core.frame import Record, Vector
 
 MOTION_ROUND_TO = 1e6  # [1/m] micrometres, to which positions and their derivatives are rounded
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] the same for covariances
@@ -111,17 +111,6 @@ class Model(Protocol):
 def standard_deviations(covariances: Vector) -> Vector:
     """Standard deviations (...) of covariances (..., 3, 3), root mean square over the axes."""
     return np.asarray(np.sqrt(np.maximum(np.trace(covariances, axis1=-2, axis2=-1), 0.0) / 3))
-
-
-@compiled
-def round_to(values: Vector, parts: float) -> None:
-    """Rounds values (3, 3) to so many parts of a unit, in place.
-
-    Machines that differ in the last bits agree on all that follows.
-    """
-    for i in range(3):
-        for j in range(3):
-            values[i, j] = np.rint(values[i, j] * parts) / parts
 
 
 @compiled

@@ -12,17 +12,14 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.core.record import Vector
-from service.core.rotation import turn_on
+from service.core.frame import Vector
+from service.core.geometry import turn_on
 
 TURN_ROUND_TO = 1e6  # [1/rad] microradians, to which orientations and angular velocities are rounded
 COVARIANCE_ROUND_TO = 1e10  # [1/rad²] the same for covariances
 CLOSURE_ROUND_TO = 1e6  # the same for closures
 NO_GRIPPER = -1.0  # the closure that a skill without a gripper predicts
 UNKNOWN, OPEN, CLOSED = 0, 1, 2  # of a gripper
-OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
-MOVES_S = 0.5  # for so long it is let be once it was told to move
-THERE_M = 0.01  # a tool that is no farther off is where it is to be
 
 
 class Turn(NamedTuple):
@@ -67,22 +64,6 @@ class LearnedGripper:
         """How far it should be closed at an input (I,), 0 (open) to 1 (closed)."""
         found = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
         return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
-
-
-def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
-    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
-    closure is predicted and the tool is so far off [m].
-
-    With hysteresis, and not before it can have moved: what trembles about the middle changes
-    nothing. Not on the way: a tool that is late would open or close elsewhere.
-    """
-    if closure == NO_GRIPPER:
-        return gripper
-    if gripper == UNKNOWN:
-        return CLOSED if closure > 0.5 else OPEN
-    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
-        return gripper
-    return CLOSED if closure > CLOSE_ABOVE else OPEN
 
 
 _NOTHING = np.zeros((3, 3))

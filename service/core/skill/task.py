@@ -2,19 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.contract.requests import ViaPoint
-from service.core.record import Vector
+from service.contract.requests import Name, ViaPoint
+from service.core.frame import Vector
 
 MOST_CORNERS = 3  # positions of one hand that it may go between
+MOST_NAMES = 100
 NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a via-point
+TASK_RANGES = {"corners": (0, MOST_CORNERS - 1, ""), "shares": (-1, MOST_CORNERS * 2 - 1, ""), "follow": (-1, 1, "")}
+"""Least, greatest and unit of the numbers in a task's stored arrays."""
 
 Indices = NDArray[np.int64]
+
+# Of a task in compiled loops: where both hands' positions are, and what is of one size in all.
+TASK = np.dtype(
+    [
+        ("corners", np.float64, (2, 3, 3)),  # [m] positions of the left and the right hand
+        ("inputs", np.int64, (2, 3)),  # as `Task.inputs`
+        ("scale", np.float64),  # of the kernel exp(-scale |difference|²) over inputs
+        ("std", np.float64),  # [m] how sure the positions are, of each axis
+        ("prior_offset", np.float64, (3,)),  # [m] the tool's offset far from all data
+    ]
+)
+
+# One of the named via-points, in compiled loops.
+VIA_POINT = np.dtype(
+    [
+        ("tool", np.float64, (3,)),  # [m]
+        ("prior", np.float64),  # the tool's weight here, far from all data; 0 at the first, which has what is left
+        ("corners", np.int64, (2,)),  # as a row of `Task.corners`
+        ("follow", np.int64),  # as `Task.follow`
+    ]
+)
 
 
 class Task(NamedTuple):
@@ -48,6 +73,40 @@ class Task(NamedTuple):
                 here &= known if (here & known).any() else True
                 hands[side, corner] = at[here, 3 * side : 3 * side + 3].mean(axis=0)
         return TaskParameters(hands, at[:, 6:].copy(), points.std)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """What a skill's file has of it."""
+        names = np.array(msgspec.json.encode(self.names).decode())
+        return {"names": names, "corners": self.corners, "shares": self.inputs, "follow": self.follow}
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Task:
+        """What was stored in these arrays. Raises ValueError, KeyError."""
+        names = msgspec.json.decode(str(arrays["names"]), type=tuple[Name, ...])
+        count, width = len(names), int(arrays["shares"].max()) + 1
+        check_shapes(arrays, {"corners": (count, 2), "shares": (2, MOST_CORNERS), "follow": (count,)})
+        if not 2 <= count <= MOST_NAMES or len(set(names)) < count:
+            raise ValueError(f"via-points {', '.join(names)}: 2 to {MOST_NAMES} different names needed")
+        corners, inputs, follow = (
+            np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "shares", "follow")
+        )
+        for side in (0, 1):
+            has = int((inputs[side] >= 0).sum())
+            numbered = np.array_equal(np.unique(corners[:, side]), np.arange(has))
+            if not has or (inputs[side, :has] < 0).any() or not numbered:
+                raise ValueError(
+                    f"the hands' positions {corners.tolist()} and inputs {inputs.tolist()} do not fit each other"
+                )
+        if not np.array_equal(np.unique(inputs[inputs >= 0]), np.arange(width)):
+            raise ValueError(f"the inputs {inputs.tolist()} are not numbered through")
+        return Task(names, corners, inputs, follow)
+
+
+def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raises ValueError where an array has another shape, or nothing in it."""
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or not shape[0]:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, {shape} needed")
 
 
 class TaskParameters(NamedTuple):

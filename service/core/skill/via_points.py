@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from service.contract.requests import ViaPoint
-from service.core.record import Vector
+from service.core.frame import Vector
 
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
 NEAR = 50.0  # [1/m²] of a kernel exp(-NEAR |difference|²) of hands: how far around a via-point the tool is moved
