@@ -214,7 +214,7 @@ class Skill:
     @cached_property
     def constant_turn(self) -> Turn:
         """What is predicted where no orientation was learned."""
-        return Turn(np.ascontiguousarray(self.orientation, np.float64), np.zeros(3), np.zeros((3, 3)))
+        return Turn(np.array(self.orientation, np.float64), np.zeros(3), np.zeros((3, 3)))
 
     @cached_property
     def demonstrated(self) -> Vector:
