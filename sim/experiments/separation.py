@@ -134,7 +134,7 @@ def run_one(task: tuple[str, int]) -> Outcome:
 
     skill_for = rivals.ours(shipped_skill())(drawn.scene)
     if kind == "unheeded":
-        with patch.object(Separation, "look"):
+        with patch.object(Separation, "step"):
             done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
     else:
         done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
