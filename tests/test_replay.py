@@ -29,10 +29,10 @@ from support.wam import URDF
 GOLDEN = RECORDINGS / "golden.mcap"
 
 
-def command(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def command(*arguments: str, timeout_s: float = 110, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "service", "replay", *arguments],
-        capture_output=True, text=True, timeout=110, check=False, env=os.environ | environment, cwd=RECORDINGS.parent,
+        capture_output=True, text=True, timeout=timeout_s, check=False, env=os.environ | environment, cwd=RECORDINGS.parent,
     )  # fmt: skip
 
 
@@ -40,6 +40,14 @@ def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked
     done = command(str(GOLDEN), OPENBLAS_NUM_THREADS="2", OMP_NUM_THREADS="2", MKL_NUM_THREADS="2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
+
+
+@pytest.mark.timeout(500)
+def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units() -> None:
+    done = command(str(GOLDEN), "--exact", NUMBA_CPU_NAME="generic", timeout_s=480)
+    assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
+    native = command(str(GOLDEN), "--exact")
+    assert done.stdout.splitlines()[-1] == native.stdout.splitlines()[-1]
 
 
 def test_the_golden_session_replays_from_a_state_in_its_middle() -> None:

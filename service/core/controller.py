@@ -69,7 +69,7 @@ class Controller:
     def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
         self._state = copied(start_state(settings, skill) if state is None else state)
         self._memory = as_array(self._state)
-        self._layout = frame_layout(len(settings.joints.names))
+        self._blank = as_array(blank(frame_layout(len(settings.joints.names))))
         self.intake = Intake(settings)
         self._skill = SkillStage(settings, skill)
         self.decision = Decision(settings)
@@ -107,7 +107,7 @@ class Controller:
         Ticks have growing indices. Over indices that are left out hands are taken to have moved on;
         the arm moves by one period only.
         """
-        state, frame = self._state, blank(self._layout)
+        state, frame = self._state, self._blank.copy()[0]
         known = self._take_in(tick, frame)
         lap("intake")
         wanted = self._skill.step(state, frame) if known & HANDS_KNOWN else None

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.least_squares import factorise, keep_under, least_squares, substitute
+from service.core.arm.least_squares import factorise, solve, substitute
 from service.core.frame import Records, Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 
@@ -180,8 +180,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         limits[k] = constraints[k].planned
         for j in range(joints):
             rows[k, j] = constraints[k].row[j] * scale[j]
-    least_squares(scaled, wanted, home, damping, bounds, out)
-    kept = keep_under(scaled, wanted, home, damping, bounds, rows, limits, out)
+    kept = solve(scaled, wanted, home, damping, bounds, rows, limits, out)
     if kept:
         said |= SEPARATED
     if not _can_have(arms, goals, out):  # it turns as far as costs its position nothing
@@ -189,8 +188,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         scaled[3:], wanted[3:] = 0.0, 0.0
         for j in range(joints):
             home[j] = goal.moving[j] / scale[j]
-        least_squares(scaled, wanted, home, damping, bounds, free)
-        keep_under(scaled, wanted, home, damping, bounds, rows, limits, free)
+        solve(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not kept:  # what keeps distances was found for this solution, not for one on the way to it
             _turn_less(arms, goals, out, free)
     excess = _excess(arms, out)

@@ -45,6 +45,24 @@ def substitute(root: Vector, right: Vector) -> None:
 
 
 @compiled
+def solve(
+    tasks: Vector,
+    wanted: Vector,
+    posture: Vector,
+    damping: float,
+    bounds: Vector,
+    rows: Vector,
+    limits: Vector,
+    x: Vector,
+) -> bool:
+    """Into x (J,) the solution of `least_squares`, brought under rows (K, J) x <= limits (K,);
+    whether it was not there.
+    """
+    least_squares(tasks, wanted, posture, damping, bounds, x)
+    return keep_under(tasks, wanted, posture, damping, bounds, rows, limits, x)
+
+
+@compiled
 def least_squares(
     tasks: Vector, wanted: Vector, posture: Vector, damping: float, bounds: Vector, result: Vector
 ) -> None:

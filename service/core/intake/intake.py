@@ -344,8 +344,8 @@ def _take_hand(
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
     stale_ticks, period_s = given.stale_ticks, given.period_s
-    fresh = is_fresh(states, side, stale_ticks)
     since = state.tick - state.hand_ticks[side]
+    fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
     jumped, cause = False, -1
     if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
         cause = NOT_FINITE
@@ -387,9 +387,7 @@ def _report(states: Records, frames: Records, parameters: Records) -> int:
         frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    known = 0
-    if is_fresh(states, 0, given.stale_ticks) and is_fresh(states, 1, given.stale_ticks):
-        known |= HANDS_KNOWN
+    known = HANDS_KNOWN if frame.hand_ages.min() >= 0 and frame.hand_ages.max() < given.stale_ticks else 0
     if state.arm_tick >= 0 and state.tick - state.arm_tick < given.silent_ticks:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= given.still_ticks:

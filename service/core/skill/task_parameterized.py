@@ -19,7 +19,7 @@ from kmp.kernel_row import add_weighted
 from service.contract.records import Layout
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, structured
-from service.core.geometry import dot_between, nearest_between, round_to
+from service.core.geometry import nearest_between, round_to
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.model import COVARIANCE_ROUND_TO, FARTHEST_M, MOTION_ROUND_TO, Arrays, Motion
 from service.core.skill.task import (
@@ -55,7 +55,10 @@ def hand_weights(hands: Vector, stillness: Vector, task: Record, out: Vector) ->
         hand, nearest = hands[3 * side : 3 * side + 3], math.inf
         farther = max(farther, nearest_between(hand, corners[side], count, weight))
         for i in range(count):
-            nearest = min(nearest, dot_between(hand, corners[side, i], hand, corners[side, i]))
+            square = 0.0
+            for k in range(3):
+                square += (hand[k] - corners[side, i, k]) ** 2
+            nearest = min(nearest, square)
         near = min(max((AWAY_M - math.sqrt(nearest)) / (AWAY_M - AT_M), 0.0), 1.0)
         power = 1.0 + (SHARPNESS - 1.0) * near * stillness[side]
         total = 0.0

@@ -1,0 +1,144 @@
+"""The way of one hand sample through the service, from its subscriber to the joint command: which
+files it enters, in order, and how often one calls into another.
+
+    python -m tests.hand_sample
+
+Compiled functions run as plain Python here, so that they are seen too. A call from one function of
+a file to a function of another counts once, however often a loop repeats it. A re-entry is such a
+call into a file that was entered before.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # before anything imports Numba
+
+from service import one_blas_thread  # noqa: F401
+
+# isort: split
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from service.client import endpoints, open_session, publisher
+from service.config import Settings, robot_description
+from service.contract import cdr
+from service.contract.messages import BASE, Attachment, JointState, PoseStamped
+from service.contract.records import SIDES, SOURCES, Mode
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick, Vector
+from service.core.outputs import outgoing
+from service.daemon import daemon
+from service.daemon.cell_streams import Arrivals, CellStreams
+from service.daemon.input_monitor import KEYS
+from service.shipped import shipped_skill
+
+ROOT = Path(__file__).parents[1]
+LOOP = str(Path(daemon.__file__))  # this file does what the loop there does
+PERIODS = 80
+
+
+class Walk:
+    """The calls between files of this repository while `sys.setprofile` has `see`."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, str, str, str]] = []
+
+    def see(self, frame: FrameType, event: str, _: Any) -> None:
+        """Notes a call into another file."""
+        if event != "call" or not self._is_ours(frame):
+            return
+        caller = frame.f_back
+        while caller is not None and not self._is_ours(caller):
+            caller = caller.f_back
+        start = LOOP if caller is None or caller.f_code.co_filename == __file__ else caller.f_code.co_filename
+        function = "" if caller is None else caller.f_code.co_name
+        end = frame.f_code.co_filename
+        call = (start, function, end, frame.f_code.co_name)
+        if start != end and call not in self.calls:
+            self.calls.append(call)
+
+    @staticmethod
+    def _is_ours(frame: FrameType) -> bool:
+        file = frame.f_code.co_filename
+        return file.startswith((f"{ROOT}/service", f"{ROOT}/kmp")) or file == __file__
+
+    @property
+    def files(self) -> list[str]:
+        """The files in the order in which they are entered."""
+        found = dict.fromkeys([LOOP, *(end for *_, end, _ in self.calls)])
+        return [str(Path(file).relative_to(ROOT)) for file in found if file != __file__]
+
+    @property
+    def re_entries(self) -> int:
+        """How many calls go into a file that was entered before."""
+        return len(self.calls) + 1 - len(self.files)
+
+
+def walk() -> Walk:
+    """A sample's way, while the arm follows."""
+    settings, skill, seen = Settings(), shipped_skill().for_loop(), Walk()
+    controller = Controller(settings, skill, urdf=robot_description(settings))
+    hands, names = skill.hands[0].reshape(2, 3), settings.joints.names
+    listening = open_session(listen=["tcp/127.0.0.1:0"])
+    arrivals = {KEYS[source]: Arrivals() for source in SOURCES}
+    streams = CellStreams(listening, settings, arrivals=arrivals, failed=print)
+    with open_session(connect=list(endpoints(listening))) as session:
+        trackers = [publisher(session, settings.cell, f"hands/{side}") for side in SIDES]
+
+        def sample(hand: Vector, index: int) -> bytes:
+            x, y, z = hand.tolist()
+            return cdr.encode_pose(
+                PoseStamped(1 + 2_000_000 * index, BASE, (x, y, z + 1e-4 * index), (0.0, 0.0, 0.0, 1.0))
+            )
+
+        def publish(tick: Tick, frame: Frame) -> None:
+            attachment = cdr.encode_attachment(Attachment(tick.index, 0, int(frame["hand_stamp_ns"])))
+            for key, payload in outgoing(frame, tick.index, names):
+                streams.publish(key, payload, attachment)
+
+        def arm(index: int) -> Event:
+            state = JointState(1 + 2_000_000 * index, names, settings.arm.posture, (0.0,) * len(names))
+            return Event("joints/state", b"", state)
+
+        frames: list[Frame] = []
+        for index in range(PERIODS):
+            for tracker, hand in zip(trackers, hands, strict=True):
+                tracker.put(sample(hand, index))
+            until = time.monotonic() + 10.0
+            inbox: list[Event] = []
+            while len(inbox) < 2 and time.monotonic() < until:
+                inbox += streams.receive()
+            run(controller, [Tick(index, (*inbox, arm(index)))], [lambda tick, frame: frames.append(frame)])
+        if frames[-1]["mode"] != Mode.FOLLOW:
+            raise SystemExit(f"the arm does not follow, but has mode {Mode(int(frames[-1]['mode'])).name}")
+        trackers[0].put(sample(hands[0], PERIODS))
+        newest: list[Event] = []
+        until = time.monotonic() + 10.0
+        while not newest and time.monotonic() < until:
+            sys.setprofile(None)
+            seen.calls.clear()
+            sys.setprofile(seen.see)
+            newest = streams.receive()
+        run(controller, [Tick(PERIODS, tuple(newest))], [publish])
+        sys.setprofile(None)
+    streams.close()
+    listening.close()  # type: ignore[no-untyped-call]
+    return seen
+
+
+def main() -> None:
+    """Prints the way, and counts it."""
+    seen = walk()
+    print("\n".join(f"{number:2} {file}" for number, file in enumerate(seen.files, 1)))
+    print(f"{len(seen.files)} files, {len(seen.calls)} calls between them, {seen.re_entries} re-entries")
+    if "--calls" in sys.argv:
+        for start, caller, end, called in seen.calls:
+            print(f"{Path(start).relative_to(ROOT)} {caller} -> {Path(end).relative_to(ROOT)} {called}")
+
+
+if __name__ == "__main__":
+    main()
