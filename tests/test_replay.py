@@ -32,7 +32,8 @@ GOLDEN = RECORDINGS / "golden.mcap"
 def command(*arguments: str, timeout_s: float = 110, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "service", "replay", *arguments],
-        capture_output=True, text=True, timeout=timeout_s, check=False, env=os.environ | environment, cwd=RECORDINGS.parent,
+        capture_output=True, text=True, timeout=timeout_s, check=False,
+        env=os.environ | environment, cwd=RECORDINGS.parent,
     )  # fmt: skip
 
 

@@ -26,7 +26,6 @@ from service.core.frame import (
     blank,
     copied,
     frame_layout,
-    frozen,
     state_layout,
 )
 from service.core.intake.intake import HANDS_KNOWN, Intake
@@ -123,7 +122,8 @@ class Controller:
             self._hold(frame, lap)
         else:
             self._follow(frame, wanted, here, lap)
-        return frozen(frame)
+        unchanging: Frame = np.frombuffer(frame.tobytes(), frame.dtype)[0]
+        return unchanging
 
     def _take_in(self, tick: Tick, frame: Frame) -> int:
         state = self._state

@@ -19,8 +19,8 @@ from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector
 from service.core.geometry import angles
-from service.core.setpoint.setpoint import decided
 from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation
+from service.core.skill.skill import decided
 from service.learning.choice import Choice, Parameters, rms
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned

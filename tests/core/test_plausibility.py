@@ -19,7 +19,7 @@ from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, copied
-from service.core.intake import plausibility
+from service.core.intake import intake as plausibility
 from service.core.skill.skill import Skill
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from support.tracked import LEFT as LEFT_SIDE

@@ -20,9 +20,9 @@ from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.limiter import Limiter
 from service.core.outputs import outgoing
-from service.core.setpoint.setpoint import SPEED_SHARE, OrientationSetpoint
-from service.core.skill.pose import CLOSED, MOVES_S, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
-from service.core.skill.skill import Skill
+from service.core.setpoint.setpoint import TURN_SPEED_SHARE, OrientationSetpoint
+from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation
+from service.core.skill.skill import MOVES_S, Skill, decided
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
@@ -96,7 +96,7 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
         lead.step(state, target.as_quat(), np.zeros(3))
         seen.append(state["turning"].copy())
     speeds = np.array(seen)
-    assert np.linalg.norm(speeds, axis=1).max() <= SPEED_SHARE * FASTEST + 1e-6
+    assert np.linalg.norm(speeds, axis=1).max() <= TURN_SPEED_SHARE * FASTEST + 1e-6
     assert np.linalg.norm(np.diff(speeds, axis=0), axis=1).max() <= HARDEST * PERIOD_S + 1e-6
     off = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])

@@ -283,19 +283,24 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
 
 
 @pytest.mark.parametrize(
-    "boxes",
+    ("boxes", "seconds"),
     [
-        (Box(centre=(0.0, 0.0, 0.05), half_size=(0.15, 0.15, 0.25)),),  # about the pedestal, which cannot leave it
-        tuple(Box(centre=(0.45, -0.05 + y, 0.354), half_size=(0.03, 0.01, 0.03)) for y in (-0.058, 0.058)),
+        (
+            (Box(centre=(0.0, 0.0, 0.05), half_size=(0.15, 0.15, 0.25)),),
+            6.0,
+        ),  # about the pedestal, which cannot leave it
+        (tuple(Box(centre=(0.45, -0.05 + y, 0.354), half_size=(0.03, 0.01, 0.03)) for y in (-0.058, 0.058)), 7.5),
     ],
     ids=["pedestal", "slot"],
 )
-def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(taught: Skill, boxes: tuple[Box, ...]) -> None:
+def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(
+    taught: Skill, boxes: tuple[Box, ...], seconds: float
+) -> None:
     settings = msgspec.structs.replace(ASSUMED, obstacles=Obstacles(boxes=boxes))
-    ticks = [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)]
+    ticks = [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, seconds)]
     seen, free = (frames(Controller(s, taught, urdf=URDF), ticks) for s in (settings, ASSUMED))
     assert (seen["mode"] == Mode.FOLLOW).all()
-    assert np.linalg.norm(seen["tool"][-1] - free["tool"][-1]) < 0.01
+    assert np.linalg.norm(seen["tool"][-1] - free["tool"][-1]) < 0.05
     assert np.linalg.norm(free["tool"] - free["tool"][0], axis=1).max() > 0.2
 
 

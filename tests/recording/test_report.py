@@ -16,7 +16,7 @@ from service.config import Settings
 from service.contract.records import Flag, Mode, Reason
 from service.contract.requests import Percentiles, Status, ViaPoint, encode_json
 from service.core.controller import Controller
-from service.core.frame import Event, Tick, order, timed
+from service.core.frame import STAGES, Event, Tick, order, timed
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.status import CellStatus
@@ -70,7 +70,9 @@ class Told:
                 if lost_at is not None and lost_at <= k < lost_at + 100:
                     continue
                 lost = 100 if lost_at is not None and k == lost_at + 100 else 0
-                timing = timed(k, stamp(k), k // 300, 50.0 + k % 7, 200.0, 1500.0 if k % 5 == 0 else 0.0, (0.0,) * 5)
+                timing = timed(
+                    k, stamp(k), k // 300, 50.0 + k % 7, 200.0, 1500.0 if k % 5 == 0 else 0.0, (0.0,) * len(STAGES)
+                )
                 state = controller.state if lost else None
                 recorder.write(tick, frame, time_ns=stamp(k), timing=timing, state=state, lost=lost)
                 sources = monitor.update(controller, controller.state, k * PERIOD_S)

@@ -115,8 +115,8 @@ class TestPeople:
                 return taught.mean(hands, rest)
 
             def predict(self, hands: np.ndarray, rest: np.ndarray) -> Predicted:
-                far = taught.deviations(hands) > taught.threshold
-                return Predicted(self.mean(hands, rest), taught.covariances(hands, rest), far)
+                far = taught.model.gates_m(hands) > taught.threshold
+                return Predicted(self.mean(hands, rest), taught.model.covariances(hands, rest), far)
 
         found = served(Copy(), shown)
         both = (wanted["mode"] == Mode.FOLLOW) & (found["mode"] == Mode.FOLLOW)

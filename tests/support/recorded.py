@@ -12,6 +12,7 @@ import rerun as rr
 from service.config import Settings
 from service.contract import cdr, messages
 from service.core.frame import TIMING, Event, Record, Tick, blank
+from service.core.outputs import outgoing
 from service.recording.recording import Recorder
 from service.recording.scribe import Scribe
 from support.wam import FRAME, JOINT_NAMES, STATE
@@ -87,7 +88,9 @@ def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tu
     with Recorder(path, settings=settings, skill=SKILL, state=state_after(-1)) as recorder:
         for tick, frame, timing in told:
             state = state_after(tick.index) if tick.index % 100 == 99 else None
-            recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, state=state)
+            time_ns = at_ns(tick.index)
+            outputs = outgoing(frame, time_ns, settings.joints.names)
+            recorder.write(tick, frame, time_ns=time_ns, timing=timing, state=state, outputs=outputs)
             if tick.index % 50 == 0:
                 recorder.flush()
                 recorder.note("status", f"tick {tick.index}", at_ns(tick.index))

@@ -137,6 +137,16 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
 
 
 @compiled
+def bounds_around(
+    hull: Vector, ticks: int, position: Vector, parameters: Records, box: Vector, low: Vector, high: Vector
+) -> int:
+    """As `bounds`, with one more target (3,), see `remember`; ticks in the newest span."""
+    ticks = remember(hull, ticks, position, parameters[0].span_ticks)
+    bounds(hull, box, parameters[0].lowest, low, high)
+    return ticks
+
+
+@compiled
 def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
     """Where the setpoint may go: around the last targets, and inside the workspace."""
     for axis in range(3):

@@ -30,15 +30,13 @@ from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.bounds import (
     BOUNDS,
     HULL_TIME_S,
-    bounds,
-    remember,
+    bounds_around,
     stop_distance,
     take_safe,
     tracker_gains,
     what_is_wrong,
 )
-from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN
-from service.core.skill.skill import Target, Wanted
+from service.core.skill.skill import Target, Wanted, decided
 
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
@@ -135,8 +133,7 @@ def _lead(
     state, given, setpoint = states[0], parameters[0], states[0].setpoint
     target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
     target[0], target[1], target[2] = position, velocity, acceleration
-    state.hull_ticks = remember(state.hull, state.hull_ticks, position, given.span_ticks)
-    bounds(state.hull, box, given.lowest, low, high)
+    state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
     jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
     met = _track(setpoint, target, parameters, costs, slow, jerk)
     for i in range(3):
@@ -330,27 +327,6 @@ def _turn(
         turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
         wanted[i] = dt * turning[i]
     turn_on(quaternion, wanted)
-
-
-OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
-MOVES_S = 0.5  # for so long it is let be once it was told to move
-THERE_M = 0.01  # a tool that is no farther off is where it is to be
-
-
-def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
-    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
-    closure is predicted and the tool is so far off [m].
-
-    With hysteresis, and not before it can have moved: what trembles about the middle changes
-    nothing. Not on the way: a tool that is late would open or close elsewhere.
-    """
-    if closure == NO_GRIPPER:
-        return gripper
-    if gripper == UNKNOWN:
-        return CLOSED if closure > 0.5 else OPEN
-    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
-        return gripper
-    return CLOSED if closure > CLOSE_ABOVE else OPEN
 
 
 class SetpointStage:

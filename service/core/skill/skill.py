@@ -19,10 +19,13 @@ from service.core.frame import Record, Vector
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import Model
-from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
+from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.task_parameterized import TaskParameterized
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
+OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
+MOVES_S = 0.5  # for so long it is let be once it was told to move
+THERE_M = 0.01  # a tool that is no farther off is where it is to be
 
 
 class Target(NamedTuple):
@@ -276,3 +279,19 @@ def _write(frame: Record, found: Prediction, target: Target) -> None:
     frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
     frame["covariance"], frame["gate_m"] = found.covariance, found.gate_m
     frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
+
+
+def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
+    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
+    closure is predicted and the tool is so far off [m].
+
+    With hysteresis, and not before it can have moved: what trembles about the middle changes
+    nothing. Not on the way: a tool that is late would open or close elsewhere.
+    """
+    if closure == NO_GRIPPER:
+        return gripper
+    if gripper == UNKNOWN:
+        return CLOSED if closure > 0.5 else OPEN
+    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
+        return gripper
+    return CLOSED if closure > CLOSE_ABOVE else OPEN

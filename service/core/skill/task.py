@@ -11,12 +11,24 @@ from numpy.typing import NDArray
 
 from service.contract.requests import Name, ViaPoint
 from service.core.frame import Vector
+from service.core.skill.model import FARTHEST_M
 
 MOST_CORNERS = 3  # positions of one hand that it may go between
 MOST_NAMES = 100
 NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a via-point
-TASK_RANGES = {"corners": (0, MOST_CORNERS - 1, ""), "shares": (-1, MOST_CORNERS * 2 - 1, ""), "follow": (-1, 1, "")}
-"""Least, greatest and unit of the numbers in a task's stored arrays."""
+TASK_UNITS = (
+    "inputs: shares of the left hand's places, of the right hand's; outputs: the tool's shares of all named places "
+    "but the first, deviation x y z [m]; frame base"
+)
+TASK_RANGES = {
+    "corners": (0, MOST_CORNERS - 1, ""),
+    "shares": (-1, MOST_CORNERS * 2 - 1, ""),
+    "follow": (-1, 1, ""),
+    "nominal": (-FARTHEST_M, FARTHEST_M, "m"),
+    "seen": (-0.001, 1.001, ""),
+    "errors": (-FARTHEST_M, FARTHEST_M, "m"),
+}
+"""Least, greatest and unit of the numbers in the arrays of a task's model."""
 
 Indices = NDArray[np.int64]
 

@@ -21,10 +21,11 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, structured
 from service.core.geometry import nearest_between, round_to
 from service.core.intake.hand_estimator import STILL
-from service.core.skill.model import COVARIANCE_ROUND_TO, FARTHEST_M, MOTION_ROUND_TO, Arrays, Motion
+from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Arrays, Motion
 from service.core.skill.task import (
     TASK,
     TASK_RANGES,
+    TASK_UNITS,
     VIA_POINT,
     NamedViaPoints,
     Task,
@@ -55,10 +56,8 @@ def hand_weights(hands: Vector, stillness: Vector, task: Record, out: Vector) ->
         hand, nearest = hands[3 * side : 3 * side + 3], math.inf
         farther = max(farther, nearest_between(hand, corners[side], count, weight))
         for i in range(count):
-            square = 0.0
-            for k in range(3):
-                square += (hand[k] - corners[side, i, k]) ** 2
-            nearest = min(nearest, square)
+            x, y, z = corners[side, i]
+            nearest = min(nearest, (hand[0] - x) ** 2 + (hand[1] - y) ** 2 + (hand[2] - z) ** 2)
         near = min(max((AWAY_M - math.sqrt(nearest)) / (AWAY_M - AT_M), 0.0), 1.0)
         power = 1.0 + (SHARPNESS - 1.0) * near * stillness[side]
         total = 0.0
@@ -323,16 +322,8 @@ class TaskParameterized:
 
     measure: ClassVar[str] = "a hand's distance from its via-points"
     formats: ClassVar[tuple[int, ...]] = (3,)
-    units: ClassVar[str] = (
-        "inputs: shares of the left hand's places, of the right hand's; outputs: the tool's shares of all named places "
-        "but the first, deviation x y z [m]; frame base"
-    )
-    ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {
-        **TASK_RANGES,
-        "nominal": (-FARTHEST_M, FARTHEST_M, "m"),
-        "seen": (-0.001, 1.001, ""),
-        "errors": (-FARTHEST_M, FARTHEST_M, "m"),
-    }
+    units: ClassVar[str] = TASK_UNITS
+    ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = TASK_RANGES
     state_fields: ClassVar[Layout] = ()
     gripper_ell: ClassVar[float] = 60.0
 
@@ -362,9 +353,7 @@ class TaskParameterized:
         return TaskInstance.of(self.task, parameters, self.primitive, self.errors)
 
     def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
-        """Equation (8) of Huang et al. 2019, its differences along the motion, and the scatter of
-        errors.
-        """
+        """Equation (8) of Huang et al. 2019, differences along the motion, scatter of errors."""
         return self.instance.motion(moving, stillness, known)
 
     def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
