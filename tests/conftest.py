@@ -8,6 +8,7 @@ from service import one_blas_thread  # noqa: F401
 import importlib.util
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ from service.core import warm_up
 from service.core.skill.skill import Skill
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import decoded
-from support import vulkan
-from support.paths import RECORDINGS
+from support import tiers, vulkan
+from support.paths import RECORDINGS, ROOT
 
 
 class _NoBench:
@@ -36,11 +37,39 @@ if importlib.util.find_spec("pybullet") is None:
     sys.meta_path.insert(0, _NoBench)  # type: ignore[arg-type]
 
 
+BEGAN_S = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--seconds-left`, for what is run as long as there is time."""
+    parser.addoption("--seconds-left", type=float, metavar="S", help="leave out what has not begun after so long")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what is quick and what is research, and puts the files that take longest first."""
+    tests = ROOT / "tests"
+    where = {item: str(item.path.relative_to(tests)) + "::" + item.nodeid.split("::", 1)[-1] for item in items}
+    for item, test in where.items():
+        for marker in tiers.markers(test, timed=item.get_closest_marker("timed") is not None):
+            item.add_marker(marker)
+    items.sort(key=lambda item: tiers.begins(where[item]))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leaves out a test for which no time is left, and says so."""
+    left_s = item.config.getoption("--seconds-left")
+    if left_s is not None and time.monotonic() - BEGAN_S > left_s:
+        pytest.skip(f"left out: not begun within {left_s:g} s")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """In a checkout fresh to this Python, compiles what a daemon compiles at its first start.
 
     Each test of a daemon would else do so in a process of its own, and time out where several do.
+    Files are begun in the order of the tests, not the one with the most tests first.
     """
+    config.option.loadscopereorder = False
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
     compiled = any((Path(warm_up.__file__).parent / "__pycache__").glob(f"*.{version}.nbi"))
     if compiled or hasattr(config, "workerinput"):

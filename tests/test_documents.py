@@ -108,7 +108,9 @@ def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(page: str, he
         assert named, promise
         for file, test in named:
             text = (ROOT / file).read_text(encoding="utf-8")
-            assert re.search(rf"^(def|class) {test}\b" if test else r"^def test_|^Test", text, re.MULTILINE), tests
+            assert re.search(rf"^(def|class) {test}\b" if test else r"^def test_|^class Test", text, re.MULTILINE), (
+                tests
+            )
 
 
 def test_each_fault_has_the_figures_that_were_measured() -> None:

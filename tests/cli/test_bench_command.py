@@ -12,10 +12,11 @@ from service.recording.replay import replay
 from service.timing import loads, soak
 from support.cell import thirdhand
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.timed]
+pytestmark = pytest.mark.timeout(180)
 QUIET = {"say": lambda line: None}
 
 
+@pytest.mark.timed
 def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
     done = thirdhand("bench", "--seconds", "3", "--json", "--output", str(tmp_path), timeout=150)
     assert done.returncode == 0, done.stderr
@@ -31,6 +32,7 @@ def test_report_and_picture_and_recording_are_kept(tmp_path: Path) -> None:
     assert next(tmp_path.glob("*.rrd")).stat().st_size > 10_000
 
 
+@pytest.mark.timed
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
     monkeypatch.setattr(loads, "large_skill", bytes)
@@ -53,6 +55,7 @@ def test_a_leak_is_told_from_noise() -> None:
     assert leak["slope_mb_per_h"] == pytest.approx(5, abs=2 * leak["interval_mb_per_h"])
 
 
+@pytest.mark.timed
 def test_soak_reports_each_process() -> None:
     report = soak.run(0.12, 500, **QUIET)
     assert set(report["processes"]) == {"daemon", "scribe", "skill worker"}

@@ -35,7 +35,7 @@ SETTINGS = Settings()
 PERIOD_S = SETTINGS.period_s
 SHIPPED = decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="soldering")
 SKILLS = (SHIPPED, adapted(SHIPPED, Scene().via_points(), tolerance=0.05), replace(SHIPPED, threshold=math.inf))
-EXAMPLES = int(os.environ.get("THIRDHAND_EXAMPLES", "500"))
+FEW, EXAMPLES = 50, int(os.environ.get("THIRDHAND_EXAMPLES", "500"))
 
 short = st.integers(1, 60)  # ticks
 seeds = st.integers(0, 2**32 - 1)
@@ -156,11 +156,25 @@ class Cell(RuleBasedStateMachine):
         bounds_hold(np.array(self.seen), np.array(self.measured), box=SHIPPED.workspace)
 
 
-TestCell = pytest.mark.timeout(60 + EXAMPLES)(Cell.TestCase)
-TestCell.settings = example_settings(
-    max_examples=EXAMPLES,
-    stateful_step_count=15,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+def drawing(examples: int) -> example_settings:
+    """How a test draws so many sessions."""
+    return example_settings(
+        max_examples=examples,
+        stateful_step_count=15,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+class TestCell(Cell.TestCase):  # type: ignore[misc, valid-type]
+    """Some sessions."""
+
+    settings = drawing(FEW)
+
+
+@pytest.mark.timeout(60 + EXAMPLES)
+class TestCellAtLength(Cell.TestCase):  # type: ignore[misc, valid-type]
+    """Many."""
+
+    settings = drawing(EXAMPLES)

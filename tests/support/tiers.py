@@ -1,0 +1,92 @@
+"""Which tests are `quick`, which are `research`: by files, or by tests where a file holds both.
+
+`quick` is what a contributor runs before each commit: all but what is listed here as SLOW, RESEARCH
+or marked `timed`. What is slow in itself but the only one of its room has a test or two in SMOKE.
+`research` is what measures and compares methods at length: it tells about the method, and hardly
+ever about a change. Everything else is what a change needs.
+"""
+
+from __future__ import annotations
+
+RESEARCH = (
+    "cli/test_bench_command.py::test_soak_reports_each_process",
+    "cli/test_bench_command.py::test_what_happens_beside_the_loop_is_put_on",
+    "core/test_invariant.py::TestCellAtLength",
+    "sim/test_experiments.py::TestExperiments",
+    "sim/test_faults.py",
+    "sim/test_people.py::test_a_reduced_comparison_keeps_the_order_that_is_stable",
+)
+SLOW = (  # the longest first: so they begin first
+    "daemon/test_survival.py",
+    "daemon/test_daemon.py",
+    "core/test_warm_up.py",
+    "recording/test_scribe.py",
+    "test_static.py",
+    "daemon/test_roles.py",
+    "cli/test_doctor.py",
+    "test_replay.py",
+    "recording/test_segments.py",
+    "core/test_any_hands.py",
+    "cli/test_own_task.py",
+    "sim/test_bench.py",
+    "cli/test_interrupt.py",
+    "daemon/test_fuzzed_daemon.py",
+    "core/test_other_arms.py",
+    "cli/test_view_live.py",
+    "daemon/test_network.py",
+    "core/test_fuzzed_session.py",
+    "cli/test_learn_command.py",
+    "daemon/test_skill_worker.py",
+    "cli/test_report_command.py",
+    "test_examples.py",
+    "kmp/test_distribution.py",
+    "test_site.py",
+    "test_wheel.py",
+    "core/test_invariant.py",
+    "core/test_separation.py::test_the_arm_stops_for_a_hand_in_its_way",
+    "core/test_separation.py::test_motion_that_leaves_a_hand_is_not_slowed",
+    "core/test_pose.py::test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to",
+    "core/test_setpoint.py::test_targets_that_alternate_or_tremble_make_no_setpoint_run_away",
+    "core/test_setpoint.py::test_an_axis_that_wild_ones_starve_comes_back",
+    "core/test_arm_sources.py::test_no_stranger_makes_a_command_jump",
+    "core/test_plausibility.py::test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculated_with",
+    "learning/test_gate.py",
+    "kmp/test_low_rank.py",
+    "kmp/test_tutorial.py",
+    "recording/test_sinks.py",
+    "recording/test_damage.py",
+    "daemon/test_requests.py",
+    "sim/test_people.py",
+    "sim/test_experiments_run_the_service.py",
+    "test_hand_sample.py",
+    "recording/test_taking.py::test_a_demonstration_is_recorded_shown_trimmed_and_deleted",
+)
+SMOKE = (
+    "cli/test_learn_command.py::test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read",
+    "daemon/test_daemon.py::test_a_session_from_start_to_end",
+    "recording/test_scribe.py::test_what_is_told_is_recorded_and_drawn",
+    "sim/test_bench.py::test_a_tool_that_goes_as_taught_does_the_task",
+    "test_replay.py::test_the_golden_session_replays_from_a_state_in_its_middle",
+    "test_static.py::test_static_checks_find_nothing[lint]",
+    "test_static.py::test_static_checks_find_nothing[format]",
+)
+
+
+def is_among(test: str, named: tuple[str, ...]) -> bool:
+    """Whether a test (`folder/file.py::name[parameters]`) is one of these, or in one of these."""
+    return any(test == one or test.startswith((f"{one}::", f"{one}[")) for one in named)
+
+
+def markers(test: str, *, timed: bool) -> list[str]:
+    """The markers that a test gets."""
+    if is_among(test, RESEARCH):
+        return ["research"]
+    if timed or (is_among(test, SLOW) and not is_among(test, SMOKE)):
+        return []
+    return ["quick"]
+
+
+def begins(test: str) -> int:
+    """The place of a test's file in the order in which files are begun: the longest first."""
+    file = test.split("::", maxsplit=1)[0]
+    return SLOW.index(file) if file in SLOW else len(SLOW)
