@@ -21,18 +21,18 @@ PLANTED = """
 from service import one_blas_thread
 import sys, threading, time
 from service.cli.main import main
-from service.daemon.streams import Streams
+from service.daemon.cell_streams import CellStreams
 
 def busy(seconds):
     until = time.perf_counter() + seconds
     while time.perf_counter() < until:
         pass
 
-receive = Streams.receive
+receive = CellStreams.receive
 if {thread}:
     threading.Thread(target=busy, args=(1e3,), daemon=True).start()
 else:
-    Streams.receive = lambda self: (busy(0.001), receive(self))[1]
+    CellStreams.receive = lambda self: (busy(0.001), receive(self))[1]
 sys.exit(main(sys.argv[1:]))
 """
 
