@@ -53,8 +53,13 @@ ROUND_TO = 1e9  # of the share: machines that differ in the last bits agree
 
 def is_contested(state: Record, *, already: bool) -> bool:
     """Whether some source is contradicted by another; `already`: it was found so before."""
+    return bool(_is_contested(as_array(state), already))
+
+
+@compiled
+def _is_contested(states: Records, already: bool) -> bool:
     share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED_SHARE, SCATTERED_M)
-    return bool(max(state["contested"].tolist()) > share or max(state["noise_variance"].tolist()) > scatter_m**2)
+    return bool(states[0].contested.max() > share or states[0].noise_variance.max() > scatter_m**2)
 
 
 @compiled
@@ -225,8 +230,7 @@ class Intake:
                 self.take_arm(state, event.value)
             else:
                 self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
-        known = int(_report(as_array(state), as_array(frame), self._parameters))
-        return known | CONTESTED * is_contested(state, already=int(state["reason"]) == TWO_SOURCES)
+        return int(_report(as_array(state), as_array(frame), self._parameters))
 
     def is_fresh(self, state: Record, side: int) -> bool:
         """Whether a hand has been seen, and lately enough."""
@@ -392,4 +396,5 @@ def _report(states: Records, frames: Records, parameters: Records) -> int:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= given.still_ticks:
             known |= ARM_STILL
-    return known
+    contested = _is_contested(states, state.reason == TWO_SOURCES)
+    return known | CONTESTED if contested else known

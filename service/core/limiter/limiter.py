@@ -29,6 +29,8 @@ ROUND_TO = 1e9  # [1/rad] of the positions: machines that differ in the last bit
 LARGEST = 1e6  # of any number of a state that is calculated with
 BOUNDED = 1  # flag of a step: the wanted velocity was cut
 CHASED = 2  # some joint cannot have it in a tick
+UNSAFE = 4  # some joint could not have stopped after it
+UNUSABLE = -1  # the state cannot be calculated with
 
 
 class Limited(NamedTuple):
@@ -79,13 +81,13 @@ class Limiter:
         """
         state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.empty(len(q))
         state[0], state[1], state[2] = q, dq, ddq
-        if not is_usable(state):
+        met = _step(state, velocity, self._parameters, wanted, moved)
+        if met == UNUSABLE:
             return _stuck(q)
-        met = _toward(state, velocity, self._parameters, wanted, moved)
         if met & CHASED:
             self._chase(state, wanted, moved)
-        safe = _make_safe(state, moved, self._parameters)
-        return _frozen(moved, limited=met > 0 or not safe)
+            _make_safe(state, moved, self._parameters)
+        return _frozen(moved, limited=met > 0)
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
         """The joints one period later on the way to rest, at which all come at once and as soon as
@@ -113,6 +115,17 @@ class Limiter:
         except (ruckig.RuckigError, ValueError):  # ValueError: a result that the binding has no name for
             return
         np.copyto(moved, self._trajectory.at_time(self._period), where=np.isnan(moved))
+
+
+@compiled
+def _step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
+    """As `_toward`, and made safe where no joint is to be chased; UNUSABLE for such a state."""
+    if not is_usable(state):
+        return UNUSABLE
+    met = _toward(state, velocity, parameters, wanted, moved)
+    if not met & CHASED and not _make_safe(state, moved, parameters):
+        met |= UNSAFE
+    return met
 
 
 @compiled

@@ -36,6 +36,7 @@ from service.core.setpoint.bounds import (
     tracker_gains,
     what_is_wrong,
 )
+from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Target, Wanted, decided
 
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
@@ -86,12 +87,6 @@ class SetpointGenerator:
         """
         motion = target.position, target.velocity, target.acceleration
         return int(_lead(as_array(state), *motion, self._parameters, box, costs, slow))
-
-    def slow_down(self, state: Record, here: Records, share: float) -> float:
-        """Share of the greatest speed for a setpoint that is ahead of the tool, and that may keep
-        only a share of its own speed.
-        """
-        return float(slow_down(state["setpoint"], here["position"][0], share, float(self._parameters["max_speed"][0])))
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
         """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
@@ -267,9 +262,12 @@ class OrientationSetpoint:
 
     def __init__(self, settings: Settings) -> None:
         tool = settings.tool
-        self._limits = np.array([TURN_SPEED_SHARE * tool.max_turn_speed, tool.max_turn_acceleration])
-        self._about = float(tool.orientation == "full")
-        self._period_s = settings.period_s
+        self.parameters = parameters(
+            max_speed=TURN_SPEED_SHARE * tool.max_turn_speed,
+            max_acceleration=float(tool.max_turn_acceleration),
+            about=int(tool.orientation == "full"),
+            period_s=settings.period_s,
+        )
 
     def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
         """Puts it where the tool is, before there are targets: rotation (3, 3), turning (3,)
@@ -283,7 +281,7 @@ class OrientationSetpoint:
 
         Where the settings say that a direction is followed, +z goes the shortest way.
         """
-        _turn(state["orientation"], state["turning"], orientation, turning, self._about, self._limits, self._period_s)
+        _turn(state["orientation"], state["turning"], orientation, turning, self.parameters)
 
 
 @compiled
@@ -292,15 +290,14 @@ def _turn(
     turning: Vector,
     target: Vector,
     target_turning: Vector,
-    about: float,
-    limits: Vector,
-    dt: float,
+    parameters: Records,
 ) -> None:
     """One period, in place."""
+    given, dt = parameters[0], parameters[0].period_s
     error, wanted, axis, target_axis = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     axis_of(quaternion, axis)
     along = 0.0
-    if about > 0.0:
+    if given.about:
         turn_between(quaternion, target, error)
     else:
         axis_of(target, target_axis)
@@ -309,7 +306,7 @@ def _turn(
             along += target_turning[i] * axis[i]
     angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
     # in proportion to the error when near, braking evenly from afar
-    brake, rate = TURN_BRAKE_SHARE * limits[1], TURN_GAIN
+    brake, rate = TURN_BRAKE_SHARE * given.max_acceleration, TURN_GAIN
     near = brake / TURN_GAIN**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
@@ -317,12 +314,12 @@ def _turn(
     for i in range(3):
         wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
         speed += wanted[i] * wanted[i]
-    slower = min(1.0, limits[0] / max(math.sqrt(speed), 1e-12))
+    slower = min(1.0, given.max_speed / max(math.sqrt(speed), 1e-12))
     change = 0.0
     for i in range(3):
         wanted[i] = slower * wanted[i] - turning[i]
         change += wanted[i] * wanted[i]
-    share = min(1.0, limits[1] * dt / max(math.sqrt(change), 1e-12))
+    share = min(1.0, given.max_acceleration * dt / max(math.sqrt(change), 1e-12))
     for i in range(3):
         turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
         wanted[i] = dt * turning[i]
@@ -333,7 +330,7 @@ class SetpointStage:
     """Leads the state's setpoints within the workspace's box (2, 3) [m] of the skill in force."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
-        self._arm, self._period_s = arm, settings.period_s
+        self._arm, self._period_s, self._max_speed = arm, settings.period_s, float(settings.tool.max_speed)
         self._costs = np.empty((3, 3, len(settings.joints.names)))
         self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
 
@@ -348,12 +345,12 @@ class SetpointStage:
         """Leads the setpoints one period on; what `SetpointGenerator.step` says. `share` is that of
         the setpoint's speed at which separation lets the tool go along.
         """
-        slow = self._position.slow_down(state, here.record, share)
-        joint_costs(self._arm.parameters, here.record, self._costs)
+        states, frames = as_array(state), as_array(frame)
+        slow = _ready(states, here.record, self._arm.parameters, self._max_speed, share, self._costs)
         met = self._position.step(state, wanted.target, box, self._costs, slow)
-        self._orientation.step(state, wanted.orientation, wanted.turning)
-        self._grip(state, wanted, here)
-        _write(as_array(state), as_array(frame))
+        if state["closure"] != NO_GRIPPER:
+            self._grip(state, wanted, here)
+        _finish(states, frames, self._orientation.parameters)
         return met
 
     def _grip(self, state: Record, wanted: Wanted, here: Kinematics) -> None:
@@ -364,6 +361,21 @@ class SetpointStage:
         state["gripper"] = decided(before, closure, since_s=since_s, off=off)
         if state["gripper"] != before:
             state["gripper_tick"] = state["tick"]
+
+
+@compiled
+def _ready(states: Records, heres: Records, arms: Records, max_speed: float, share: float, costs: Vector) -> float:
+    """The joints' costs of tool motion into `costs`; share of the speed that is allowed."""
+    joint_costs(arms, heres, costs)
+    return slow_down(states[0].setpoint, heres[0].position, share, max_speed)
+
+
+@compiled
+def _finish(states: Records, frames: Records, parameters: Records) -> None:
+    """Turns the orientation's setpoint on toward the frame's target, and shows the setpoints."""
+    state, frame = states[0], frames[0]
+    _turn(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
+    _write(states, frames)
 
 
 @compiled
