@@ -14,7 +14,7 @@ from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 
 ROUND_TO = 1e9  # of quaternions: machines that differ in the last bits agree
-_TINY = 1e-12
+_TINY = 1e-12  # a sine below it has no direction
 
 
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
@@ -144,7 +144,7 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
 
 
 LEAST = 1e-9  # [m] segments nearer than this meet; [m²] shorter ones are points
-HALVINGS = 40
+HALVINGS = 40  # of a segment, to the nearest point of a box: to 1e-12 of its length
 FLAT = 1e-6  # [m²] what a triangle's edges are taken to be longer by, as it may be none
 CAPSULE = np.dtype(
     [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]

@@ -21,7 +21,8 @@ from service.core.intake.intake import still_ticks
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
 
-REHEARSED_TICKS, SAMPLE_EVERY = 30, 5
+FOLLOWED_TICKS = 30  # after the arm is believed
+SAMPLE_EVERY = 5  # ticks, of the hands
 
 
 def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
@@ -57,7 +58,7 @@ def _as_sent(skill: Skill) -> Skill:
 def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
     controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
-    count = still_ticks(settings) + REHEARSED_TICKS
+    count = still_ticks(settings) + FOLLOWED_TICKS
     for index in range(count):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -9,6 +9,7 @@ import pytest
 
 from service.contract.records import Field
 from service.core.frame import Record, Vector
+from service.core.skill import MODEL_STATE
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import Model, Motion
 from service.core.skill.skill import MODELS, STATE_FIELDS, Skill
@@ -94,7 +95,7 @@ def test_models_are_told_apart_by_their_words_and_formats() -> None:
     assert all(len({words(model) for model in MODELS}) == len(MODELS) for words in (measure, units))
     formats = [number for model in MODELS for number in model.formats]
     assert len(set(formats)) == len(formats)
-    assert STATE_FIELDS == ()  # none remembers yet
+    assert STATE_FIELDS == MODEL_STATE  # the state has them, whichever model is in force
 
 
 def measure(model: type[Model]) -> str:

@@ -16,8 +16,7 @@ from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.separation import Separation
 
-# Chosen on the WAM, whose tool reaches 0.88 m from its shoulder, and scaled by the arm's reach.
-REACH_M = 0.88
+REACH_M = 0.88  # of the WAM, on which the next four were chosen; they are scaled by the arm's own
 TURN_LEVER = 0.03  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
 DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
 SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture

@@ -11,10 +11,13 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 
-LEAST_SQUARE, LEAST_GAIN = 1e-12, 1e-12
+LEAST_SQUARE = 1e-12  # of a pivot: what is less is rounding
+LEAST_GAIN = 1e-12  # for which a joint leaves its bound
 BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
 ROUNDS = 40  # inequalities that may be met or left in one step
-LEAST_EXCESS, LEAST_SLOPE, LEAST_FORCE = 1e-9, 1e-10, 1e-12
+LEAST_EXCESS = 1e-9  # beyond a limit that counts
+LEAST_SLOPE = 1e-10  # along which a constraint can still be met
+LEAST_FORCE = 1e-12  # of a constraint that may be left
 
 
 @compiled

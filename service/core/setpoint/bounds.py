@@ -14,7 +14,8 @@ from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.setpoint import HULL_SPANS
 
-LEAST_SHARE, HALVINGS = 1e-3, 40  # of its acceleration with which an axis waits for the slowest; how that is found
+LEAST_SHARE = 1e-3  # of its acceleration with which an axis waits for the slowest
+HALVINGS = 40  # in which that share is found
 
 
 @compiled

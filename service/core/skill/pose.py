@@ -66,7 +66,7 @@ class LearnedGripper:
         return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
 
 
-_NOTHING = np.zeros((3, 3))
+_NOTHING = np.zeros((3, 3))  # in place of a covariance that is known
 
 
 @compiled

@@ -14,7 +14,7 @@ from service.core.frame import Vector
 from service.core.skill.model import FARTHEST_M
 
 MOST_CORNERS = 3  # positions of one hand that it may go between
-MOST_NAMES = 100
+MOST_NAMES = 100  # via-points of a task: more are a mistake in the file
 NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a via-point
 TASK_UNITS = (
     "inputs: shares of the left hand's places, of the right hand's; outputs: the tool's shares of all named places "
