@@ -51,6 +51,11 @@ class HandSettings(Section, frozen=True):
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # each axis; a start, it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
+    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is on its way
+    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # in which a hand comes to be still
+    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] off where it is expected: a hand has jumped ...
+    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.0  # [m/s] ... farther after a pause; reaches have 1.5
+    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # until hands that changed places are believed
 
 
 class ToolSettings(Section, frozen=True):
@@ -66,6 +71,7 @@ class ToolSettings(Section, frozen=True):
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk², beside error²
+    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
 
 
 class ArmSettings(Section, frozen=True):
@@ -139,6 +145,7 @@ class People(Section, frozen=True):
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
     contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] of the tool to a hand that receives
     unknown_speed: Positive = 1.6  # [m/s] of a hand that has only just been seen
+    tremor_speed: Positive = 0.1  # [m/s] nothing is foreseen of a slower hand: it trembles; all of it at twice that
 
 
 class Box(Section, frozen=True):

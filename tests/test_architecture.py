@@ -190,3 +190,25 @@ def test_constraints_name_versions_and_no_places() -> None:
     assert pins
     assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", pin)] == []
     assert [line for line in lines if re.search(r"://|--(extra-)?index|--find-links|@", line)] == []
+
+
+def test_each_number_of_the_core_says_why_it_is_what_it_is() -> None:
+    """A constant has a comment behind or above it, or a docstring beneath it."""
+    bare = []
+    for path in (ROOT / "service" / "core").rglob("*.py"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for node, after in zip(tree := ast.parse("\n".join(lines)).body, [*tree[1:], None], strict=True):
+            if not isinstance(node, ast.Assign) or not _is_numeric(node.value):
+                continue
+            explained = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            above, here = lines[node.lineno - 2], lines[node.end_lineno - 1]  # type: ignore[operator]
+            if "#" not in here and not above.startswith("#") and not explained:
+                bare.append(f"{path.relative_to(ROOT)}:{node.lineno}: {lines[node.lineno - 1]}")
+    assert not bare, "\n".join(bare)
+
+
+def _is_numeric(value: ast.expr) -> bool:
+    """Whether an expression is of numbers, and no layout or record."""
+    parts = list(ast.walk(value))
+    made = {ast.unparse(part.func) for part in parts if isinstance(part, ast.Call)}
+    return made <= {"np.array"} and any(isinstance(p, ast.Constant) and type(p.value) in (int, float) for p in parts)

@@ -356,7 +356,7 @@ def serve(
     and UnreachableError before it starts, LoopError where it ends by itself.
     """
     lock = Lock(state_folder(settings), settings.cell)
-    skill_worker = SkillWorker()
+    skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
     try:
         skill = load_skill(skill_worker, skill_path, settings)
         daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, lock=lock)

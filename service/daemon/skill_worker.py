@@ -23,7 +23,7 @@ from typing import Any
 from service import child
 from service.contract.requests import ViaPoint
 from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.learning.via_points import adapted
+from service.learning.via_points import MAX_GAIN, adapted
 
 TIMEOUT_S = 8.0  # shorter than a client waits
 
@@ -34,13 +34,14 @@ class SkillWorker:
     Methods may be called from any thread; it works on one request at a time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, max_gain: float = MAX_GAIN) -> None:
+        self._max_gain = max_gain
         self._busy = threading.Lock()
         self._child: child.Child | None = None
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        return self._ask(timeout_s, "load", path, None, 0.0)
+        return self._ask(timeout_s, "load", path)
 
     def adapt(
         self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
@@ -49,7 +50,7 @@ class SkillWorker:
 
         Raises SkillError, also after `timeout_s` [s].
         """
-        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance)
+        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance, self._max_gain)
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -105,7 +106,7 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, tolerance: float) -> StoredSkill:
+def _work(kind: str, source: Any, *adaptation: Any) -> StoredSkill:
     if kind == "load":
         try:
             data = Path(source).read_bytes()
@@ -113,9 +114,9 @@ def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, toleran
             raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
         skill = decoded(data, origin=str(source))
     else:
+        via_points, tolerance, max_gain = adaptation
         skill = decoded(source, origin="the skill in force")
-    if via_points is not None:
-        skill = adapted(skill, via_points, tolerance=tolerance)
+        skill = adapted(skill, via_points, tolerance=tolerance, max_gain=max_gain)
     hands = skill.hands[0].reshape(2, 3)
     skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
     return skill

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from kmp import ViaPointMissed
+from service.config import ToolSettings
 from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
@@ -20,23 +21,25 @@ from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, StoredSkill, with_file
 
-STEEPEST = 4.0  # of 300 random soldering scenes the worst has 3.6; the skill itself comes to be twice as steep there
+MAX_GAIN = ToolSettings().max_gain
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
 
 
-def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
+def adapted(
+    skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, max_gain: float = MAX_GAIN
+) -> StoredSkill:
     """A new skill that goes through these via-points and no others. Raises SkillError.
 
     Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
-    tool would have to move more than `STEEPEST` times as far as the hands contradict each other:
+    tool would have to move more than `max_gain` times as far as the hands contradict each other:
     hands at rest tremble, and the tool would shake so many times as much.
     """
     if not tolerance >= 0:
         names = [point.name for point in via_points]
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     inputs, outputs, deviations = neighbourhoods(via_points)
-    _check_agreement(via_points, inputs, outputs, deviations)
+    _check_agreement(via_points, inputs, outputs, deviations, max_gain)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
@@ -60,18 +63,20 @@ def _weight(skill: Skill) -> float:
     return 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
 
 
-def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
+def _check_agreement(
+    via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector, max_gain: float
+) -> None:
     """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
     contradict each other.
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
-    allowed = STEEPEST * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
+    allowed = max_gain * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
     owners = [name for point in via_points for name in [point.name] * points_made_of([point])]
     for i, j in np.argwhere(tools > allowed)[:1].tolist():
         raise SkillError(
             f"via-points {owners[i]!r} and {owners[j]!r} contradict each other: their hands are {hands[i, j]:.4f} m "
-            f"apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, {STEEPEST:g} "
+            f"apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, {max_gain:g} "
             "times the hands' distance and what their std allow"
         )
 

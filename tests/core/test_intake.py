@@ -202,7 +202,7 @@ def test_a_stamp_from_the_future_is_refused_and_locks_no_source_out(ahead_ns: in
         hands.advance()
     assert hands.rejected() == {Cause.REPEATED: 1, Cause.AHEAD: 2}
     assert hands.fresh()
-    assert hands.intake.is_arm_heard(hands.state)
+    assert hands.heard()
 
 
 def test_a_stamp_may_be_ahead_by_the_time_that_passed_and_the_time_to_silence() -> None:
@@ -228,7 +228,7 @@ def test_stamps_at_the_ends_of_their_numbers_are_compared_without_overflow(first
     hands.hand(7)
     hands.arm(7)
     assert hands.fresh()
-    assert hands.intake.is_arm_heard(hands.state)
+    assert hands.heard()
 
 
 def test_a_stale_hand_stands_still_and_starts_anew() -> None:
@@ -292,14 +292,14 @@ def test_a_useless_arm_sample_is_counted_and_changes_nothing_else(
 
 def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with_any_stamp() -> None:
     hands = Hands()
-    assert not hands.intake.is_arm_heard(hands.state)
+    assert not hands.heard()
     hands.arm(1000)
     hands.advance(49)
     hands.arm(999)
     hands.arm(1000)
     assert hands.rejected() == {Cause.OLDER: 1, Cause.REPEATED: 1}
-    assert hands.intake.is_arm_heard(hands.state)
+    assert hands.heard()
     hands.advance()
-    assert not hands.intake.is_arm_heard(hands.state)
+    assert not hands.heard()
     hands.arm(5)
-    assert hands.intake.is_arm_heard(hands.state)
+    assert hands.heard()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from importlib.metadata import files
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,43 +19,8 @@ from service.recording.replay import replay
 from sim.scene import Scene
 from sim.script import HandScript
 from sim.teach import demonstrations
+from support.arms import MODELS, cell_of, toml_of, urdf_of
 from support.in_process import frames, ticks_of
-
-
-class Model(NamedTuple):
-    """An arm: its file among the robots, the link that carries the tool, and joints at the tool's
-    start [rad].
-    """
-
-    file: str
-    plate: str
-    posture: tuple[float, ...]
-
-
-# The postures have the tool where the demonstrations begin, 45 degrees down.
-MODELS = {
-    "panda": Model("panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)),
-    "ur5": Model("ur5_robot.urdf", "tool0", (-0.39, -1.67, 2.129, -2.772, -1.303, 0.0)),
-}
-
-
-def urdf_of(model: Model) -> Path:
-    """Where the file is installed."""
-    return next(Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == model.file)
-
-
-def toml_of(model: Model, **changed: str) -> str:
-    """The settings of a cell with this arm; a line left empty is left out."""
-    count = len(model.posture)
-    lines = {
-        "urdf": f"[arm]\nurdf = {json.dumps(str(urdf_of(model)))}",
-        "plate": f'plate = "{model.plate}"',
-        "source": 'source = "assumed"',
-        "posture": f"posture = {list(model.posture)}",
-        "acceleration": f"[joints]\nacceleration = {[10.0] * count}",
-        "jerk": f"jerk = {[500.0] * count}",
-    }
-    return "\n".join((lines | changed).values())
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +31,12 @@ def reach() -> Skill:
 
 @pytest.fixture(scope="module", params=MODELS)
 def cell(request: pytest.FixtureRequest) -> Settings:
-    return parse(toml_of(MODELS[request.param]), origin=request.param)
+    return cell_of(request.param)
 
 
-def test_it_follows_moving_targets_with_every_limit_held(cell: Settings, reach: Skill) -> None:
+@pytest.mark.parametrize("arm", ["wam", *MODELS])
+def test_it_follows_moving_targets_with_every_limit_held(arm: str, reach: Skill) -> None:
+    cell = cell_of(arm)
     seen = frames(Controller(cell, reach, urdf=robot_description(cell)), ticks_of(HandScript(Scene(), seed=3)))
     assert (seen["mode"] == Mode.FOLLOW).all()
     error_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)

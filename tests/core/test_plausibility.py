@@ -15,10 +15,11 @@ from hypothesis import example, given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
+from service.config import HandSettings
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, copied
+from service.core.frame import Tick, Vector, copied, parameters
 from service.core.intake import intake as plausibility
 from service.core.skill.skill import Skill
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
@@ -54,6 +55,26 @@ def test_a_jump_is_believed_once_three_samples_over_20_ms_agree_and_not_at_all_b
     assert hands.fresh()
 
 
+def test_what_counts_as_a_jump_and_how_long_a_swap_is_doubted_are_settings() -> None:
+    leap = (0.5, 0.18, 0.2)
+    for jump, believed in ((0.04, False), (0.1, True)):
+        hands = Hands(HandSettings(jump=jump))
+        tell(hands, [PLACE] * 100 + [leap], 100)
+        assert hands.rejected() == ({} if believed else {Cause.JUMPED: 1})
+    for swapped_s in (0.3, 1.0):
+        hands = Hands(HandSettings(swapped_s=swapped_s))
+        for tick in range(1, 51):
+            hands.hand(tick, PLACE, side=0)
+            hands.hand(tick, ELSEWHERE, side=1)
+            hands.advance()
+        hands.advance(50)
+        tick = 100
+        while float(hands.hand(10**9 + tick, ELSEWHERE)[1]) < 0.2:
+            hands.advance()
+            tick += 1
+        assert tick * 0.002 == pytest.approx(swapped_s + 0.2, abs=0.02)
+
+
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("length", [1, 2])
 def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, length: int) -> None:
@@ -84,10 +105,10 @@ def test_of_two_sources_that_take_turns_the_first_is_believed_and_the_contest_is
     tell(hands, [PLACE] * 20, rate_hz)
     y = tell(hands, [other, PLACE] * (3 * rate_hz // 2), rate_hz)
     assert np.abs(np.array(y) - PLACE[1]).max() < 0.001
-    assert hands.intake.is_contested(hands.state, already=False)
+    assert hands.contested()
     assert hands.fresh()
     tell(hands, [PLACE] * (3 * rate_hz), rate_hz)
-    assert not hands.intake.is_contested(hands.state, already=True)
+    assert not hands.contested(already=True)
 
 
 @pytest.mark.parametrize("offset_ns", [-5_000_000, 3600 * 10**9])
@@ -98,7 +119,7 @@ def test_a_second_source_with_a_clock_of_its_own_is_noticed_too(offset_ns: int) 
         stamp_ns = 10**15 + int(hands.state["tick"]) * 2_000_000
         hands.hand(stamp_ns, PLACE)
         hands.hand(stamp_ns + offset_ns, ELSEWHERE)
-    assert hands.intake.is_contested(hands.state, already=False)
+    assert hands.contested()
     assert abs(hands.state["hands"][LEFT_SIDE, 0, 1] - 0.1) < 0.001
 
 
@@ -111,12 +132,12 @@ def test_two_trackers_that_are_nearly_of_one_mind_are_noticed_by_the_scatter(apa
         hands.advance(max(0, round(500 * at_s) - int(hands.state["tick"])))
         place = np.add(PLACE, (0.0, 0.1 * math.sin(2 * at_s), off)) + 0.002 * random.standard_normal(3)
         hands.hand(10**12 + round(1e9 * at_s), tuple(place.tolist()))
-        told.append(hands.intake.is_contested(hands.state, already=bool(told and told[-1])))
+        told.append(hands.contested(already=bool(told and told[-1])))
     seconds = np.array([at_s for at_s, _ in when])
     assert not np.array(told)[seconds < 1.0].any()
     assert np.array(told)[seconds > 2.5].all()
     tell(hands, [PLACE] * 200, 100)
-    assert not hands.intake.is_contested(hands.state, already=True)
+    assert not hands.contested(already=True)
 
 
 def test_a_poor_tracker_alone_is_no_contest() -> None:
@@ -124,7 +145,7 @@ def test_a_poor_tracker_alone_is_no_contest() -> None:
     for row in 0.008 * random.standard_normal((500, 3)):
         hands.advance(5)
         hands.hand(10**9 + int(hands.state["tick"]), tuple((np.array(PLACE) + row).tolist()))
-        assert not hands.intake.is_contested(hands.state, already=False)
+        assert not hands.contested()
 
 
 def test_a_copy_of_the_same_source_that_comes_late_is_no_contest() -> None:
@@ -134,7 +155,7 @@ def test_a_copy_of_the_same_source_that_comes_late_is_no_contest() -> None:
         hands.hand(10**9 + k, PLACE)
         hands.hand(10**9 + k - 3, PLACE)
         hands.hand(10**9 + k, PLACE)
-    assert not hands.intake.is_contested(hands.state, already=True)
+    assert not hands.contested(already=True)
     assert set(hands.rejected()) == {Cause.OLDER, Cause.REPEATED}
 
 
@@ -192,7 +213,7 @@ def test_hands_that_are_taken_for_each_other_are_not_believed_but_held_for(rate_
     off, fresh = hands.tell(1.0)
     assert fresh[2 * hands.every :].all()
     assert off.max() < 0.02
-    assert not hands.intake.is_contested(hands.state, already=True)
+    assert not hands.contested(already=True)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -330,6 +351,7 @@ def test_stamps_are_judged_as_the_plain_rule_says(stamp: int, newest: int, fresh
 
 def test_compiled_and_plain_memory_agree() -> None:
     hands, random = Hands(), np.random.default_rng(7)
+    given = parameters(period_s=0.002, stale_ticks=50, swapped_s=2.0).view(np.recarray)
     compiled, plain = copied(hands.state), copied(hands.state)
     for _ in range(200):
         jumped, at = bool(random.random() < 0.4), random.choice([0.0, 0.01, 0.3]) * np.ones(3)
@@ -337,7 +359,7 @@ def test_compiled_and_plain_memory_agree() -> None:
         for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
             state["tick"] += ticks
             way(plausibility.note)(state.base.view(np.recarray), 0, jumped, 0.002)
-            answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), 0, at, 50, 0.002))
+            answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), given, 0, at))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
         for name in ("jump_first_tick", "jump_newest_tick", "jump_count", "jump_is_swap"):

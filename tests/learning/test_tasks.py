@@ -16,7 +16,7 @@ from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.skill.skill import Skill
 from service.core.skill.task import MOST_CORNERS
-from service.core.skill.task_parameterized import TaskParameterized, nearest_between
+from service.core.skill.task_parameterized import TaskInstance, TaskParameterized, nearest_between
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
@@ -95,6 +95,21 @@ def test_a_moving_hand_is_on_its_way_and_a_trembling_one_moves_nothing(between: 
     calm = between.predict(half.reshape(2, 3), (0.02 * way).reshape(2, 3), AT_REST.reshape(2, 3))
     assert np.linalg.norm(calm.velocity) < 1e-3
     assert np.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_what_is_near_to_a_via_point_is_smaller_where_these_lie_close_together(between: Skill) -> None:
+    """For a watchmaker all of it is smaller."""
+    assert isinstance(between.model, TaskParameterized)
+    task, at = between.model.task, between.model.nominal
+    large, small = (
+        TaskInstance.of(task, task.parameters(at._replace(at=share * at.at))) for share in (0.3 / 0.44, 0.1 / 0.44)
+    )
+    assert (large.tasks["size"] <= 1.0).all()
+    assert (small.tasks["size"] < 0.4).all()
+    hands = np.random.default_rng(3).uniform(-0.1, 0.1, (50, 6)) + np.hstack([*large.tasks["corners"][0].mean(axis=1)])
+    expected, found = large.inputs(hands)[0], small.inputs(hands / 3.0)[0]
+    assert np.abs(expected - found).max() < 2e-3  # edges are taken to be a millimetre longer
+    assert between.model.instance.tasks["size"].tolist() == [[1.0, 1.0]]
 
 
 def test_a_via_point_of_another_name_is_added_and_forgotten(between: Skill, shown: list[Demonstration]) -> None:

@@ -9,9 +9,10 @@ import numpy as np
 from service.config import HandSettings, Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
-from service.core.frame import Record, Vector, blank
-from service.core.intake.intake import Intake
-from support.wam import JOINT_NAMES, STATE
+from service.core.frame import Record, Vector, as_array, blank, copied
+from service.core.intake.hand_estimator import is_fresh
+from service.core.intake.intake import ARM_HEARD, Intake, is_contested
+from support.wam import FRAME, JOINT_NAMES, STATE
 
 PERIOD_S = 0.002
 LEFT, RIGHT = 0, 1
@@ -22,7 +23,8 @@ class Hands:
     """An intake and its state, moved on tick by tick."""
 
     def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
-        self.intake = Intake(Settings(hands=hands or HandSettings(), rate_hz=rate_hz))
+        self.settings = Settings(hands=hands or HandSettings(), rate_hz=rate_hz)
+        self.intake = Intake(self.settings)
         self.state: Record = blank(STATE)
         self.intake.begin(self.state)
         self.advance()
@@ -51,7 +53,15 @@ class Hands:
         self.intake.take_arm(self.state, JointState(stamp_ns, names, position, velocity))
 
     def fresh(self, side: int = LEFT) -> bool:
-        return self.intake.is_fresh(self.state, side)
+        stale_ticks = max(1, round(self.settings.hands.stale_ms / 1000 * self.settings.rate_hz))
+        return bool(is_fresh(as_array(self.state), side, stale_ticks))
+
+    def heard(self) -> bool:
+        """Whether the arm has reported its joints lately enough."""
+        return bool(self.intake.step(copied(self.state), blank(FRAME), 0, []) & ARM_HEARD)
+
+    def contested(self, *, already: bool = False) -> bool:
+        return bool(is_contested(as_array(self.state), already))
 
     def rejected(self) -> dict[Cause, int]:
         return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}

@@ -26,44 +26,44 @@ import numpy as np
 from scipy.linalg import expm
 
 from kmp.compiled import compiled
+from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.intake import MODES
 
 LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
-STILL_SPEED = 0.05  # [m/s] a hand this fast is on its way
-RISE_S = 0.2  # in which a hand comes to be still
 FALL_S = 0.03  # in which it is still no more
 ROUND_TO = 1e9  # of what is remembered: machines that differ in the last bits agree
 STILL = np.ones(2)  # both hands
+USUAL = HandSettings()  # of recordings, whose cell nobody knows
 
 
-def smoothing(period_s: float) -> Vector:
+def smoothing(period_s: float, still_s: float) -> Vector:
     """By how much (3,) the lowpass velocity, rising and falling stillness change in a period."""
-    return 1.0 - np.exp(-period_s / np.array([LOWPASS_S, RISE_S, FALL_S]))
+    return 1.0 - np.exp(-period_s / np.array([LOWPASS_S, still_s, FALL_S]))
 
 
 @compiled
-def stillness_after(velocity: Vector, smoothing: Vector, lowpass: Vector, stillness: float) -> float:
-    """The stillness of a hand a period later, when it moves so (3,) [m/s]; `lowpass` (3,) is its
-    velocity without tremor, moved on too.
+def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpass: Vector, stillness: float) -> float:
+    """The stillness of a hand a period later, when it moves so (3,) [m/s]; `changes` are those of
+    `smoothing`, `lowpass` (3,) is its velocity without tremor, moved on too.
     """
     square = 0.0
     for axis in range(3):
-        lowpass[axis] = np.rint((lowpass[axis] + smoothing[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO) / ROUND_TO
+        lowpass[axis] = np.rint((lowpass[axis] + changes[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO) / ROUND_TO
         square += lowpass[axis] * lowpass[axis]
-    share = square / STILL_SPEED**2
+    share = square / still_speed**2
     now = math.exp(-share * share)
-    after = stillness + (smoothing[1] if now > stillness else smoothing[2]) * (now - stillness)
+    after = stillness + (changes[1] if now > stillness else changes[2]) * (now - stillness)
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 
 
-def stillness_of(velocities: Vector, period_s: float) -> Vector:
+def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUAL) -> Vector:
     """The stillness (T, 2) of both hands that moved so (T, 6) [m/s], from stillness."""
     out, stillness = np.empty((len(velocities), 2)), STILL.copy()
-    changed, lowpass = smoothing(period_s), np.zeros((2, 3))
+    changes, lowpass, speed = smoothing(period_s, hands.still_s), np.zeros((2, 3)), float(hands.still_speed)
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
-            stillness[side] = stillness_after(velocity[side], changed, lowpass[side], stillness[side])
+            stillness[side] = stillness_after(velocity[side], changes, speed, lowpass[side], stillness[side])
         row[:] = stillness
     return out
 
@@ -77,9 +77,7 @@ LEAST_NOISE = 7e-4  # [m] of a tracker's standard deviation: below it, hands tre
 MOST_NOISE = 5e-2  # [m]
 AVERAGED = 60  # samples over which the noise is averaged
 OUTLIER = 9.0  # times the noise variance: as much as one difference may count
-JUMP_M = 0.04  # jump gate: max(JUMP_M + JUMP_MPS * dt, JUMP_NOISE sigma)
-JUMP_MPS = 1.0  # [m/s]
-JUMP_NOISE = 6.0  # standard deviations
+JUMP_NOISE = 6.0  # standard deviations of a tracker's noise that are no jump
 START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
 START_ACCELERATION = 1.0  # [m/s²] likewise
 LEAST_PROBABILITY = 1e-4  # of a mode
@@ -90,19 +88,20 @@ ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the las
 class HandEstimator:
     """The estimates of both hands, in the state's arrays."""
 
-    def __init__(self, *, noise_std_m: float, period_s: float) -> None:
-        """`noise_std_m` is where the estimate of the noise begins."""
-        self._noise = noise_std_m**2
-        self._period_s = period_s
+    def __init__(self, hands: HandSettings, period_s: float) -> None:
+        self._hands, self._period_s = hands, period_s
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
         transition, noise = model(ticks * self._period_s)
-        return parameters(transition=transition, noise=noise, smoothing=smoothing(ticks * self._period_s))
+        changed = smoothing(ticks * self._period_s, self._hands.still_s)
+        return parameters(
+            transition=transition, noise=noise, smoothing=changed, still_speed=float(self._hands.still_speed)
+        )
 
     def begin(self, state: Record) -> None:
         """Sets what no sample has reported yet."""
-        state["noise_variance"] = self._noise
+        state["noise_variance"] = self._hands.noise_std_m**2
         state["hand_stillness"] = STILL
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
@@ -276,7 +275,7 @@ def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
         lowpass, stillness = state.hand_velocity_lowpass[side], state.hand_stillness[side]
-        state.hand_stillness[side] = stillness_after(hand[1], over.smoothing, lowpass, stillness)
+        state.hand_stillness[side] = stillness_after(hand[1], over.smoothing, over.still_speed, lowpass, stillness)
 
 
 @compiled
@@ -287,12 +286,12 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
 
 
 @compiled
-def has_jumped(states: Records, side: int, position: Vector, interval_s: float) -> bool:
+def has_jumped(states: Records, parameters: Records, side: int, position: Vector, interval_s: float) -> bool:
     """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
     after the one before.
     """
-    state = states[0]
-    gate = max(JUMP_M + JUMP_MPS * interval_s, JUMP_NOISE * math.sqrt(state.noise_variance[side]))
+    state, given = states[0], parameters[0]
+    gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE * math.sqrt(state.noise_variance[side]))
     off = 0.0
     for axis in range(3):
         off += (position[axis] - state.hands[side, 0, axis]) ** 2

@@ -11,8 +11,8 @@ contradicts it. One rule for both hands and the arm:
   `CONFIRMED` samples in a row, over `CONFIRMED_S` at least, agree with each other; the arm's never,
   before it was silent: it has a body.
 * A hand that comes to where the other one was, which is not seen there any more, has not moved: its
-  tracker takes one for the other. That is believed after `SWAPPED_S`, as it may have put itself
-  right.
+  tracker takes one for the other. That is believed after `hands.swapped_s`, as it may have put
+  itself right.
 * A source is contested from when a quarter of what it told within about a second had jumped, until
   that is less than a tenth; and while a hand's samples scatter more than any tracker's, as those of
   two that are some centimetres apart do.
@@ -32,14 +32,13 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SIDES, SOURCES, Cause, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
-from service.core.intake.hand_estimator import HandEstimator, has_jumped, is_fresh, take
+from service.core.intake.hand_estimator import HandEstimator, has_jumped, take
 
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 CONFIRMED = 3  # samples in a row that agree
 CONFIRMED_S = 0.02  # over so long at least
 SWAPPED_M = 0.05  # so near to where the other hand was ...
 SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
-SWAPPED_S = 2.0  # after so long a swap is believed
 AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
 AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
 CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
@@ -51,13 +50,9 @@ MOST_S = 1 / 30  # that one sample counts, whatever the pause before it
 ROUND_TO = 1e9  # of the share: machines that differ in the last bits agree
 
 
-def is_contested(state: Record, *, already: bool) -> bool:
-    """Whether some source is contradicted by another; `already`: it was found so before."""
-    return bool(_is_contested(as_array(state), already))
-
-
 @compiled
-def _is_contested(states: Records, already: bool) -> bool:
+def is_contested(states: Records, already: bool) -> bool:
+    """Whether some source is contradicted by another; `already`: it was found so before."""
     share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED_SHARE, SCATTERED_M)
     return bool(states[0].contested.max() > share or states[0].noise_variance.max() > scatter_m**2)
 
@@ -88,54 +83,55 @@ def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
 
 
 @compiled
-def is_swapped(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
+def is_swapped(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """Whether a hand's sample (3,) [m], the first after a silence, is the other hand's, or goes on
     from samples that were.
     """
-    state = states[0]
+    state, given = states[0], parameters[0]
     is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
-    if is_swap and (state.tick - state.jump_first_tick[side]) * period_s >= SWAPPED_S:
+    if is_swap and (state.tick - state.jump_first_tick[side]) * given.period_s >= given.swapped_s:
         return False
-    if is_swap and _goes_on(states, side, position, stale_ticks, period_s):
+    if is_swap and _goes_on(states, parameters, side, position):
         return True
-    silent = seen >= 0 and stale_ticks <= state.tick - seen and (state.tick - seen) * period_s < SWAPPED_S
-    return bool(silent and _is_at_other(states, side, position, period_s))
+    silent = state.tick - seen
+    lately = given.stale_ticks <= silent and silent * given.period_s < given.swapped_s
+    return bool(seen >= 0 and lately and _is_at_other(states, parameters, side, position))
 
 
 @compiled
-def is_confirmed(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
+def is_confirmed(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """Whether a hand's sample (3,) [m] that jumped is to be believed, by those just before it."""
-    state = states[0]
-    if state.jump_count[side] == 0 or not _goes_on(states, side, position, stale_ticks, period_s):
+    state, given = states[0], parameters[0]
+    if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
         state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
     state.jumped_to[side, :] = position
     state.jump_newest_tick[side] = state.tick
     state.jump_count[side] += 1
     first, count = state.jump_first_tick[side], state.jump_count[side]
     unseen = state.hand_ticks[1 - side] < first
-    if count > 1 and unseen and _is_at_other(states, side, position, period_s):
+    if count > 1 and unseen and _is_at_other(states, parameters, side, position):
         state.jump_is_swap[side] = 1
-    enough_s = SWAPPED_S if state.jump_is_swap[side] else CONFIRMED_S
-    return bool(count >= CONFIRMED and (state.tick - first + 0.5) * period_s >= enough_s)
+    enough_s = given.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
+    return bool(count >= CONFIRMED and (state.tick - first + 0.5) * given.period_s >= enough_s)
 
 
 @compiled
-def _is_at_other(states: Records, side: int, position: Vector, period_s: float) -> bool:
+def _is_at_other(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """Whether a hand's sample is where the other hand was, and not where this one was."""
-    state = states[0]
+    state, given = states[0], parameters[0]
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * period_s, SWAPPED_S)
+    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * given.period_s, given.swapped_s)
     return bool(seen >= 0 and _distance(position, there) < min(near, 0.5 * _distance(here, there)))
 
 
 @compiled
-def _goes_on(states: Records, side: int, position: Vector, stale_ticks: int, period_s: float) -> bool:
+def _goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """Whether a sample is where a hand can be that was at the newest one that jumped."""
-    state = states[0]
+    state, given = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * period_s
-    return bool(passed < stale_ticks and near)
+    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * given.period_s
+    return bool(passed < given.stale_ticks and near)
 
 
 @compiled
@@ -146,13 +142,14 @@ def _distance(a: Vector, b: Vector) -> float:
     return math.sqrt(square)
 
 
-UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # of `hands.unit`
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
 TWO_SOURCES = int(Reason.TWO_SOURCES)
 MAX_JOINT_SPEED = 100.0  # [rad/s] beyond it a measured joint is a mistake
-JUMP_RAD = 0.2  # jump gate of a joint: JUMP_RAD + JUMP_RADPS * dt
-JUMP_RADPS = 5.0  # [rad/s]
+JUMP_RAD = 0.2  # [rad] jump gate of a joint ...
+JUMP_RADPS = 5.0  # [rad/s] ... for each second without a sample, as by hand an arm is moved so fast ...
+JUMP_SPEEDS = 2.0  # ... or as many times its fastest joint's greatest speed, where that is more
 FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
 STILL_RAD = 0.02  # an arm is at rest that stayed within so much ...
 STILL_S = 0.1  # ... for so long
@@ -204,6 +201,10 @@ class Intake:
             stale_ticks=self._stale_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
+            jump=float(hands.jump),
+            jump_speed=float(hands.jump_speed),
+            swapped_s=float(hands.swapped_s),
+            joint_jump_speed=max(JUMP_RADPS, JUMP_SPEEDS * max(settings.joints.velocity)),
             plausible_joints=limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]]),
         )
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
@@ -213,7 +214,7 @@ class Intake:
         self._maps_base = hands.frame in ("", BASE)
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
-        self._estimator = HandEstimator(noise_std_m=hands.noise_std_m, period_s=settings.period_s)
+        self._estimator = HandEstimator(hands, settings.period_s)
 
     def begin(self, state: Record) -> None:
         """Sets in a state of zeros what no sample has reported yet."""
@@ -231,24 +232,6 @@ class Intake:
             else:
                 self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
         return int(_report(as_array(state), as_array(frame), self._parameters))
-
-    def is_fresh(self, state: Record, side: int) -> bool:
-        """Whether a hand has been seen, and lately enough."""
-        return bool(is_fresh(as_array(state), side, self._stale_ticks))
-
-    def are_fresh(self, state: Record) -> bool:
-        """Whether both hands are."""
-        return self.is_fresh(state, 0) and self.is_fresh(state, 1)
-
-    def is_arm_heard(self, state: Record) -> bool:
-        """Whether the arm has told its joints lately enough."""
-        seen = int(state["arm_tick"])
-        return seen >= 0 and int(state["tick"]) - seen < self._silent_ticks
-
-    @staticmethod
-    def is_contested(state: Record, *, already: bool) -> bool:
-        """Whether a hand or the arm is told by two sources; `already`: it was found so before."""
-        return is_contested(state, already=already)
 
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
@@ -311,7 +294,7 @@ def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vec
     if near:
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s)
     if near and cause != REPEATED:
-        jumped = fresh and off > JUMP_RAD + JUMP_RADPS * passed_s
+        jumped = fresh and off > JUMP_RAD + given.joint_jump_speed * passed_s
         note(states, ARM, jumped, given.period_s)
         if jumped and cause < 0:
             cause = JUMPED
@@ -360,10 +343,10 @@ def _take_hand(
     else:
         cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
         if cause != REPEATED:
-            jumped = fresh and has_jumped(states, side, in_base, since * period_s)
+            jumped = fresh and has_jumped(states, parameters, side, in_base, since * period_s)
             note(states, side, jumped, period_s)
-            jumped = jumped or is_swapped(states, side, in_base, stale_ticks, period_s)
-        if cause < 0 and jumped and not is_confirmed(states, side, in_base, stale_ticks, period_s):
+            jumped = jumped or is_swapped(states, parameters, side, in_base)
+        if cause < 0 and jumped and not is_confirmed(states, parameters, side, in_base):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
@@ -396,5 +379,5 @@ def _report(states: Records, frames: Records, parameters: Records) -> int:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= given.still_ticks:
             known |= ARM_STILL
-    contested = _is_contested(states, state.reason == TWO_SOURCES)
+    contested = is_contested(states, state.reason == TWO_SOURCES)
     return known | CONTESTED if contested else known

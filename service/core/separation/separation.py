@@ -38,7 +38,6 @@ SLIP = 0.01  # [m/s] that joints which start one after the other may approach at
 NEAR_VIA_POINT = 0.02  # [m] beside a via-point's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
 CHANGE_S = 0.07  # over which a hand's acceleration fades
-STEADY = 0.1  # [m/s] slower hands tremble, and nothing is foreseen of them; all of it at twice that
 RAMP_S = 0.08  # of a braking, and until a hand's new velocity is known
 UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
 CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
@@ -71,6 +70,7 @@ class Separation:
             room=np.array([PEOPLE_ROOM, THINGS_ROOM]),
             contact_speed=float(people.contact_speed),
             unknown_speed=float(people.unknown_speed),
+            tremor_speed=float(people.tremor_speed),
             hand_radius=float(people.radius),
             forearm=people.length / np.linalg.norm(direction) * direction,
             frames=body.frames,
@@ -161,7 +161,7 @@ def _step(
         for mode in range(state.mode_probabilities.shape[1]):
             variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
         known, receives = variance <= UNSURE * UNSURE, _receives(contacts, state.hands, side)
-        moment = _swiftness(state.hands[side, 1]) if known else 0.0
+        moment = _swiftness(state.hands[side, 1], given.tremor_speed) if known else 0.0
         for k in range(len(AHEAD_S) if moment > 0.0 else 1):
             ahead = moment * AHEAD_S[k]
             parts = now if k == 0 else then
@@ -260,10 +260,10 @@ def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) 
 
 
 @compiled
-def _swiftness(velocity: Vector) -> float:
+def _swiftness(velocity: Vector, tremor_speed: float) -> float:
     """0 for a hand that rests or trembles, 1 for one that goes somewhere."""
     speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-    return min(max(speed / STEADY - 1.0, 0.0), 1.0)
+    return min(max(speed / tremor_speed - 1.0, 0.0), 1.0)
 
 
 @compiled

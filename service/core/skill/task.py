@@ -14,6 +14,8 @@ from service.core.frame import Vector
 from service.core.skill.model import FARTHEST_M
 
 MOST_CORNERS = 3  # positions of one hand that it may go between
+APART_M = 0.3  # a task whose positions of a hand are all nearer to each other is so many times smaller ...
+LEAST_SIZE = 0.1  # ... down to this share
 MOST_NAMES = 100  # via-points of a task: more are a mistake in the file
 NONE, LEFT, RIGHT = -1, 0, 1  # which hand the tool goes with at a via-point
 TASK_UNITS = (
@@ -37,6 +39,7 @@ TASK = np.dtype(
     [
         ("corners", np.float64, (2, 3, 3)),  # [m] positions of the left and the right hand
         ("inputs", np.int64, (2, 3)),  # as `Task.inputs`
+        ("size", np.float64, (2,)),  # of what is near to a position of each hand; 1 but where these lie close together
         ("scale", np.float64),  # of the kernel exp(-scale |difference|²) over inputs
         ("std", np.float64),  # [m] how sure the positions are, of each axis
         ("prior_offset", np.float64, (3,)),  # [m] the tool's offset far from all data
@@ -78,13 +81,15 @@ class Task(NamedTuple):
         """
         rows = [points.names.index(name) for name in self.names]
         at, known = points.at[rows], np.array([not points.known or name in points.known for name in self.names])
-        hands = np.zeros((2, MOST_CORNERS, 3))
+        hands, size = np.zeros((2, MOST_CORNERS, 3)), np.ones(2)
         for side in (0, 1):
             for corner in range(int(self.corners[:, side].max()) + 1):
                 here = self.corners[:, side] == corner
                 here &= known if (here & known).any() else True
                 hands[side, corner] = at[here, 3 * side : 3 * side + 3].mean(axis=0)
-        return TaskParameters(hands, at[:, 6:].copy(), points.std)
+            apart = np.linalg.norm(hands[side, : corner + 1, None] - hands[side, : corner + 1], axis=2)
+            size[side] = min(max(apart.max() / APART_M, LEAST_SIZE), 1.0)
+        return TaskParameters(hands, at[:, 6:].copy(), points.std, size)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """What a skill's file has of it."""
@@ -122,13 +127,14 @@ def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[
 
 
 class TaskParameters(NamedTuple):
-    """Where the via-points are [m]: the positions of both hands (2, 3, 3), the tool's (N, 3); and
-    how sure that is, of each axis [m].
+    """Where the via-points are [m]: the positions of both hands (2, 3, 3), the tool's (N, 3); how
+    sure that is, of each axis [m]; and how large the task is for each hand (2,), 1 or less.
     """
 
     hands: Vector
     tool: Vector
     std: float
+    size: Vector
 
 
 class NamedViaPoints(NamedTuple):

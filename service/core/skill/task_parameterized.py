@@ -35,7 +35,7 @@ from service.core.skill.task import (
 from service.core.skill.via_points import NEAR, bent
 
 SHARPNESS = 4.0  # power of the weights of a hand that rests
-AT_M = 0.12  # a hand that rests as near to a via-point belongs to it
+AT_M = 0.12  # in a task of full size, a hand that rests as near to a via-point belongs to it
 AWAY_M = 0.17  # one that rests as far from all waits on its way
 LEAST_WEIGHT = 1e-4  # that every via-point has, so that none is of an undefined power
 STEP_S = 0.02  # of differences along the hands' motion
@@ -58,7 +58,7 @@ def hand_weights(hands: Vector, stillness: Vector, task: Record, out: Vector) ->
         for i in range(count):
             x, y, z = corners[side, i]
             nearest = min(nearest, (hand[0] - x) ** 2 + (hand[1] - y) ** 2 + (hand[2] - z) ** 2)
-        near = min(max((AWAY_M - math.sqrt(nearest)) / (AWAY_M - AT_M), 0.0), 1.0)
+        near = min(max((AWAY_M - math.sqrt(nearest) / task["size"][side]) / (AWAY_M - AT_M), 0.0), 1.0)
         power = 1.0 + (SHARPNESS - 1.0) * near * stillness[side]
         total = 0.0
         for i in range(count):
@@ -121,6 +121,7 @@ class TaskInstance:
         """A KMP of a task's weights, and its errors; without those it knows inputs alone."""
         tasks, via_points = structured(1, TASK), structured(len(task.names), VIA_POINT)
         tasks["corners"], tasks["inputs"], tasks["std"] = parameters.hands, task.inputs, parameters.std
+        tasks["size"] = parameters.size
         via_points["tool"], via_points["corners"], via_points["follow"] = parameters.tool, task.corners, task.follow
         rows, nothing = np.empty((0, task.width + len(task.names) + 2)), np.empty((0, task.width + 3))
         if primitive is not None:

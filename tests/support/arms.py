@@ -1,0 +1,54 @@
+"""Cells with arms that we did not write, a Panda, its fingers locked, and a UR5 of six joints; and
+with the shipped one beside them.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import files
+from pathlib import Path
+from typing import NamedTuple
+
+from service.config import Settings, parse
+from support.in_process import ASSUMED
+
+
+class Model(NamedTuple):
+    """An arm: its file among the robots, the link that carries the tool, and joints at the tool's
+    start [rad].
+    """
+
+    file: str
+    plate: str
+    posture: tuple[float, ...]
+
+
+# The postures have the tool where the demonstrations begin, 45 degrees down.
+MODELS = {
+    "panda": Model("panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)),
+    "ur5": Model("ur5_robot.urdf", "tool0", (-0.39, -1.67, 2.129, -2.772, -1.303, 0.0)),
+}
+
+
+def urdf_of(model: Model) -> Path:
+    """Where the file is installed."""
+    return next(Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == model.file)
+
+
+def toml_of(model: Model, **changed: str) -> str:
+    """The settings of a cell with this arm; a line left empty is left out."""
+    count = len(model.posture)
+    lines = {
+        "urdf": f"[arm]\nurdf = {json.dumps(str(urdf_of(model)))}",
+        "plate": f'plate = "{model.plate}"',
+        "source": 'source = "assumed"',
+        "posture": f"posture = {list(model.posture)}",
+        "acceleration": f"[joints]\nacceleration = {[10.0] * count}",
+        "jerk": f"jerk = {[500.0] * count}",
+    }
+    return "\n".join((lines | changed).values())
+
+
+def cell_of(name: str) -> Settings:
+    """A cell with one of the models, or `wam`, whose arm is assumed to be at its posture."""
+    return ASSUMED if name == "wam" else parse(toml_of(MODELS[name]), origin=name)
