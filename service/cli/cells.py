@@ -7,7 +7,7 @@ import sys
 
 import msgspec
 
-from service.cli.clients import reached
+from service.cli.usage import reached
 from service.client import Cell
 from service.client import cells as served_cells
 

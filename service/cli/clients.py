@@ -5,16 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
-import zenoh
-
 from service.cli.here import still
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, added_in
-from service.client import Client, open_session
+from service.cli.usage import UsageError, added_in, reached
+from service.client import Client
 from service.contract import requests
-from service.contract.channels import ENDPOINT
 from service.contract.incidents import in_brief, remedy
 
 
@@ -55,7 +51,7 @@ def _names(request: Any) -> list[str]:
 
 def _add(args: argparse.Namespace) -> Any:
     if args.file:
-        return added_in(Path(args.file))
+        return added_in(args.file)
     if args.here and args.name:
         for name, position in still(args).items():
             setattr(args, name, getattr(args, name) or position)
@@ -77,17 +73,6 @@ def hold(args: argparse.Namespace) -> int:
 
 
 resume = reset = hold
-
-
-def reached(args: argparse.Namespace) -> zenoh.Session:
-    """A session to the daemon or router that the command line names. Raises UnreachableError."""
-    return open_session(
-        connect=args.connect or (),
-        otherwise=[ENDPOINT],
-        timeout_s=CONNECT_TIMEOUT_S,
-        certificate=args.certificate,
-        zenoh_config=args.zenoh_config,
-    )
 
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:

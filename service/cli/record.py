@@ -8,6 +8,7 @@ import select
 import sys
 from pathlib import Path
 
+from service.cli.progress import say
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
@@ -34,9 +35,7 @@ def record(args: argparse.Namespace) -> int:
         raise UsageError("a take's name needed, or --list")
     settings = load(args.config) if args.config else None
     if args.plot is not None:
-        if args.plot.suffix != ".png":
-            raise UsageError(f"{args.plot}: a picture is written as .png: {args.plot.with_suffix('.png').name}, say")
-        check_writable(args.plot)
+        check_writable(args.plot, ".png")
     if args.list:
         return _list(args.folder, settings)
     if args.delete:
@@ -109,7 +108,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         raise UnreachableError(f"{error}{hint}") from None
     with session:
         if args.until == "key":
-            print("Enter or Ctrl-C ends it", file=sys.stderr, flush=True)
+            say("Enter or Ctrl-C ends it")
         captured = capture(
             session,
             cell,
@@ -120,7 +119,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             wait_s=args.wait,
             longest_s=args.seconds,
             progress=_progress if sys.stderr.isatty() else lambda line: None,
-            say=lambda line: print(f"\r{line}", file=sys.stderr, flush=True),
+            say=lambda line: say(f"\r{line}"),
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
