@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from service.cli.progress import say
 from service.client import Client, open_session
 from service.core.frame import STAGES, TIMING
 from service.launch import launched
@@ -39,10 +39,6 @@ SLOWER = 1.15  # accepted latency, as a multiple of half a period, the round tri
 
 def bench(args: argparse.Namespace) -> int:
     """Exit code 0 once measured, whatever the result."""
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
     report: Any
