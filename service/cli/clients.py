@@ -7,16 +7,17 @@ import math
 import sys
 from typing import Any
 
+import msgspec
+
 from service.cli.here import still
 from service.cli.usage import UsageError, added_in, reached
 from service.client import Client
-from service.contract import requests
 from service.contract.incidents import in_brief, remedy
 
 
 def via_points(args: argparse.Namespace) -> int:
     """Exit code 0 once the daemon has carried out the request."""
-    request: Any = {"op": args.action}
+    request: dict[str, Any] = {"op": args.action}
     if args.action == "remove":
         request["names"] = args.names
     elif args.action == "add":
@@ -35,23 +36,17 @@ def via_points(args: argparse.Namespace) -> int:
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
-    if replaced := [point["name"] for point in before if point["name"] in _names(request)]:
+    added = [point["name"] for point in request.get("points", ())]
+    if replaced := [point["name"] for point in before if point["name"] in added]:
         print(f"replaced, as there was one of this name: {', '.join(replaced)}")
     for warning in reply.get("warnings", ()):
         print(f"warning: {warning}", file=sys.stderr)
     return 0
 
 
-def _names(request: Any) -> list[str]:
-    """The names of the via-points that a request adds."""
-    if isinstance(request, requests.Add):
-        return [point.name for point in request.points]
-    return [point["name"] for point in request["points"]]
-
-
 def _add(args: argparse.Namespace) -> Any:
     if args.file:
-        return added_in(args.file)
+        return msgspec.to_builtins(added_in(args.file))
     if args.here and args.name:
         for name, position in still(args).items():
             setattr(args, name, getattr(args, name) or position)

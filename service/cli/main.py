@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from service import interrupt
-from service.cli import record_options, via_point_options
+from service.cli import record_options
 from service.cli.usage import Parser, UsageError, check_cell, option, within
 from service.contract import channels
 from service.contract.explain import ExplainedError
+from service.contract.records import SIDES
+from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 
 RUN_BY = {  # the modules that are not named as their command
@@ -176,7 +178,19 @@ def parser() -> argparse.ArgumentParser:
         f"--radius .03 --follow left --std .001\n  {example} add glass --here",
     )
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
-    via_point_options.add_options(a)
+    for place in (*SIDES, "tool"):
+        a.add_argument(f"--{place}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
+    defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
+    option(a, "--std", "M", "how exactly the tool is to go there [m]", defaults.std)
+    option(a, "--radius", "M", "also for hands this far from there [m]", defaults.radius)
+    follow = "within the radius the tool moves with this hand"
+    option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
+    turn = "how the tool is turned there"
+    a.add_argument("--orientation", nargs=4, type=float, metavar=("X", "Y", "Z", "W"), help=turn)
+    a.add_argument("--gripper", choices=("open", "closed"), help="what the gripper does there")
+    option(a, "--tolerance", "M", f"points learned nearer than this give way (default: {TOLERANCE_M} m)")
+    option(a, "--file", "FILE", "a request as JSON instead; - is standard input")
     _reach(a)
     a = described(actions, "remove", "forget via-points by name", f"{example} remove handover")
     a.add_argument("names", metavar="NAME", nargs="+")

@@ -16,7 +16,6 @@ from service.contract.channels import ENDPOINT
 from service.demonstrations.capture import capture
 from service.demonstrations.demonstration_files import (
     DemonstrationNameError,
-    Summary,
     demonstration_paths,
     draw,
     existing_path,
@@ -55,7 +54,10 @@ def record(args: argparse.Namespace) -> int:
     elif not args.show:
         _capture(args, settings or Settings())
     found = summary(existing_path(args.folder, args.name), settings=settings)
-    _show(found, args.plot)
+    print(table(found))
+    if args.plot is not None:
+        draw(found, args.plot)
+        print(f"{args.plot} drawn", file=sys.stderr)
     return 0
 
 
@@ -74,13 +76,6 @@ def _list(folder: Path, settings: Settings | None) -> int:
         print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}")
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
-
-
-def _show(found: Summary, plot: Path | None) -> None:
-    print(table(found))
-    if plot is not None:
-        draw(found, plot)
-        print(f"{plot} drawn", file=sys.stderr)
 
 
 def _capture(args: argparse.Namespace, settings: Settings) -> None:

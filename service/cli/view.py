@@ -192,10 +192,6 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     live = "://" in str(source)
     if not live and not Path(source).is_file():
         raise ViewerError(f"nothing to picture: there is no {source}")
-    if not live:
-        with Path(source).open("rb") as file:
-            if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
-                raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
     os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # else its graphics library logs errors
     try:

@@ -96,7 +96,13 @@ def _whole(
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()
-            processes = _used(service.process.pid)
+            processes = {
+                who: {
+                    "cpu_s": round(sum(process.cpu_times()[:2]), 2),
+                    "memory_mb": round(process.memory_info().rss / 1e6, 1),
+                }
+                for who, process in family(service.process.pid).items()
+            }
             if service.stop() != 0:
                 raise BenchError(f"the service failed: {service.log.read_text()[-500:]}")
         recorded = sorted(set(folder.glob("*.mcap")) - before)  # one after the other
@@ -111,17 +117,6 @@ def _whole(
         **figures(timing["lateness_us"], timing["work_us"]),
         "stages_us": {name: percentiles(timing["stages_us"][:, i]) for i, name in enumerate(STAGES)},
         "processes": processes,
-    }
-
-
-def _used(pid: int) -> dict[str, dict[str, float]]:
-    """Processor time [s] and memory [MB] so far of a daemon and its children, by kind."""
-    return {
-        who: {
-            "cpu_s": round(sum(process.cpu_times()[:2]), 2),
-            "memory_mb": round(process.memory_info().rss / 1e6, 1),
-        }
-        for who, process in family(pid).items()
     }
 
 
