@@ -7,9 +7,10 @@ import sys
 
 import msgspec
 
-from service.cli.clients import reached
+from service.cli.usage import reached
 from service.client import Cell
 from service.client import cells as served_cells
+from service.contract.incidents import in_brief
 
 
 def cells(args: argparse.Namespace) -> int:
@@ -32,6 +33,6 @@ def description(cell: Cell) -> str:
     now = cell.status
     if now is None:
         return f"alive as Zenoh session {cell.session}, but without a status"
-    mode = now.mode + (f" ({now.reason})" if now.reason else "")
+    mode = in_brief(now.mode, now.reason)
     hands = ", ".join(now.hand_age_ms) or "no hands"
     return f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"

@@ -64,12 +64,7 @@ def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.Ellipt
     """A new authority, its key written to the folder."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("thirdhand authority")
-    authority = (
-        _builder(name, name, key, _days_from_now(days))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs_certificates=True), critical=True)
-        .sign(key, hashes.SHA256())
-    )
+    authority = _builder(name, name, key, _days_from_now(days), signs=True).sign(key, hashes.SHA256())
     _save(folder / AUTHORITY_KEY, _pem(key))
     return authority, key
 
@@ -125,9 +120,7 @@ def _write(
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * serves
     until = min(_days_from_now(days), authority.not_valid_after_utc)
     builder = (
-        _builder(_name(folder.name), authority.subject, own, until)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs_certificates=False), critical=True)
+        _builder(_name(folder.name), authority.subject, own, until, signs=False)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key()), critical=False)
     )
@@ -160,8 +153,20 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime.datetime
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime.datetime, *, signs: bool
 ) -> x509.CertificateBuilder:
+    """What all certificates hold; `signs` whether its holder signs others."""
+    usage = x509.KeyUsage(
+        digital_signature=not signs,
+        key_cert_sign=signs,
+        crl_sign=signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -171,20 +176,8 @@ def _builder(
         .not_valid_before(now() - CLOCKS_DIFFER)
         .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-    )
-
-
-def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
+        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
+        .add_extension(usage, critical=True)
     )
 
 

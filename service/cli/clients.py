@@ -5,22 +5,19 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
-import zenoh
+import msgspec
 
 from service.cli.here import still
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, added_in
-from service.client import Client, open_session
-from service.contract import requests
-from service.contract.channels import ENDPOINT
+from service.cli.usage import UsageError, added_in, reached
+from service.client import Client
 from service.contract.incidents import in_brief, remedy
 
 
 def via_points(args: argparse.Namespace) -> int:
     """Exit code 0 once the daemon has carried out the request."""
-    request: Any = {"op": args.action}
+    request: dict[str, Any] = {"op": args.action}
     if args.action == "remove":
         request["names"] = args.names
     elif args.action == "add":
@@ -39,23 +36,17 @@ def via_points(args: argparse.Namespace) -> int:
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
-    if replaced := [point["name"] for point in before if point["name"] in _names(request)]:
+    added = [point["name"] for point in request.get("points", ())]
+    if replaced := [point["name"] for point in before if point["name"] in added]:
         print(f"replaced, as there was one of this name: {', '.join(replaced)}")
     for warning in reply.get("warnings", ()):
         print(f"warning: {warning}", file=sys.stderr)
     return 0
 
 
-def _names(request: Any) -> list[str]:
-    """The names of the via-points that a request adds."""
-    if isinstance(request, requests.Add):
-        return [point.name for point in request.points]
-    return [point["name"] for point in request["points"]]
-
-
 def _add(args: argparse.Namespace) -> Any:
     if args.file:
-        return added_in(Path(args.file))
+        return msgspec.to_builtins(added_in(args.file))
     if args.here and args.name:
         for name, position in still(args).items():
             setattr(args, name, getattr(args, name) or position)
@@ -77,17 +68,6 @@ def hold(args: argparse.Namespace) -> int:
 
 
 resume = reset = hold
-
-
-def reached(args: argparse.Namespace) -> zenoh.Session:
-    """A session to the daemon or router that the command line names. Raises UnreachableError."""
-    return open_session(
-        connect=args.connect or (),
-        otherwise=[ENDPOINT],
-        timeout_s=CONNECT_TIMEOUT_S,
-        certificate=args.certificate,
-        zenoh_config=args.zenoh_config,
-    )
 
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:

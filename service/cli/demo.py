@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from service.child import python
+from service.cli.progress import say
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
@@ -37,9 +37,7 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Exit code 0 only if the task succeeded and the recording lacks nothing."""
-    report = run(
-        args.out, scene=args.scene, rate_hz=args.rate, say=lambda line: print(line, file=sys.stderr, flush=True)
-    )
+    report = run(args.out, scene=args.scene, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterator, Sequence
 
@@ -44,9 +45,7 @@ class Finding(msgspec.Struct, frozen=True):
         return " | ".join(said)
 
 
-def wrong(what: str, found: str, wanted: str, remedy: str) -> Finding:
-    """What needs to be mended."""
-    return Finding("wrong", what, found, wanted, remedy)
+wrong = functools.partial(Finding, "wrong")  # what needs to be mended
 
 
 def judged(fine: bool, what: str, found: str, wanted: str, remedy: str) -> Finding:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from typing import Any
 
-from service.client import Client, open_session
-from service.contract.channels import ENDPOINT
+from service.cli.progress import say
+from service.cli.usage import reached
+from service.client import Client
 from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 
@@ -29,13 +29,9 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
     where hands or tool are not seen, or move, for TIMEOUT_S.
     """
     wanted = [name for name in (*SIDES, "tool") if not getattr(args, name)]
-    print(
-        f"waiting for the daemon, and until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s",
-        file=sys.stderr,
-        flush=True,
-    )
+    say(f"waiting for the daemon, and until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s")
     seen: list[tuple[float, dict[str, list[float]]]] = []
-    with open_session(connect=args.connect or [ENDPOINT], timeout_s=TIMEOUT_S, certificate=args.certificate) as session:
+    with reached(args, TIMEOUT_S) as session:
         client = Client(session, args.cell)
         client.wait_until_ready(timeout_s=TIMEOUT_S)
         begun_s = time.monotonic()

@@ -19,7 +19,6 @@ import secrets
 import subprocess
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
@@ -69,19 +68,8 @@ class Latest:
         facts = (
             f"{hands or 'no hands seen'}; {near}{now['rate_hz']:.0f} Hz, {now['missed']} missed; skill {now['skill']}"
         )
-        return {
-            "mode": now["mode"],
-            "reason": now["reason"],
-            "because": now["because"],
-            "remedy": now["remedy"],
-            "age_s": time.monotonic() - self._at,
-            "facts": facts,
-        }
-
-
-class _Server(http.server.ThreadingHTTPServer):
-    daemon_threads = True
-    allow_reuse_address = True
+        told = {name: now[name] for name in ("mode", "reason", "because", "remedy")}
+        return told | {"age_s": time.monotonic() - self._at, "facts": facts}
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -89,10 +77,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "thirdhand", ""
-
-    def __init__(self, page: LivePage, *args: Any) -> None:
-        self._page = page
-        super().__init__(*args)
+    server: LivePage
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         """Logs nothing."""
@@ -102,11 +87,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return self._respond(403, "This page is for this machine's own address, not for another name.")
         path = urlsplit(self.path).path
         if path == "/":
-            return self._respond(200, self._page.html(self.headers["Host"]), kind="text/html; charset=utf-8")
+            return self._respond(200, self.server.html(self.headers["Host"]), kind="text/html; charset=utf-8")
         if path == "/status":
-            return self._respond(200, json.dumps(self._page.latest.summary()), kind="application/json")
+            return self._respond(200, json.dumps(self.server.latest.summary()), kind="application/json")
         if path.startswith("/viewer/"):
-            return self._pass_on(self._page.viewer, "GET", path.removeprefix("/viewer"), None)
+            return self._pass_on(self.server.viewer, "GET", path.removeprefix("/viewer"), None)
         return self._respond(404, "There is nothing of this name.")
 
     def do_POST(self) -> None:
@@ -118,16 +103,17 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if self._is_foreign():
             return self._respond(403, "This page is for this machine's own address, not for another name.")
         if self.path == STREAM:
-            return self._pass_on(self._page.stream, "POST", self.path, body)
+            return self._pass_on(self.server.stream, "POST", self.path, body)
         name = self.path.removeprefix("/")
         if name not in ORDERS:
             return self._respond(404, "There is nothing of this name.")
-        if not hmac.compare_digest(self.headers.get("X-Thirdhand-Token", ""), self._page.token):
+        if not hmac.compare_digest(self.headers.get("X-Thirdhand-Token", ""), self.server.token):
             return self._respond(403, "The token of the page is needed: reload it.")
         try:
-            return self._respond(200, self._page.order(name))
+            reply = self.server.client.ask(name)
         except ExplainedError as error:
             return self._respond(502, f"{name} was NOT carried out: {error}")
+        return self._respond(200, f"{name} in force since tick {reply['tick']}")
 
     def _is_foreign(self) -> bool:
         """Whether the request is from another site, or to another host's name."""
@@ -136,7 +122,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return True
         try:
             name = urlsplit(f"//{host}").hostname or ""
-            return name not in ("localhost", self._page.address.host) and not ipaddress.ip_address(name)
+            return name not in ("localhost", self.server.address.host) and not ipaddress.ip_address(name)
         except ValueError:
             return True
 
@@ -193,18 +179,17 @@ def _other_name(host: str) -> str:
     return f"{other}:{port}" if other else host
 
 
-class LivePage:
+class LivePage(http.server.ThreadingHTTPServer):
     """The page's server, which listens at `address`. Raises OSError where it cannot."""
 
     def __init__(
         self, listen: Address, *, client: Client, latest: Latest, cell: str, stream: Address, viewer: Address
     ) -> None:
-        self._client, self.latest, self._cell = client, latest, cell
+        super().__init__(listen, _Handler)
+        self.address = Address(listen.host, self.server_port)
+        self.client, self.latest, self._cell = client, latest, cell
         self.stream, self.viewer, self.token = stream, viewer, secrets.token_urlsafe(24)
         self._template = Path(__file__).with_name("live.html").read_text(encoding="utf-8")
-        self.address = listen
-        self._server = _Server(listen, partial(_Handler, self))
-        self.address = Address(listen.host, self._server.server_port)
 
     def html(self, host: str) -> str:
         """The page, for a browser that reaches it by this host and port.
@@ -224,20 +209,6 @@ class LivePage:
             text = text.replace(name, value)
         return text
 
-    def order(self, name: str) -> str:
-        """The result of hold, resume or reset, in words. Raises ExplainedError."""
-        reply = self._client.ask(name)
-        return f"{name} in force since tick {reply['tick']}"
-
-    def serve(self) -> None:
-        """Serves until `close`."""
-        self._server.serve_forever(poll_interval=0.1)
-
-    def close(self) -> None:
-        """Ends the server."""
-        self._server.shutdown()
-        self._server.server_close()
-
 
 @contextlib.contextmanager
 def web_viewer(program: Path, stream: str, port: int) -> Iterator[Address]:
@@ -245,26 +216,26 @@ def web_viewer(program: Path, stream: str, port: int) -> Iterator[Address]:
     the context lasts. Raises OSError where it does not start.
     """
     command = [str(program), "--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), stream]
-    viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        until = time.monotonic() + START_S
-        while True:
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S)
-            try:
-                connection.request("HEAD", "/")
-                connection.getresponse()
-                break
-            except OSError as error:
-                if viewer.poll() is not None or time.monotonic() > until:
-                    raise OSError(f"the web viewer did not start on port {port}: {error}") from None
-                time.sleep(0.1)
-            finally:
-                connection.close()
-        yield Address("127.0.0.1", port)
-    finally:
-        viewer.terminate()
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet) as viewer:
         try:
-            viewer.wait(TIMEOUT_S)
-        except subprocess.TimeoutExpired:
+            until, connection = (
+                time.monotonic() + START_S,
+                http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S),
+            )
+            while True:
+                with contextlib.closing(connection):
+                    try:
+                        connection.request("HEAD", "/")
+                        connection.getresponse()
+                        break
+                    except OSError as error:
+                        if viewer.poll() is not None or time.monotonic() > until:
+                            raise OSError(f"the web viewer did not start on port {port}: {error}") from None
+                time.sleep(0.1)
+            yield Address("127.0.0.1", port)
+        finally:
+            viewer.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                viewer.wait(TIMEOUT_S)
             viewer.kill()
-            viewer.wait()

@@ -13,37 +13,26 @@ import os
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from service import interrupt
-from service.cli import record_options, via_point_options
-from service.cli.usage import Parser, UsageError, check_cell
-from service.config import RATES_HZ
+from service.cli import record_options
+from service.cli.usage import Parser, UsageError, check_cell, option, within
 from service.contract import channels
 from service.contract.explain import ExplainedError
+from service.contract.records import SIDES
+from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 
-RUN_BY = {
-    "demo": "cli.demo",
-    "serve": "cli.serve",
-    "play": "cli.recordings",
-    "replay": "cli.recordings",
-    "learn": "cli.recordings",
-    "record": "cli.record",
-    "via-points": "cli.clients",
-    "status": "cli.status",
-    "doctor": "cli.doctor",
-    "hold": "cli.clients",
-    "resume": "cli.clients",
-    "reset": "cli.clients",
-    "cells": "cli.cells",
-    "view": "cli.view",
+RUN_BY = {  # the modules that are not named as their command
+    **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
+    **dict.fromkeys(("via-points", "hold", "resume", "reset"), "cli.clients"),
     "report": "cli.report_command",
-    "certificates": "cli.certificates",
     "bench": "timing.benchmark",
 }
 SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
+ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself (default: $THIRDHAND_ZENOH_CONFIG)"
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
-FORMATTER = argparse.RawDescriptionHelpFormatter
 
 
 def parser() -> argparse.ArgumentParser:
@@ -56,16 +45,19 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
-        sub = commands_of.add_parser(
-            name, help=about, description=about, epilog=f"example:\n  {example}", formatter_class=FORMATTER
+    def described(among: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:
+        added: argparse.ArgumentParser = among.add_parser(
+            name,
+            help=about,
+            description=about,
+            epilog=f"example:\n  {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        sub.set_defaults(run=f"{RUN_BY[name]}.{name.replace('-', '_')}")
-        return sub
+        return added
 
-    def client(name: str, about: str, example: str) -> argparse.ArgumentParser:
-        sub = command(name, about, example)
-        _reach(sub)
+    def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
+        sub = described(commands_of, name, about, example)
+        sub.set_defaults(run=f"{RUN_BY.get(name, f'cli.{name}')}.{name.replace('-', '_')}")
         return sub
 
     c = command(
@@ -73,26 +65,16 @@ def parser() -> argparse.ArgumentParser:
         "The soldering scenario, closed loop and headless: bench, service and scribe.",
         "thirdhand demo --scene my-scene.toml",
     )
-    c.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        default=Path("thirdhand-demo"),
-        help="where recording and viewer file go (default: %(default)s)",
-    )
-    c.add_argument(
-        "--scene", metavar="FILE", type=Path, help="TOML file with handover, glass and soldering as [x, y, z] in metres"
-    )
-    c.add_argument("--rate", metavar="HZ", type=_rate, default=500, help="of the loop (default: %(default)s)")
+    option(c, "--out", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
+    option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
+    option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
-    c.add_argument("--seconds", metavar="S", type=float, default=24.0, help="to measure for (default: %(default)g)")
-    c.add_argument("--rate", metavar="HZ", type=_rate, default=500, help="of the loop (default: %(default)s)")
+    option(c, "--seconds", "S", "to measure for", 24.0)
+    option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    c.add_argument(
-        "--output", metavar="DIR", type=Path, help="write bench.json there, a picture, and what the whole recorded"
-    )
+    option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
     other = c.add_mutually_exclusive_group()
     other.add_argument(
         "--loads", action="store_true", help="what happens beside the loop instead, each for so many seconds"
@@ -102,42 +84,26 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
     )
-    c.add_argument(
-        "--config", metavar="FILE", type=Path, help="settings of the cell as TOML; options below go before it"
-    )
-    c.add_argument("--cell", metavar="NAME", help="prefix of all keys (default: thirdhand)")
-    c.add_argument(
-        "--listen",
-        metavar="EP",
-        action="append",
-        help=f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})",
-    )
-    c.add_argument("--connect", metavar="EP", action="append", help="Zenoh endpoint to connect to; may be repeated")
-    _zenoh_config(c)
-    c.add_argument("--rate", metavar="HZ", type=_rate, help="of the loop (default: 500)")
-    c.add_argument(
-        "--skill",
-        metavar="FILE",
-        type=Path,
-        help="a skill made by `thirdhand learn` (default: the shipped soldering skill)",
-    )
-    c.add_argument(
-        "--arm",
-        choices=("state", "assumed"),
-        help="wait for the arm's joint states, or assume its posture (default: state)",
-    )
-    c.add_argument("--record", metavar="DIR", type=Path, help="write .mcap and .rrd files there")
-    c.add_argument("--live", metavar="PORT", type=int, help="serve Rerun viewers on this loopback port")
+    option(c, "--config", "FILE", "settings of the cell as TOML; options below go before it")
+    option(c, "--cell", "NAME", "prefix of all keys (default: thirdhand)")
+    listen = f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})"
+    option(c, "--listen", "EP", listen, action="append")
+    option(c, "--connect", "EP", "Zenoh endpoint to connect to; may be repeated", action="append")
+    option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
+    option(c, "--rate", "HZ", "of the loop (default: 500)")
+    option(c, "--skill", "FILE", "a skill made by `thirdhand learn` (default: the shipped soldering skill)")
+    arm = "wait for the arm's joint states, or assume its posture (default: state)"
+    c.add_argument("--arm", choices=("state", "assumed"), help=arm)
+    option(c, "--record", "DIR", "write .mcap and .rrd files there")
+    option(c, "--live", "PORT", "serve Rerun viewers on this loopback port", type=int)
 
     c = command(
         "play",
         "Publishes the hands of a recording or demonstration, as a tracker would.",
         "thirdhand play recordings/demonstration-6.mcap --loop",
     )
-    c.add_argument("file", metavar="FILE", type=Path, help="an MCAP file with hands/left and hands/right")
-    c.add_argument(
-        "--speed", metavar="X", type=float, default=1.0, help="times as fast as recorded (default: %(default)s)"
-    )
+    option(c, "file", "FILE", "an MCAP file with hands/left and hands/right")
+    option(c, "--speed", "X", "times as fast as recorded", 1.0, type=within(float, 0.01, 100))
     c.add_argument("--loop", action="store_true", help="over and over")
     _reach(c)
 
@@ -147,13 +113,11 @@ def parser() -> argparse.ArgumentParser:
         "or damaged is listed; only --exact fails for it.",
         "thirdhand replay recordings/golden.mcap --exact",
     )
-    c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording, and those that follow it")
+    option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
     c.add_argument(
         "--exact", action="store_true", help="forbid gaps, damage, a cut, and even differences below 10 µm and 10 µrad"
     )
-    c.add_argument(
-        "--after", metavar="TICK", type=int, help="start from the first recorded state at or after this tick"
-    )
+    option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
 
     c = command("record", record_options.ABOUT, record_options.EXAMPLE)
     record_options.add_options(c)
@@ -165,9 +129,9 @@ def parser() -> argparse.ArgumentParser:
         "approach, places, limits, rejections. Several are set side by side.",
         "thirdhand report thirdhand-demo/*.mcap --html report.html",
     )
-    c.add_argument("files", metavar="FILE", type=Path, nargs="+", help="a recording (.mcap); of two their differences")
-    c.add_argument("--html", metavar="FILE", type=Path, help="all of it with plots as one page, too")
-    c.add_argument("--csv", metavar="DIR", type=Path, help="each table, and every tick, as CSV files there, too")
+    option(c, "files", "FILE", "a recording (.mcap); of two their differences", nargs="+")
+    option(c, "--html", "FILE", "all of it with plots as one page, too")
+    option(c, "--csv", "DIR", "each table, and every tick, as CSV files there, too")
 
     c = command(
         "learn",
@@ -175,14 +139,10 @@ def parser() -> argparse.ArgumentParser:
         "exit 1 and no file.",
         "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
     )
-    c.add_argument(
-        "demonstrations",
-        metavar="DEMO",
-        nargs="+",
-        type=Path,
-        help="recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's "
-        "folder",
+    demonstrations = (
+        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder"
     )
+    option(c, "demonstrations", "DEMO", demonstrations, nargs="+", type=Path)
     for name in ("left", "right", "tool"):
         c.add_argument(
             f"--{name}",
@@ -190,66 +150,64 @@ def parser() -> argparse.ArgumentParser:
             help=f"where the {name}{' hand' * (name != 'tool')} is in recordings of others: poses, a PoseArray with an "
             "index, or a TFMessage with a child frame" + "; or joint states" * (name == "tool"),
         )
-    c.add_argument("--output", metavar="FILE", type=Path, required=True, help="the skill, .npz")
-    c.add_argument("--plot", metavar="FILE", type=Path, help="a picture of what it is judged by, .png")
+    option(c, "--output", "FILE", "the skill, .npz", required=True)
+    option(c, "--plot", "FILE", "a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
-    c.add_argument(
-        "--config", metavar="FILE", type=Path, help="settings of the cell: the tracker's axes and unit, the arm"
+    option(c, "--config", "FILE", "settings of the cell: the tracker's axes and unit, the arm")
+    places = (
+        "where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
+        "do not hold it: then the skill is learned between them, and holds wherever they are"
     )
-    c.add_argument(
-        "--places",
-        metavar="FILE",
-        type=Path,
-        help="where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
-        "do not hold it: then the skill is learned between them, and holds wherever they are",
-    )
-    c.add_argument("--points", metavar="N", type=_count, default=200, help="of the reference (default: %(default)s)")
-    c.add_argument("--ell", metavar="L", type=_positive, help="of the kernel [1/m²] (default: chosen; mixture: 5)")
-    c.add_argument(
-        "--components",
-        metavar="K",
-        type=_count,
-        help="take the reference from a mixture of K, the paper's way (default: from the demonstrations themselves)",
-    )
-    c.add_argument("--penalty", metavar="L", type=_positive, help="the mixture's lambda (default: 2)")
-    c.add_argument(
-        "--seed", type=int, default=0, help="of the mixture's start and the sampled inputs (default: %(default)s)"
-    )
+    option(c, "--places", "FILE", places)
+    count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
+    option(c, "--points", "N", "of the reference", 200, type=count)
+    option(c, "--ell", "L", "of the kernel [1/m²] (default: chosen; mixture: 5)", type=positive)
+    components = "take the reference from a mixture of K, the paper's way (default: from the demonstrations themselves)"
+    option(c, "--components", "K", components, type=count)
+    option(c, "--penalty", "L", "the mixture's lambda (default: 2)", type=positive)
+    option(c, "--seed", None, "of the mixture's start and the sampled inputs", 0, type=int)
 
     c = command("via-points", "Via-points taught to a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")
-    nothing = "example:\n  thirdhand via-points "
-    a = actions.add_parser(
-        "add", help="teach via-points, all or nothing", formatter_class=FORMATTER,
-        epilog=f"{nothing}add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
-        "--radius .03 --follow left --std .001\n  thirdhand via-points add glass --here",
-    )  # fmt: skip
-    a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
-    via_point_options.add_options(a)
-    _reach(a)
-    a = actions.add_parser(
-        "remove", help="forget via-points by name", epilog=f"{nothing}remove handover", formatter_class=FORMATTER
+    example = "thirdhand via-points"
+    a = described(
+        actions,
+        "add",
+        "teach via-points, all or nothing",
+        f"{example} add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
+        f"--radius .03 --follow left --std .001\n  {example} add glass --here",
     )
+    a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
+    for place in (*SIDES, "tool"):
+        a.add_argument(f"--{place}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
+    defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
+    option(a, "--std", "M", "how exactly the tool is to go there [m]", defaults.std)
+    option(a, "--radius", "M", "also for hands this far from there [m]", defaults.radius)
+    follow = "within the radius the tool moves with this hand"
+    option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
+    turn = "how the tool is turned there"
+    a.add_argument("--orientation", nargs=4, type=float, metavar=("X", "Y", "Z", "W"), help=turn)
+    a.add_argument("--gripper", choices=("open", "closed"), help="what the gripper does there")
+    option(a, "--tolerance", "M", f"points learned nearer than this give way (default: {TOLERANCE_M} m)")
+    option(a, "--file", "FILE", "a request as JSON instead; - is standard input")
+    _reach(a)
+    a = described(actions, "remove", "forget via-points by name", f"{example} remove handover")
     a.add_argument("names", metavar="NAME", nargs="+")
     _reach(a)
-    _reach(
-        actions.add_parser("list", help="the via-points in force", epilog=f"{nothing}list", formatter_class=FORMATTER)
-    )
-    _reach(
-        actions.add_parser("clear", help="forget all via-points", epilog=f"{nothing}clear", formatter_class=FORMATTER)
-    )
+    _reach(described(actions, "list", "the via-points in force", f"{example} list"))
+    _reach(described(actions, "clear", "forget all via-points", f"{example} clear"))
 
-    c = client("status", "What a running daemon does.", "thirdhand status --json")
+    c = _reach(command("status", "What a running daemon does.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")
     c.add_argument("--watch", action="store_true", help="hands, tool, target and distances as they change")
-    c = client(
-        "doctor", "Looks at a running cell, and says what is wrong and what to do. Then exit 1.", "thirdhand doctor"
-    )
+    about = "Looks at a running cell, and says what is wrong and what to do. Then exit 1."
+    c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
-    c.add_argument("--seconds", metavar="S", type=float, default=2.0, help="to look for (default: %(default)g)")
-    client("hold", "Stops the arm, which then stays.", "thirdhand hold")
-    client("resume", "Ends an operator's hold.", "thirdhand resume")
-    client("reset", "Ends a fault.", "thirdhand reset")
+    option(c, "--seconds", "S", "to look for", 2.0, type=within(float, 0.2, 60))
+    _reach(command("hold", "Stops the arm, which then stays.", "thirdhand hold"))
+    _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
+    _reach(command("reset", "Ends a fault.", "thirdhand reset"))
 
     c = command("cells", "The daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447")
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
@@ -261,39 +219,29 @@ def parser() -> argparse.ArgumentParser:
         "certificate by the authority that is there.",
         "thirdhand certificates secrets --host bench.local",
     )
-    c.add_argument("folder", metavar="DIR", type=Path, help="a new folder, private to its user; with --role an old one")
-    c.add_argument(
-        "--host", metavar="NAME", action="append", help="or address at which clients reach the daemon; may be repeated"
-    )
+    option(c, "folder", "DIR", "a new folder, private to its user; with --role an old one")
+    option(c, "--host", "NAME", "or address at which clients reach the daemon; may be repeated", action="append")
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="of one more certificate")
-    c.add_argument("--name", metavar="ROLE-N", help="of that one, like tracker-2 (default: the first that is free)")
-    c.add_argument("--days", metavar="N", type=int, default=3650, help="that they are valid (default: %(default)s)")
+    option(c, "--name", "ROLE-N", "of that one, like tracker-2 (default: the first that is free)")
+    option(c, "--days", "N", "that they are valid", 3650, type=int)
 
     # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
     c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
     c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
 
-    c = client(
+    c = command(
         "view",
         "Shows a recording, or a running daemon, in Rerun.",
         "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
     )
+    _reach(c)
     c.add_argument("file", metavar="FILE|live", help="an .rrd or .mcap file, or `live`")
-    c.add_argument("--screenshot", metavar="PNG", type=Path, help="write a picture instead of opening a window")
-    c.add_argument(
-        "--time", metavar="S", type=float, help="of the picture, from the recording's start (default: its end)"
-    )
-    c.add_argument(
-        "--web",
-        metavar="[HOST:]PORT",
-        nargs="?",
-        const="127.0.0.1:0",
-        help="with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)",
-    )
-    c.add_argument(
-        "--tab", choices=("task", "timing", "learning"), default="task", help="of the picture (default: %(default)s)"
-    )
+    option(c, "--screenshot", "PNG", "write a picture instead of opening a window")
+    option(c, "--time", "S", "of the picture, from the recording's start (default: its end)")
+    web = "with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)"
+    option(c, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
+    option(c, "--tab", None, "of the picture", "task", choices=("task", "timing", "learning"))
     return top
 
 
@@ -305,54 +253,18 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _rate(given: str) -> int:
-    low, high = RATES_HZ
-    if given.isdecimal() and low <= int(given) <= high:
-        return int(given)
-    raise argparse.ArgumentTypeError(f"{given} given, {low} to {high} Hz needed")
-
-
-def _count(given: str) -> int:
-    if given.isdecimal() and 1 <= int(given) <= 2500:
-        return int(given)
-    raise argparse.ArgumentTypeError(f"{given} given, 1 to 2500 needed")
-
-
-def _positive(given: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 1e-3 <= float(given) <= 1e4:
-            return float(given)
-    raise argparse.ArgumentTypeError(f"{given} given, 0.001 to 10000 needed")
-
-
-def _reach(sub: argparse.ArgumentParser, cell: str | None = "thirdhand", *, one: bool = True) -> None:
-    sub.add_argument(
-        "--connect",
-        metavar="EP",
-        action="append",
-        help="Zenoh endpoint of the daemon or of a router; of several the first that answers "
-        f"(default: {channels.ENDPOINT})",
-    )
+def _reach(
+    sub: argparse.ArgumentParser, cell: str | None = "thirdhand", *, one: bool = True
+) -> argparse.ArgumentParser:
+    """The same parser, with the options by which a daemon is reached; `one`: and named."""
+    endpoint = "Zenoh endpoint of the daemon or of a router; of several the first that answers"
+    option(sub, "--connect", "EP", f"{endpoint} (default: {channels.ENDPOINT})", action="append")
     if one:
-        sub.add_argument(
-            "--cell", metavar="NAME", default=cell, help=f"prefix of all keys (default: {cell or 'as configured'})"
-        )
-    sub.add_argument(
-        "--certificate",
-        metavar="DIR",
-        type=Path,
-        help="of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)",
-    )
-    _zenoh_config(sub)
-
-
-def _zenoh_config(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "--zenoh-config",
-        metavar="FILE",
-        type=Path,
-        help="Zenoh's own settings, for all that the service does not set itself (default: $THIRDHAND_ZENOH_CONFIG)",
-    )
+        option(sub, "--cell", "NAME", "prefix of all keys" + " (default: as configured)" * (cell is None), cell)
+    role = "of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)"
+    option(sub, "--certificate", "DIR", role)
+    option(sub, "--zenoh-config", "FILE", ZENOH_CONFIG)
+    return sub
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -13,26 +13,25 @@ from collections.abc import Callable, Iterator
 AFTER_S, EVERY_S = 2.0, 10.0
 
 
+def say(line: str) -> None:
+    """Prints a line on standard error at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
 def progress(
     what: str, *, total: int | None = None, unit: str = "ticks", after_s: float = AFTER_S, every_s: float = EVERY_S
 ) -> Iterator[Callable[[int], None]]:
     """A function to call with the number of units done; `total` is known or None. A context."""
-    shown = _Shown(what, total, unit, after_s, every_s)
-    try:
+    with contextlib.closing(_Shown(what, total, unit, after_s, every_s)) as shown:
         yield shown.done
-    finally:
-        shown.close()
 
 
 @contextlib.contextmanager
 def steps(what: str, *, after_s: float = AFTER_S, every_s: float = EVERY_S) -> Iterator[Callable[[str], None]]:
     """A function to call with the name of each step as it begins; a context."""
-    shown = _Shown(what, None, "", after_s, every_s)
-    try:
+    with contextlib.closing(_Shown(what, None, "", after_s, every_s)) as shown:
         yield shown.doing
-    finally:
-        shown.close()
 
 
 class _Shown:
@@ -53,7 +52,7 @@ class _Shown:
     def doing(self, what: str) -> None:
         self._what, self._begun = what, time.monotonic()
         if not sys.stderr.isatty():
-            print(what, file=sys.stderr, flush=True)
+            say(what)
 
     def close(self) -> None:
         self._ended.set()
@@ -94,4 +93,4 @@ class _Shown:
                 passed = f"{100 * self._count / self._total:.0f} % of {self._total} {self._unit}, {passed}"
             elif self._count:
                 passed = f"{self._count} {self._unit}, {passed}"
-            print(f"{self._what}: {passed}", file=sys.stderr, flush=True)
+            say(f"{self._what}: {passed}")

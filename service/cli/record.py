@@ -8,6 +8,7 @@ import select
 import sys
 from pathlib import Path
 
+from service.cli.progress import say
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
@@ -15,7 +16,6 @@ from service.contract.channels import ENDPOINT
 from service.demonstrations.capture import capture
 from service.demonstrations.demonstration_files import (
     DemonstrationNameError,
-    Summary,
     demonstration_paths,
     draw,
     existing_path,
@@ -34,9 +34,7 @@ def record(args: argparse.Namespace) -> int:
         raise UsageError("a take's name needed, or --list")
     settings = load(args.config) if args.config else None
     if args.plot is not None:
-        if args.plot.suffix != ".png":
-            raise UsageError(f"{args.plot}: a picture is written as .png: {args.plot.with_suffix('.png').name}, say")
-        check_writable(args.plot)
+        check_writable(args.plot, ".png")
     if args.list:
         return _list(args.folder, settings)
     if args.delete:
@@ -56,7 +54,10 @@ def record(args: argparse.Namespace) -> int:
     elif not args.show:
         _capture(args, settings or Settings())
     found = summary(existing_path(args.folder, args.name), settings=settings)
-    _show(found, args.plot)
+    print(table(found))
+    if args.plot is not None:
+        draw(found, args.plot)
+        print(f"{args.plot} drawn", file=sys.stderr)
     return 0
 
 
@@ -75,13 +76,6 @@ def _list(folder: Path, settings: Settings | None) -> int:
         print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}")
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
-
-
-def _show(found: Summary, plot: Path | None) -> None:
-    print(table(found))
-    if plot is not None:
-        draw(found, plot)
-        print(f"{plot} drawn", file=sys.stderr)
 
 
 def _capture(args: argparse.Namespace, settings: Settings) -> None:
@@ -109,7 +103,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         raise UnreachableError(f"{error}{hint}") from None
     with session:
         if args.until == "key":
-            print("Enter or Ctrl-C ends it", file=sys.stderr, flush=True)
+            say("Enter or Ctrl-C ends it")
         captured = capture(
             session,
             cell,
@@ -120,7 +114,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             wait_s=args.wait,
             longest_s=args.seconds,
             progress=_progress if sys.stderr.isatty() else lambda line: None,
-            say=lambda line: print(f"\r{line}", file=sys.stderr, flush=True),
+            say=lambda line: say(f"\r{line}"),
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)

@@ -10,9 +10,8 @@ from collections.abc import Mapping
 
 import msgspec
 
-from service.cli.clients import reached
-from service.cli.progress import progress, steps
-from service.cli.usage import UsageError, check_writable, places_in
+from service.cli.progress import progress, say, steps
+from service.cli.usage import check_writable, places_in, reached
 from service.client import Client, Tracker
 from service.config import load
 from service.contract import cdr
@@ -34,8 +33,6 @@ COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
 
 def play(args: argparse.Namespace) -> int:
     """Exit code 0 once all hands are published."""
-    if not 0.01 <= args.speed <= 100:
-        raise UsageError(f"--speed {args.speed}: 0.01 to 100 accepted")
     try:
         hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in iter_hands(args.file)]
     except WireError as error:
@@ -92,19 +89,15 @@ def replay(args: argparse.Namespace) -> int:
 
 def learn(args: argparse.Namespace) -> int:
     """Exit code 0 once the skill is written; 1, and nothing written, where it would be unsafe."""
-    for path, suffix, what in ((args.output, ".npz", "a skill"), (args.plot, ".png", "a picture")):
-        if path is not None:
-            if path.suffix != suffix:
-                raise UsageError(f"{path}: {what} is written as {suffix}: {path.with_suffix(suffix).name}, say")
-            check_writable(path)
+    check_writable(args.output, ".npz")
+    if args.plot:
+        check_writable(args.plot, ".png")
     settings = load(args.config) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
-        demonstration = read_demonstration(
-            path, topics=topics, settings=settings, say=lambda line: print(line, file=sys.stderr, flush=True)
-        )
+        demonstration = read_demonstration(path, topics=topics, settings=settings, say=say)
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count
         print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)

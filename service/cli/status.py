@@ -14,8 +14,8 @@ from zenoh.handlers import RingChannel
 
 from service import interrupt
 from service.cli.clients import ask
-from service.cli.usage import CONNECT_TIMEOUT_S
-from service.client import UnreachableError, open_session
+from service.cli.usage import reached
+from service.client import UnreachableError
 from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
@@ -39,9 +39,7 @@ def status(args: argparse.Namespace) -> int:
 
 
 def _watch(args: argparse.Namespace) -> int:
-    with open_session(
-        connect=args.connect or [channels.ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
-    ) as session:
+    with reached(args) as session:
         told = heard(session, args.cell)
         if args.json:
             for now in told:
@@ -197,7 +195,7 @@ def _arm(now: Status) -> str:
 def _off(now: Status) -> str:
     assert now.tool_m is not None
     assert now.target_m is not None
-    return f"{1000 * sum((a - b) ** 2 for a, b in zip(now.tool_m, now.target_m, strict=True)) ** 0.5:.1f} mm"
+    return f"{1000 * math.dist(now.tool_m, now.target_m):.1f} mm"
 
 
 def _turned(now: Status) -> str:

@@ -1,17 +1,24 @@
-"""Usage errors and checks of arguments that the commands share."""
+"""Options and checks of arguments that the commands share, and usage errors."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import os
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import Any, NoReturn
 
-if TYPE_CHECKING:
-    from service.contract.requests import Add, ViaPoint
+import zenoh
+
+from service.client import open_session
+from service.config import RATES_HZ, converted
+from service.contract.channels import ENDPOINT
+from service.contract.requests import Add, RequestError, ViaPoint, decode_request
+from service.described_arm import SettingsError
 
 CONNECT_TIMEOUT_S = 3.0
 
@@ -31,40 +38,76 @@ class Parser(argparse.ArgumentParser):
         super().error(message + (f"; did you mean {near[0]}?" if near else ""))
 
 
+def within(kind: type[float], low: float, high: float, unit: str = "") -> Callable[[str], float]:
+    """What reads a number (an int or a float) from `low` to `high` from the command line."""
+
+    def read(given: str) -> float:
+        with contextlib.suppress(ValueError):
+            if low <= kind(given) <= high:
+                return kind(given)
+        raise argparse.ArgumentTypeError(f"{given} given, {low:g} to {high:g}{unit} needed")
+
+    return read
+
+
+KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
+    **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
+    **dict.fromkeys(("M", "S"), float),
+    "HZ": within(int, *RATES_HZ, " Hz"),
+}
+
+
+def option(
+    c: argparse.ArgumentParser, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
+) -> None:
+    """Adds an option or argument that takes a value; its help tells its default."""
+    if default is not None:
+        about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
+    c.add_argument(name, metavar=metavar, help=about, default=default, **{"type": KINDS.get(metavar, str), **more})
+
+
 def check_cell(name: str) -> None:
     """Raises UsageError where a cell cannot have this name."""
-    from service.config import converted  # heavy
-    from service.described_arm import SettingsError
-
     try:
         converted({"cell": name}, origin="--cell")
     except SettingsError as error:
         raise UsageError(str(error)) from None
 
 
-def check_writable(path: Path) -> None:
-    """Raises UsageError where no file can be written at this path; for a check before long work."""
+def check_writable(path: Path, suffix: str = "") -> None:
+    """Raises UsageError where no file of this suffix can be written at this path; for a check
+    before long work.
+    """
     folder = path.parent
     if path.is_dir():
         raise UsageError(f"{path} is a folder, the name of a file needed")
+    if suffix and path.suffix.lower() != suffix:
+        raise UsageError(f"{path}: a name that ends in {suffix} needed: {path.with_suffix(suffix).name}, say")
     if not folder.is_dir():
         raise UsageError(f"{path}: there is no folder {folder}")
     if not os.access(path if path.exists() else folder, os.W_OK):
         raise UsageError(f"{path} cannot be written: no permission")
 
 
+def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A session to the daemon or router that the command line names. Raises UnreachableError."""
+    return open_session(
+        connect=args.connect or (),
+        otherwise=[ENDPOINT],
+        timeout_s=timeout_s,
+        certificate=args.certificate,
+        zenoh_config=args.zenoh_config,
+    )
+
+
 def added_in(path: Path) -> Add:
     """The request to add via-points in a file (-: standard input). Raises RequestError, OSError."""
-    from service.contract.requests import Add, decode_request  # heavy
-
     request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
     return request
 
 
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
     """The via-points in such a file. Raises RequestError, which names the file, and OSError."""
-    from service.contract.requests import RequestError  # heavy
-
     try:
         return added_in(path).points
     except RequestError as error:

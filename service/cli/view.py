@@ -24,10 +24,10 @@ from mcap.writer import MCAP0_MAGIC
 from PIL import Image
 
 from service.cli.clients import ask
-from service.cli.progress import progress
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable
-from service.client import Client, open_session
-from service.contract.channels import ENDPOINT
+from service.cli.live_page import Address, Latest, LivePage, web_viewer
+from service.cli.progress import progress, say
+from service.cli.usage import UsageError, check_writable, reached
+from service.client import Client
 from service.contract.explain import ExplainedError
 from service.launch import free_port
 from service.network_settings import is_local
@@ -48,7 +48,7 @@ def view(args: argparse.Namespace) -> int:
     check_usage(args)
     if args.file == "live":
         now = ask(args, "status")
-        print(_line(now), file=sys.stderr, flush=True)
+        say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
         if not (url := now["scribe"].get("live")):
             raise UsageError("this daemon serves no live view; start it with --live PORT")
         return _serve(args, url) if args.web else _show(url, args)
@@ -68,71 +68,64 @@ def view(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / f"{path.stem}.rrd"
         with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
-            convert(path, drawn, say=lambda line: print(line, file=sys.stderr, flush=True), progress=done)
+            convert(path, drawn, say=say, progress=done)
         return _show(str(drawn), args)
 
 
 def check_usage(args: argparse.Namespace) -> None:
     """Raises UsageError for arguments that are not valid, before anything is drawn."""
     if args.screenshot:
-        check_writable(args.screenshot)
-        if args.screenshot.suffix.lower() != ".png":
-            raise UsageError(f"--screenshot {args.screenshot}: a name that ends in .png needed")
+        check_writable(args.screenshot, ".png")
     if args.time is not None and not (args.screenshot and math.isfinite(args.time) and args.time >= 0):
         raise UsageError(f"--time {args.time:g}: seconds from 0 on, of a --screenshot, needed")
     if args.web and (args.file != "live" or args.screenshot):
         raise UsageError("--web shows the running daemon in a browser: `thirdhand view live --web`")
 
 
-def _line(status: dict[str, Any]) -> str:
-    """Cell, mode and reason in one line."""
-    reason = f": {status['reason'].replace('_', ' ')}" if status["reason"] else ""
-    return f"{status['cell']}: {status['mode']}{reason}"
-
-
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serves the page until it is interrupted."""
-    from service.cli.live_page import Address, Latest, LivePage, web_viewer
-
     listen = _address(args.web)
     stream = urlsplit(url.removeprefix("rerun+"))
     with (
-        open_session(
-            connect=args.connect or [ENDPOINT], timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate
-        ) as session,
+        reached(args) as session,
         web_viewer(rerun_program(), url, free_port()) as viewer,
     ):
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.ask("status"))
         to = Address(str(stream.hostname), int(stream.port or 0))
         try:
-            page = LivePage(Address(*listen), client=client, latest=latest, cell=args.cell, stream=to, viewer=viewer)
+            page = LivePage(listen, client=client, latest=latest, cell=args.cell, stream=to, viewer=viewer)
         except OSError as error:
-            where = Address(*listen)
-            raise UsageError(f"--web {where}: {error.strerror or error}; another port, or 0 for any, needed") from None
+            raise UsageError(f"--web {listen}: {error.strerror or error}; another port, or 0 for any, needed") from None
         print(f"http://{page.address}/", flush=True)
         if not is_local(f"tcp/{page.address}"):
-            print("whoever reaches this address can hold, resume and reset the arm", file=sys.stderr, flush=True)
+            say("whoever reaches this address can hold, resume and reset the arm")
         for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: threading.Thread(target=page.close).start())
-        page.serve()
+            signal.signal(number, lambda *_: threading.Thread(target=page.shutdown).start())
+        with page:
+            page.serve_forever(poll_interval=0.1)
     return 0
 
 
-def _address(given: str) -> tuple[str, int]:
+def _address(given: str) -> Address:
     """Host and port of `PORT` or `HOST:PORT`. Raises UsageError."""
     host, _, port = given.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise UsageError(f"--web {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0")
-    return host.strip("[]") or "127.0.0.1", int(port)
+    return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
 def _show(source: str, args: argparse.Namespace) -> int:
+    """The exit code of the viewer on a file or a live view, once its window is closed; or 0 once
+    its picture is written.
+    """
     if args.screenshot:
         age_s = screenshot(source, args.screenshot, time=args.time, tab=args.tab)
         print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
         return 0
-    return int(show(source))
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
+    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", source], check=False).returncode
 
 
 def convert(
@@ -199,10 +192,6 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     live = "://" in str(source)
     if not live and not Path(source).is_file():
         raise ViewerError(f"nothing to picture: there is no {source}")
-    if not live:
-        with Path(source).open("rb") as file:
-            if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
-                raise ViewerError(f"nothing to picture: {source} is not an .rrd file")
     os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # else its graphics library logs errors
     try:
@@ -276,13 +265,6 @@ def _fresh(client: Any, png: Path) -> float:
         if age_s <= FRESH_S or clock.monotonic() > until:
             return age_s
         clock.sleep(0.3)
-
-
-def show(source: str | Path) -> int:
-    """The exit code of the Rerun viewer on a file or a live view, once its window is closed."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
-    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", str(source)], check=False).returncode
 
 
 def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:

@@ -7,7 +7,6 @@ from service.client.presence import Cell, Overheard, cells, living
 from service.client.session import (
     AUTHORITY,
     CERTIFICATE,
-    ENDPOINTS_TIMEOUT_S,
     KEY,
     RefusedError,
     UnreachableError,
@@ -21,7 +20,6 @@ __all__ = [
     "BRAKE_AFTER_S",
     "CERTIFICATE",
     "ENCODINGS",
-    "ENDPOINTS_TIMEOUT_S",
     "KEY",
     "Cell",
     "Client",

@@ -4,7 +4,8 @@ anything is published.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from contextlib import AbstractContextManager
+from typing import NamedTuple
 
 import msgspec
 import zenoh
@@ -52,15 +53,12 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
     return tuple(Cell(name, own, statuses.get(own)) for name, own in found)
 
 
-class Overheard:
+class Overheard(AbstractContextManager["Overheard"]):
     """Collects the keys, matching some expressions, on which something is published; a context."""
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
         self._subscribers = [session.declare_subscriber(one, self._take) for one in expressions]
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -13,12 +14,12 @@ from service.client.presence import living
 from service.client.session import UnreachableError
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
+from service.contract.records import SIDES
 
 BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 POLL_S = 0.02
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
-SIDES = ("left", "right")
 
 
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
@@ -31,7 +32,7 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
     )
 
 
-class Tracker:
+class Tracker(AbstractContextManager["Tracker"]):
     """Publishes hand poses of a cell; a context.
 
     It waits up to `timeout_s` [s] for a live daemon. Raises UnreachableError where there is none.
@@ -81,9 +82,6 @@ class Tracker:
         for one in self._publishers.values():
             one.undeclare()  # type: ignore[no-untyped-call]
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -103,7 +101,7 @@ class Command(NamedTuple):
     hand_stamp_ns: int
 
 
-class Follower:
+class Follower(AbstractContextManager["Follower"]):
     """Receives joint commands of a cell and publishes the joints' state; a context.
 
     `names` are the arm's joints, in the order of all values here. Commands that do not fit these
@@ -150,9 +148,6 @@ class Follower:
         with self._came:
             self._newest = Command(message.stamp_ns, position, velocity, *attached)
             self._came.notify()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

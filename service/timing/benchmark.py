@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from service.cli.progress import say
 from service.client import Client, open_session
 from service.core.frame import STAGES, TIMING
 from service.launch import launched
@@ -39,10 +39,6 @@ SLOWER = 1.15  # accepted latency, as a multiple of half a period, the round tri
 
 def bench(args: argparse.Namespace) -> int:
     """Exit code 0 once measured, whatever the result."""
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
     report: Any
@@ -100,7 +96,13 @@ def _whole(
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()
-            processes = _used(service.process.pid)
+            processes = {
+                who: {
+                    "cpu_s": round(sum(process.cpu_times()[:2]), 2),
+                    "memory_mb": round(process.memory_info().rss / 1e6, 1),
+                }
+                for who, process in family(service.process.pid).items()
+            }
             if service.stop() != 0:
                 raise BenchError(f"the service failed: {service.log.read_text()[-500:]}")
         recorded = sorted(set(folder.glob("*.mcap")) - before)  # one after the other
@@ -115,17 +117,6 @@ def _whole(
         **figures(timing["lateness_us"], timing["work_us"]),
         "stages_us": {name: percentiles(timing["stages_us"][:, i]) for i, name in enumerate(STAGES)},
         "processes": processes,
-    }
-
-
-def _used(pid: int) -> dict[str, dict[str, float]]:
-    """Processor time [s] and memory [MB] so far of a daemon and its children, by kind."""
-    return {
-        who: {
-            "cpu_s": round(sum(process.cpu_times()[:2]), 2),
-            "memory_mb": round(process.memory_info().rss / 1e6, 1),
-        }
-        for who, process in family(pid).items()
     }
 
 

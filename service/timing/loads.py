@@ -79,11 +79,6 @@ class LoadedCell:
 
 
 @contextlib.contextmanager
-def _nothing(cell: LoadedCell) -> Iterator[None]:
-    yield
-
-
-@contextlib.contextmanager
 def _frozen(cell: LoadedCell) -> Iterator[None]:
     pid = cell.scribe()
     os.kill(pid, signal.SIGSTOP)
@@ -121,15 +116,13 @@ def _stalled(cell: LoadedCell) -> Iterator[None]:
             yield
 
 
-def _asking(kind: str) -> Callable[[LoadedCell], contextlib.AbstractContextManager[None]]:
-    @contextlib.contextmanager
-    def asked(cell: LoadedCell) -> Iterator[None]:
-        with asking(kind, cell.service.endpoint) as process:
-            yield
-            if process.poll() is not None:
-                raise LoadError(f"what asks for {kind!r} ended with code {process.returncode}")
-
-    return asked
+@contextlib.contextmanager
+def _beside(kind: str, cell: LoadedCell) -> Iterator[None]:
+    """One of ASKING, which must not end before the load does."""
+    with asking(kind, cell.service.endpoint) as process:
+        yield
+        if process.poll() is not None:
+            raise LoadError(f"what asks for {kind!r} ended with code {process.returncode}")
 
 
 @dataclass(frozen=True)
@@ -137,7 +130,7 @@ class Load:
     """A load: its name for people, and what applies it."""
 
     what: str
-    put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[None]] = _nothing
+    put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
     program: tuple[str, ...] = ("-m", "service")
 
 
@@ -193,10 +186,10 @@ LOADS = (
     Load("scribe killed", _killed),
     Load("viewer stalled", _stalled),
     Load("disk full", _full),
-    Load(f"{QUERIES_HZ:.0f} status queries a second", _asking("status")),
-    Load(f"taught each {1e3 / TEACHING_HZ:.0f} ms", _asking("teaching")),
-    Load(f"skills of {LARGE} points loaded", _asking("loading")),
-    Load(f"hands at {BURST_HZ / 1e3:g} kHz", _asking("bursts")),
+    Load(f"{QUERIES_HZ:.0f} status queries a second", partial(_beside, "status")),
+    Load(f"taught each {1e3 / TEACHING_HZ:.0f} ms", partial(_beside, "teaching")),
+    Load(f"skills of {LARGE} points loaded", partial(_beside, "loading")),
+    Load(f"hands at {BURST_HZ / 1e3:g} kHz", partial(_beside, "bursts")),
     Load(f"{COLLECTIONS_HZ:.0f} collections a second", program=("-c", COLLECTING)),
 )
 
@@ -306,12 +299,12 @@ def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextlib.contextmanager
 def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=quiet, stdin=quiet) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def text(rows: list[dict[str, Any]]) -> str:

@@ -16,12 +16,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import msgspec
 import numpy as np
 import zenoh
 
 from service.client import endpoints, open_session
-from service.config import Settings, robot_description
+from service.config import ArmSettings, Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES
@@ -114,8 +113,7 @@ def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], Non
 
 def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
     """The result of the loop with the core alone."""
-    settings = Settings(rate_hz=rate_hz)
-    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
+    settings = Settings(rate_hz=rate_hz, arm=ArmSettings(source="assumed"))
     skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
     controller, every = Controller(settings, skill, urdf=urdf), round(HANDS_EVERY_S * rate_hz)

@@ -34,19 +34,16 @@ def probe(kind: str, *arguments: object) -> dict[str, Any]:
 @contextlib.contextmanager
 def echo() -> Iterator[str]:
     """The endpoint at which an echo listens, while the context lasts."""
-    process = subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdin is not None
-    try:
-        yield process.stdout.readline().strip()
-    finally:
-        process.stdin.close()
+    with subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
         try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
+            yield process.stdout.readline().strip()
+        finally:
+            process.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
             process.kill()
-            process.wait()
-        process.stdout.close()
 
 
 def family(pid: int) -> dict[str, psutil.Process]:

@@ -300,7 +300,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         (["../a", "--show"], 1, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
         (["there"], 1, "is there already: another name needed, or --delete it first"),
-        (["a", "--plot", "a.jpg"], 2, "a.jpg: a picture is written as .png: a.png, say"),
+        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
         (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
         (["a", "--places", "PLACES"], 1, "$.points[1].name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
