@@ -23,13 +23,15 @@ from service.core.decision.decision import FAULT
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import quaternion_of
 from service.core.separation.separation import Separation
-from service.core.setpoint.bounds import fastest_stop, stop_together
+from service.core.setpoint.bounds import braking_together, fastest_stop, stop_together
 
 ROUND_TO = 1e9  # [1/rad] of the positions: machines that differ in the last bits agree
 LARGEST = 1e6  # of any number of a state that is calculated with
 BOUNDED = 1  # flag of a step: the wanted velocity was cut
 CHASED = 2  # some joint cannot have it in a tick
 UNSAFE = 4  # some joint could not have stopped after it
+MOMENTS = 12  # of a stop, at which the tool's speed is asked for ...
+MOMENT_SHARE = 0.2  # ... so many times as far apart as a joint takes to come to its greatest acceleration
 UNUSABLE = -1  # the state cannot be calculated with
 
 
@@ -62,6 +64,7 @@ class Limiter:
             max_acceleration=np.array(limits.acceleration, np.float64),
             max_jerk=np.array(limits.jerk, np.float64),
             approach_gain=approach_gain(limits),
+            moment_s=MOMENT_SHARE * float((np.array(limits.acceleration) / np.array(limits.jerk)).max()),
         )
         count = len(limits.velocity)
         self._ruckig = ruckig.Ruckig(count)
@@ -103,6 +106,11 @@ class Limiter:
         moved[0] += q
         _make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=bool(moved[1].any()))
+
+    def speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
+        """The greatest speed [m/s] of the tool in a stop after a step that brought the arm here."""
+        speed: float = _speed_in_stop(*moved[1:3], here.record, self._parameters)
+        return speed
 
     def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
         """Puts those joints of `moved` (3, J) that are NaN one period along Ruckig's profile to the
@@ -193,6 +201,31 @@ def is_usable(state: Vector) -> bool:
     return True
 
 
+@compiled
+def _speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) -> float:
+    """`Limiter.speed_in_stop`, by the tool's Jacobian and how that changes as the joints move."""
+    jacobian, given, joints = heres[0].jacobian, parameters[0], len(dq)
+    braking, stop, way, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
+    braking_together(dq, ddq, given.max_acceleration, given.max_jerk, braking)
+    most = 0.0
+    for moment in range(1, MOMENTS + 1):
+        for j in range(joints):
+            fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], moment * given.moment_s, stop)
+            speed[j], way[j] = stop[0], stop[2]
+        x = y = z = 0.0
+        for j in range(joints):
+            x, y, z = x + jacobian[0, j] * speed[j], y + jacobian[1, j] * speed[j], z + jacobian[2, j] * speed[j]
+            for k in range(joints):  # the Jacobian's column j changes by the earlier axis times the later column
+                axis, column, moved = min(j, k), max(j, k), way[k] * speed[j]
+                wx, wy, wz = jacobian[3, axis], jacobian[4, axis], jacobian[5, axis]
+                vx, vy, vz = jacobian[0, column], jacobian[1, column], jacobian[2, column]
+                x += moved * (wy * vz - wz * vy)
+                y += moved * (wz * vx - wx * vz)
+                z += moved * (wx * vy - wy * vx)
+        most = max(most, x * x + y * y + z * z)
+    return math.sqrt(most)
+
+
 def _stuck(q: Vector) -> Limited:
     return _frozen(np.stack((q, np.zeros(len(q)), np.zeros(len(q)))), limited=True)
 
@@ -202,7 +235,8 @@ def _frozen(moved: Vector, *, limited: bool) -> Limited:
     return Limited(moved[0], moved[1], moved[2], limited)
 
 
-NEAR_SPEED = 0.95  # of the tool's greatest; what the joints turn in a tick changes it by less than the rest
+NEAR_SPEED = 0.8  # of the tool's greatest; what the joints turn in a stop changes it by less than the rest
+STOP_SHARE = 0.997  # of that speed, from which it stops: a little more comes of what is left out in finding it
 
 
 class Moved(NamedTuple):
@@ -245,7 +279,7 @@ class LimiterStage:
             separated = separation.excess(*stop[1:3]) < excess
             moved, limited = (stop, True) if separated else (moved, limited)
         here, too_fast = self._arm.at(moved.position), 0.0
-        if self._comes_to(moved, here) > self._max_speed:
+        if self._comes_to(moved, here) > STOP_SHARE * self._max_speed:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             here = self._arm.at(moved.position)
             speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
@@ -272,11 +306,9 @@ class LimiterStage:
         limit also as the arm will stand then, for what joints do to the tool changes on the way.
         """
         speed: float = tool_speeds(here.record, *moved[1:3], self._jerk)[1]
-        if not NEAR_SPEED * self._max_speed < speed <= self._max_speed:
-            return speed
-        stop = self._limiter.stop(*moved[:3])
-        then = self._arm.at(stop.position).record
-        return max(speed, tool_speeds(then, *stop[1:3], self._jerk)[1])
+        if NEAR_SPEED * self._max_speed < speed <= STOP_SHARE * self._max_speed:
+            return max(speed, self._limiter.speed_in_stop(moved, here))
+        return speed
 
 
 @compiled

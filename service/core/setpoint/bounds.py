@@ -89,24 +89,34 @@ def stop_together(
     they move together slows down on its way.
     """
     count = len(velocities)
-    out, stop = np.zeros((3, count)), np.zeros(6)
-    duration = 0.0
+    out, stop, slower = np.zeros((3, count)), np.zeros(6), np.empty(count)
+    braking_together(velocities, accelerations, max_acceleration, max_jerk, slower)
     for i in range(count):
-        fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], dt, stop)
+        fastest_stop(velocities[i], accelerations[i], slower[i], max_jerk[i], dt, stop)
+        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
+    return out
+
+
+@compiled
+def braking_together(
+    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, out: Vector
+) -> None:
+    """Into out (J,) the accelerations with which all axes come to rest at once."""
+    stop, duration = np.zeros(6), 0.0
+    for i in range(len(velocities)):
+        fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], 0.0, stop)
         duration = max(duration, stop[5])
-    for i in range(count):
+    for i in range(len(velocities)):
         low, share = LEAST_SHARE, 1.0
         if velocities[i] != 0.0 or accelerations[i] != 0.0:
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + share)
-                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], dt, stop)
+                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], 0.0, stop)
                 if stop[5] <= duration:
                     share = middle
                 else:
                     low = middle
-        fastest_stop(velocities[i], accelerations[i], share * max_acceleration[i], max_jerk[i], dt, stop)
-        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
-    return out
+        out[i] = share * max_acceleration[i]
 
 
 HULL_TIME_S = 0.35  # the setpoint stays near the targets of so long
