@@ -24,7 +24,7 @@ from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
-from service.recording.mcap_file import McapFile, machine
+from service.recording.mcap_file import machine, whole_file
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
@@ -189,24 +189,14 @@ class Capture:
         if places:
             text = cdr.encode_string(encode_json(tuple(places)).decode())
             messages.append((min(messages)[0], PLACES, text))
-        part = path.with_name(f".{path.name}.part")
-        file = McapFile(part, joints=len(self.settings.joints.names))
-        try:
+        with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
             file.writer.add_metadata("thirdhand", {"cell": self.cell, **machine()})
-            for name, kind, data in (
-                ("settings.json", "application/json", msgspec.json.encode(self.settings)),
-                ("arm.urdf", "application/xml", urdf.encode()),
-            ):
-                file.writer.add_attachment(now_ns, now_ns, name, kind, data)
+            file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
+            file.attach("arm.urdf", urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
                 codec = channels.STRING if key == PLACES else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
-            file.close()
-            part.replace(path)
-        finally:
-            file.abandon()
-            part.unlink(missing_ok=True)
 
     def _tool_by_joints(self, urdf: str) -> list[tuple[int, str, bytes]]:
         states = self.samples[JOINT_STATES]

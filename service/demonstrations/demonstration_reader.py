@@ -45,8 +45,7 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     if gripper is not None and (gripper.shape != (len(stamps_ns),) or not np.isfinite(gripper).all()):
         given, wanted = gripper.shape, (len(stamps_ns),)
         raise ValueError(f"{GRIPPER_STATE}: shape {given} given, finite numbers of shape {wanted} needed")
-    file = McapFile(Path(path), joints=0, attached=False)
-    try:
+    with McapFile(Path(path), joints=0, attached=False) as file:
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
         ):
@@ -59,8 +58,6 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
             file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
-    finally:
-        file.close()
 
 
 def read_demonstration(

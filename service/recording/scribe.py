@@ -135,9 +135,7 @@ class Scribe:
         if target is None or self._pause:
             self._pause = max(0, self._pause - 1)
             if self._wanted:
-                self._gap += 1
-                self._lost += 1
-                self._send_all = True
+                self.skip()
             return
         send_all = self._send_all
         self._since_state += 1
@@ -154,9 +152,7 @@ class Scribe:
             else:
                 target.send(message)
         except OSError:
-            self._gap += 1
-            self._lost += 1
-            self._send_all = True
+            self.skip()
             self._pause = self._settings.rate_hz // 10  # one gap rather than many
             return
         self._sent += 1
