@@ -89,7 +89,8 @@ def _split(name: str) -> list[str]:
 def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     """The contents of a take, by `settings` or those in the file. Raises RecordingError."""
     remarks: list[str] = []
-    demonstration = read_demonstration(path, settings=settings, say=lambda line: remarks.append(_without(path, line)))
+    demonstration = read_demonstration(path, settings=settings, say=remarks.append)
+    remarks = [line.removeprefix(f"{path}: ") for line in remarks]
     recorded = Recorded.open(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
@@ -109,10 +110,6 @@ def _still(demonstration: Demonstration) -> list[str]:
         for name, m in moved
         if m < LEAST_M
     ]
-
-
-def _without(path: Path, line: str) -> str:
-    return line.removeprefix(f"{path}: ")
 
 
 def _jumps(at: Vector, seconds: Vector) -> int:

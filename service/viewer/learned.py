@@ -77,16 +77,7 @@ def skill_contents(skill: bytes) -> SkillContents:
             float(arrays.get("threshold", np.inf)),
             msgspec.json.decode(str(arrays["figures"])) if "figures" in arrays else {},
         )
-    except (
-        OSError,
-        KeyError,
-        TypeError,
-        EOFError,
-        ValueError,
-        zipfile.BadZipFile,
-        msgspec.DecodeError,
-        msgspec.ValidationError,
-    ) as error:
+    except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"a skill of which nothing can be drawn: {error}") from None
 
 
