@@ -91,7 +91,7 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     remarks: list[str] = []
     demonstration = read_demonstration(path, settings=settings, say=remarks.append)
     remarks = [line.removeprefix(f"{path}: ") for line in remarks]
-    recorded = Recorded.open(path)
+    recorded = Recorded(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
     remarks += _still(demonstration)

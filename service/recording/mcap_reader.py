@@ -239,6 +239,12 @@ class _Reading:
         return self._stream.read(count)
 
 
+def full_name(schema: Schema | None) -> str:
+    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`; empty without a schema."""
+    kind = "" if schema is None else schema.name
+    return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
+
+
 def next_whole(messages: Iterator[Found], path: Path) -> Found | None:
     """The next message of an indexed file, None at its end.
 
