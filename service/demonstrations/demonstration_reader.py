@@ -35,15 +35,13 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     """
     stamps_ns, left, right, tool = demonstration[:4]
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
-    for name, stream in zip(_STREAMS, poses, strict=True):
-        if stream.shape != (len(stamps_ns), 7) or not np.isfinite(stream).all():
-            raise ValueError(
-                f"{name}: shape {stream.shape} given, finite numbers of shape ({len(stamps_ns)}, 7) needed"
-            )
-    gripper = demonstration.gripper
-    if gripper is not None and (gripper.shape != (len(stamps_ns),) or not np.isfinite(gripper).all()):
-        given, wanted = gripper.shape, (len(stamps_ns),)
-        raise ValueError(f"{GRIPPER_STATE}: shape {given} given, finite numbers of shape {wanted} needed")
+    gripper, count = demonstration.gripper, len(stamps_ns)
+    given: list[tuple[str, Vector, tuple[int, ...]]]
+    given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
+    for name, stream, shape in given:
+        if stream.shape != shape or not np.isfinite(stream).all():
+            raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
     with McapFile(Path(path), joints=0, attached=False) as file:
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
@@ -179,18 +177,15 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []
-    by_tracker = [is_by_tracker(track.name, track.frame, hands) for track in tracks]
-    if not any(by_tracker):
-        return list(tracks), []
-    turn, out = Rotation.from_matrix(axes), []
-    for track, is_mapped in zip(tracks, by_tracker, strict=True):
-        if is_mapped:
+    turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
+    for i, track in enumerate(tracks):
+        if is_by_tracker(track.name, track.frame, hands):
             at = from_tracker(track.poses[:, :3], hands)
             turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
-            track = track._replace(poses=np.hstack([at, turns]), frame=BASE)  # noqa: PLW2901
-        out.append(track)
-    names = ", ".join(track.name for track, is_mapped in zip(tracks, by_tracker, strict=True) if is_mapped)
-    return out, [f"{names} brought to frame {BASE} by [hands] unit and base_from_tracker"]
+            out[i] = track._replace(poses=np.hstack([at, turns]), frame=BASE)
+            mapped.append(track.name)
+    remark = f"{', '.join(mapped)} brought to frame {BASE} by [hands] unit and base_from_tracker"
+    return out, [remark] if mapped else []
 
 
 def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 import struct
@@ -192,23 +193,15 @@ class _Reading:
         there, else the next whole chunk; None where there is none.
         """
         if end is not None:
-            try:
+            with contextlib.suppress(ValueError):
                 self._head(end)
                 return end
-            except ValueError:
-                pass
-        return self._next_chunk(at + 1)
-
-    def _next_chunk(self, start: int) -> int | None:
-        """The first byte of the next whole chunk; None where there is none."""
-        block_at = start
-        while block_at < self._size:
+        for block_at in range(at + 1, self._size, _BLOCK):
             block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)
             for mark in _COMPRESSION.finditer(block):
-                at = block_at + mark.start() - _BEFORE_COMPRESSION
-                if at >= start and self._is_chunk(at):
-                    return at
-            block_at += _BLOCK
+                chunk_at = block_at + mark.start() - _BEFORE_COMPRESSION
+                if chunk_at > at and self._is_chunk(chunk_at):
+                    return chunk_at
         return None
 
     def _is_chunk(self, at: int) -> bool:

@@ -13,7 +13,7 @@ import shlex
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 from mcap.exceptions import McapError
@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Quaternion, SceneObject, Transform, Vector3
+from service.contract.messages import BASE, SceneObject, Transform
 from service.contract.records import SIDES
 from service.core.frame import Record, Tick, encode
 from service.core.outputs import Outputs
@@ -135,12 +135,15 @@ class Recorder(McapFile):
         found = self._links.transforms(joints)
         offset = settings.tool.plate_from_tool
         found.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
-        found.append(Transform(BASE, "setpoint", _point(frame["setpoint"]), _quaternion(frame["setpoint_orientation"])))
+        setpoint, turn, target, target_turn = (
+            tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
+        )
+        found.append(Transform(BASE, "setpoint", setpoint, turn))
         for side, name in enumerate(SIDES):
             if frame["hand_ages"][side] >= 0:
-                found.append(Transform(BASE, f"{name}_hand", _point(frame["hands"][side]), _UPRIGHT))
+                found.append(Transform(BASE, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
         if frame["covariance"].any():  # without both hands nothing is predicted
-            found.append(Transform(BASE, "target", _point(frame["target"]), _quaternion(frame["orientation"])))
+            found.append(Transform(BASE, "target", target, target_turn))
         return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
@@ -166,16 +169,6 @@ class Recorder(McapFile):
         if not self.closed and not self._begun and self._state is not None:
             self._begin(0)
         super().close()
-
-
-def _point(position: Any) -> Vector3:
-    x, y, z = position.tolist()
-    return x, y, z
-
-
-def _quaternion(orientation: Any) -> Quaternion:
-    x, y, z, w = orientation.tolist()
-    return x, y, z, w
 
 
 def _take_hint(path: Path) -> str:
