@@ -259,18 +259,14 @@ def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]
     """Names and values of the settings, and of the versions and machine, that two recordings do
     not share.
     """
-    found = []
-    told = [
+    a, b = (
         _flat(msgspec.to_builtins(r.columns.recording.settings), "")
         | {f"made with {name}": value for name, value in r.columns.recording.metadata.items()}
         | {"skill": r.skill}
         for r in (one, other)
-    ]
-    for name in sorted({*told[0], *told[1]}):
-        values = [told[i].get(name, "not told") for i in (0, 1)]
-        if values[0] != values[1]:
-            found.append((name, *values))
-    return found
+    )
+    values = ((name, a.get(name, "not told"), b.get(name, "not told")) for name in sorted({*a, *b}))
+    return [found for found in values if found[1] != found[2]]
 
 
 def _flat(value: Any, path: str) -> dict[str, Any]:
