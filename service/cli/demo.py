@@ -20,10 +20,7 @@ from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.launch import check_bench, launched, played
-from service.recording.recording import Recording
-from service.report.columns import read
-from service.report.report import Report, why_missed
-from service.report.report import report as report_of
+from service.report.report import Report, reported, why_missed
 
 START_TIMEOUT_S = 60.0
 AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
@@ -69,7 +66,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
-    found = report_of(read(Recording.open(recording)))
+    found = reported(recording)
     timing = found.columns.timing
     for name, event in report["events"].items():
         if not event["reached"]:

@@ -4,6 +4,7 @@ ends it or all is at rest, and written as received.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
-from service.recording.mcap_file import McapFile, machine
+from service.recording.mcap_file import machine, whole_file
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
@@ -137,7 +138,9 @@ class Capture:
         if now_ns - began_ns < 1e9 * rest_s:
             return False
         for key, samples in self.streams.items():
-            lately = _since(samples, now_ns - int(1e9 * rest_s))
+            lately = [*itertools.takewhile(lambda one: now_ns - one.arrived_ns <= 1e9 * rest_s, reversed(samples))][
+                ::-1
+            ]
             still = [sample.at for sample in lately]
             self._moved = self._moved or (bool(still) and _motion(key, np.array([samples[0].at, still[-1]])) > MOVED)
             covered_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
@@ -149,7 +152,8 @@ class Capture:
         """The rest before and after the motion that was left out [s]; KEPT_S of each is kept."""
         times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
         start_ns, end_ns = self.span_of_motion()
-        self.keep(start_ns, end_ns)
+        for key, samples in self.samples.items():
+            self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
         return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
@@ -165,11 +169,6 @@ class Capture:
         if not begins:
             return 0, time.time_ns()
         return min(begins) - int(1e9 * KEPT_S), max(ends) + int(1e9 * KEPT_S)
-
-    def keep(self, start_ns: int, end_ns: int) -> None:
-        """Keeps what arrived in this time, and forgets the rest."""
-        for key, samples in self.samples.items():
-            self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
 
     def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
         """Writes the demonstration, all or nothing: the messages as received and the task's places;
@@ -189,24 +188,14 @@ class Capture:
         if places:
             text = cdr.encode_string(encode_json(tuple(places)).decode())
             messages.append((min(messages)[0], PLACES, text))
-        part = path.with_name(f".{path.name}.part")
-        file = McapFile(part, joints=len(self.settings.joints.names))
-        try:
+        with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
             file.writer.add_metadata("thirdhand", {"cell": self.cell, **machine()})
-            for name, kind, data in (
-                ("settings.json", "application/json", msgspec.json.encode(self.settings)),
-                ("arm.urdf", "application/xml", urdf.encode()),
-            ):
-                file.writer.add_attachment(now_ns, now_ns, name, kind, data)
+            file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
+            file.attach("arm.urdf", urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
                 codec = channels.STRING if key == PLACES else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
-            file.close()
-            part.replace(path)
-        finally:
-            file.abandon()
-            part.unlink(missing_ok=True)
 
     def _tool_by_joints(self, urdf: str) -> list[tuple[int, str, bytes]]:
         states = self.samples[JOINT_STATES]
@@ -220,14 +209,6 @@ class Capture:
             )
             for i, at in zip(kept, poses.tolist(), strict=True)
         ]
-
-
-def _since(samples: list[Sample], since_ns: int) -> list[Sample]:
-    """The samples that arrived since a time [ns]."""
-    at = len(samples)
-    while at and samples[at - 1].arrived_ns >= since_ns:
-        at -= 1
-    return samples[at:]
 
 
 def _motion(key: str, at: Vector) -> float:

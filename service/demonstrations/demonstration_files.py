@@ -15,7 +15,7 @@ from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
 from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
 from service.learning.demonstration import LEAST_M, Demonstration
-from service.recording.mcap_file import McapFile, RecordingError
+from service.recording.mcap_file import RecordingError, whole_file
 from service.recording.mcap_reader import Messages
 
 NAME = r"\w[\w .-]{0,63}"
@@ -89,8 +89,9 @@ def _split(name: str) -> list[str]:
 def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     """The contents of a take, by `settings` or those in the file. Raises RecordingError."""
     remarks: list[str] = []
-    demonstration = read_demonstration(path, settings=settings, say=lambda line: remarks.append(_without(path, line)))
-    recorded = Recorded.open(path)
+    demonstration = read_demonstration(path, settings=settings, say=remarks.append)
+    remarks = [line.removeprefix(f"{path}: ") for line in remarks]
+    recorded = Recorded(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
     remarks += _still(demonstration)
@@ -109,10 +110,6 @@ def _still(demonstration: Demonstration) -> list[str]:
         for name, m in moved
         if m < LEAST_M
     ]
-
-
-def _without(path: Path, line: str) -> str:
-    return line.removeprefix(f"{path}: ")
 
 
 def _jumps(at: Vector, seconds: Vector) -> int:
@@ -222,40 +219,30 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
     kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
     if len(kept_s) == len(times_ns):
         return f"nothing is cut: {path} lasts {lasts_s:.1f} s"
-    part = path.with_name(f".{path.name}.part")
     joints = next((len(JOINTS.decode(row[2].data).names) for row in rows if row[0] and row[0].name == JOINTS.type), 0)
-    file = McapFile(part, joints=joints)
+    original = uncut(path)
+    existed = original.exists()
     try:
-        for name, content in messages.metadata.items():
-            file.writer.add_metadata(name, content)
-        for name, data in messages.attachments.items():
-            kind = "application/json" if name.endswith(".json") else "application/xml"
-            file.writer.add_attachment(begin_ns, begin_ns, name, kind, data)
-        for schema, channel, message in rows:
-            if schema is None or channel.message_encoding != "cdr":
-                raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it is not trimmed")
-            at_s = (message.log_time - begin_ns) / 1e9
-            if schema.name not in streams or start_s <= at_s <= end_s:
-                file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
-        file.close()
-        try:
-            summary(part)
-        except RecordingError:
-            raise RecordingError(
-                f"{path} lasts {lasts_s:.1f} s: from {start_s:g} to {end_s:g} s too little is left, and it stays as "
-                "it was"
-            ) from None
-        original = uncut(path)
-        existed = original.exists()
-        if not existed:
-            path.replace(original)
-        part.replace(path)
-        return (
-            f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s; "
-            f"the uncut take is {'still' if existed else 'kept as'} {original}"
-        )
+        with whole_file(path, joints=joints) as file:
+            for name, content in messages.metadata.items():
+                file.writer.add_metadata(name, content)
+            for name, data in messages.attachments.items():
+                file.attach(name, data, begin_ns)
+            for schema, channel, message in rows:
+                if schema is None or channel.message_encoding != "cdr":
+                    raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it is not trimmed")
+                at_s = (message.log_time - begin_ns) / 1e9
+                if schema.name not in streams or start_s <= at_s <= end_s:
+                    file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+            file.close()
+            try:
+                summary(file.path)
+            except RecordingError:
+                left = f"from {start_s:g} to {end_s:g} s too little is left, and it stays as it was"
+                raise RecordingError(f"{path} lasts {lasts_s:.1f} s: {left}") from None
+            if not existed:
+                path.replace(original)
     except KeyError as error:
         raise RecordingError(f"{path}: messages of type {error} are of no take; it is not trimmed") from None
-    finally:
-        file.abandon()
-        part.unlink(missing_ok=True)
+    told = f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s"
+    return f"{told}; the uncut take is {'still' if existed else 'kept as'} {original}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
@@ -23,7 +22,7 @@ from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, Track, chosen
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
-from service.recording.mcap_reader import Messages, next_whole
+from service.recording.mcap_reader import Messages, full_name, next_whole
 
 _STREAMS = tuple(ENDINGS.values())
 LARGEST_DELAY_S = 0.2  # by which the delays from stamp to recording may differ between streams of one clock
@@ -36,17 +35,14 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     """
     stamps_ns, left, right, tool = demonstration[:4]
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
-    for name, stream in zip(_STREAMS, poses, strict=True):
-        if stream.shape != (len(stamps_ns), 7) or not np.isfinite(stream).all():
-            raise ValueError(
-                f"{name}: shape {stream.shape} given, finite numbers of shape ({len(stamps_ns)}, 7) needed"
-            )
-    gripper = demonstration.gripper
-    if gripper is not None and (gripper.shape != (len(stamps_ns),) or not np.isfinite(gripper).all()):
-        given, wanted = gripper.shape, (len(stamps_ns),)
-        raise ValueError(f"{GRIPPER_STATE}: shape {given} given, finite numbers of shape {wanted} needed")
-    file = McapFile(Path(path), joints=0, attached=False)
-    try:
+    gripper, count = demonstration.gripper, len(stamps_ns)
+    given: list[tuple[str, Vector, tuple[int, ...]]]
+    given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
+    for name, stream, shape in given:
+        if stream.shape != shape or not np.isfinite(stream).all():
+            raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
+    with McapFile(Path(path), joints=0, attached=False) as file:
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
         ):
@@ -59,8 +55,6 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
             file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
-    finally:
-        file.close()
 
 
 def read_demonstration(
@@ -82,7 +76,7 @@ def read_demonstration(
     Raises RecordingError, also for a damaged file: the missing part may lie within a motion. A file
     that was cut ends early. `say` is called with that, and with what was found or assumed.
     """
-    recorded = Recorded.open(path)
+    recorded = Recorded(path)
     settings = settings or recorded.settings or Settings()
     if any(not fault.cut for fault in recorded.faults):
         readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
@@ -183,18 +177,15 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []
-    by_tracker = [is_by_tracker(track.name, track.frame, hands) for track in tracks]
-    if not any(by_tracker):
-        return list(tracks), []
-    turn, out = Rotation.from_matrix(axes), []
-    for track, is_mapped in zip(tracks, by_tracker, strict=True):
-        if is_mapped:
+    turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
+    for i, track in enumerate(tracks):
+        if is_by_tracker(track.name, track.frame, hands):
             at = from_tracker(track.poses[:, :3], hands)
             turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
-            track = track._replace(poses=np.hstack([at, turns]), frame=BASE)  # noqa: PLW2901
-        out.append(track)
-    names = ", ".join(track.name for track, is_mapped in zip(tracks, by_tracker, strict=True) if is_mapped)
-    return out, [f"{names} brought to frame {BASE} by [hands] unit and base_from_tracker"]
+            out[i] = track._replace(poses=np.hstack([at, turns]), frame=BASE)
+            mapped.append(track.name)
+    remark = f"{', '.join(mapped)} brought to frame {BASE} by [hands] unit and base_from_tracker"
+    return out, [remark] if mapped else []
 
 
 def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
@@ -233,44 +224,19 @@ def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
     in the order of writing. Raises RecordingError.
     """
     path = existing(path)
-    streams = PoseStreams(path, _STREAMS[:2])
-    empty = True
+    found: dict[str, str] = {}  # topics by stream, one each
+    seen: set[str] = set()
     with path.open("rb") as stream:
         messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()
-        while found := next_whole(messages, path):
-            name = streams.name(found[0], found[1])
-            if name:
-                empty = False
-                yield found[2].log_time, name.removeprefix("hands/"), found[2].data
-    if empty:
-        raise streams.missing("hands/left or hands/right")
-
-
-class PoseStreams:
-    """Finds the topics of a file that hold the wanted streams; one topic each, in any cell."""
-
-    def __init__(self, path: Path, names: tuple[str, ...], kind: str = POSE.type) -> None:
-        self._path, self._names, self._kind = path, names, kind
-        self._found: dict[str, str] = {}
-        self._seen: set[str] = set()
-
-    def name(self, schema: Any, channel: Any) -> str:
-        """The stream that a message belongs to; empty: none."""
-        topic = channel.topic
-        self._seen.add(topic)
-        name = next((name for name in self._names if f"/{topic}".endswith(f"/{name}")), "")
-        if (
-            not name
-            or schema is None
-            or schema.name.replace("/msg/", "/") != self._kind.replace("/msg/", "/")
-            or channel.message_encoding != "cdr"
-        ):
-            return ""
-        if self._found.setdefault(name, topic) != topic:
-            raise RecordingError(f"{self._path} has two streams of {name}: {self._found[name]} and {topic}")
-        return name
-
-    def missing(self, name: str) -> RecordingError:
-        """The error for a missing stream; it lists the topics."""
-        topics = ", ".join(sorted(self._seen)) or "none"
-        return RecordingError(f"{self._path} has no topic ending in {name} with {self._kind}; its topics: {topics}")
+        while one := next_whole(messages, path):
+            schema, channel, message = one
+            seen.add(topic := channel.topic)
+            name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
+            if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
+                continue
+            if found.setdefault(name, topic) != topic:
+                raise RecordingError(f"{path} has two streams of {name}: {found[name]} and {topic}")
+            yield message.log_time, name.removeprefix("hands/"), message.data
+    if not found:
+        lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
+        raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")

@@ -4,8 +4,10 @@ and which of them are the hands and the tool.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +23,7 @@ from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
 from service.recording.mcap_file import RecordingError, existing
-from service.recording.mcap_reader import FileFault, Messages
+from service.recording.mcap_reader import FileFault, Messages, full_name
 
 SIDES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
@@ -75,8 +77,9 @@ Parts = tuple[list[int], list[int], list[tuple[float, ...]], str]
 class Recorded:
     """The messages of a recording from which poses can be read, by topic."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: str | Path) -> None:
+        """Reads an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
+        self.path = Path(path)
         self.topics: dict[str, str] = {}  # types by topic, of all topics
         self.faults: list[FileFault] = []
         self.settings: Settings | None = None  # those in force when it was recorded, if it is ours
@@ -84,28 +87,21 @@ class Recorded:
         self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
-        self._decode: Callable[[bytes, str], Any]
+        self._is_ros_1 = self.path.suffix == ".bag"
+        if self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
+            self._read_bag()
+        else:
+            self._read_mcap()
 
     @property
     def is_ours(self) -> bool:
         """Whether its settings are attached."""
         return self.settings is not None
 
-    @classmethod
-    def open(cls, path: str | Path) -> Recorded:
-        """The messages of an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
-        path = Path(path)
-        found = cls(path)
-        if path.is_dir() or path.suffix in (".db3", ".bag"):
-            found._read_bag()
-        else:
-            found._read_mcap()
-        return found
-
     def _read_mcap(self) -> None:
         messages = Messages(existing(self.path))
         for schema, channel, message in messages:
-            kind = "" if schema is None else _full(schema.name)
+            kind = full_name(schema)
             self.topics.setdefault(channel.topic, kind)
             if channel.message_encoding == "cdr" and kind in (*KINDS, JOINTS.type):
                 self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
@@ -118,7 +114,6 @@ class Recorded:
             except msgspec.DecodeError as error:
                 raise RecordingError(f"the settings in {self.path} are not understood: {error}") from None
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
-        self._decode = _decoder("ROS2_HUMBLE", "deserialize_cdr")
 
     def _decoded_places(self, data: bytes) -> tuple[ViaPoint, ...]:
         try:
@@ -132,9 +127,8 @@ class Recorded:
 
         if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
-        is_ros_1 = self.path.suffix == ".bag"
         try:
-            with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
+            with (Ros1Reader if self._is_ros_1 else Ros2Reader)(self.path) as bag:
                 self.topics = {one.topic: one.msgtype for one in bag.connections}
                 wanted = [one for one in bag.connections if one.msgtype in (*KINDS, JOINTS.type)]
                 for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
@@ -142,9 +136,11 @@ class Recorded:
         except Exception as error:  # the exceptions of its storages have no common base
             there = "" if self.path.exists() else " It is not there."
             raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{there}") from None
-        self._decode = (
-            _decoder("ROS1_NOETIC", "deserialize_ros1") if is_ros_1 else _decoder("ROS2_HUMBLE", "deserialize_cdr")
-        )
+
+    def _decoded(self, data: bytes, kind: str) -> Any:
+        if self._is_ros_1:
+            return _typestore("ROS1_NOETIC").deserialize_ros1(data, kind)
+        return cdr.decode_pose(data) if kind == POSE.type else _typestore("ROS2_HUMBLE").deserialize_cdr(data, kind)
 
     def tracks(self, topic: str) -> dict[str, Parts]:
         """The streams of poses in a topic by part: stamps, times of recording [ns], poses, frame.
@@ -157,7 +153,7 @@ class Recorded:
         out = self._read[topic] = dict[str, Parts]()
         for logged_ns, data in self._raw.get(topic, ()):
             try:
-                parts = _poses(kind, self._decode(data, kind))
+                parts = _poses(kind, self._decoded(data, kind))
             except Exception as error:  # the deserialiser raises exceptions of many kinds
                 raise RecordingError(f"{self.path}: {topic}: a {kind} that is not readable: {error}") from None
             for part, stamp_ns, frame, pose in parts:
@@ -182,15 +178,7 @@ class Recorded:
 
     def tool_by_joints(self, topic: str, settings: Settings, urdf: str) -> Track:
         """The tool in frame `base`, found from joint states by the URDF. Raises RecordingError."""
-        stamps, logged, joints = [], [], []
-        for logged_ns, data in self._raw[topic]:
-            try:
-                state = self._joint_state(data)
-                joints.append(in_order(state, settings.joints.names)[0])
-            except WireError as error:
-                raise RecordingError(f"{self.path}: {topic}: {error}") from None
-            stamps.append(state.stamp_ns or logged_ns)
-            logged.append(logged_ns)
+        logged, stamps, joints = zip(*self._joint_states(topic, settings.joints.names), strict=True)
         poses, kept = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
         source = f"{topic}, by the URDF"
         return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
@@ -205,14 +193,10 @@ class Recorded:
         if len(topics) > 1:
             raise RecordingError(f"{self.path}: topics {', '.join(sorted(topics))}: one gripper needed")
         closure_at: dict[int, float] = {}
-        for logged_ns, data in self._raw[topics[0]] if topics else ():
-            try:
-                state = self._joint_state(data)
-            except WireError as error:
-                raise RecordingError(f"{self.path}: {topics[0]}: {error}") from None
-            if not np.isfinite(state.position[:1]).all() or not state.position:
-                raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {state.stamp_ns} ns")
-            closure_at[logged_ns if logged else state.stamp_ns or logged_ns] = state.position[0]
+        for logged_ns, stamp_ns, position in self._joint_states(topics[0]) if topics else ():
+            if not np.isfinite(position[:1]).all() or not position:
+                raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {stamp_ns} ns")
+            closure_at[logged_ns if logged else stamp_ns] = position[0]
         if not closure_at:
             return None
         at = np.array(sorted(closure_at), np.int64)
@@ -221,22 +205,28 @@ class Recorded:
         out.setflags(write=False)
         return out
 
-    def _joint_state(self, data: bytes) -> Any:
-        """Raises WireError."""
-        if self.path.suffix != ".bag":
-            return cdr.decode_joints(data)
-        raise WireError("joint states of ROS 1 are not read; a bag of ROS 2 needed, or --tool with poses")
+    def _joint_states(self, topic: str, names: tuple[str, ...] = ()) -> Iterator[tuple[int, int, tuple[float, ...]]]:
+        """Time of recording, stamp [ns], and position of each joint state, of the joints named if
+        there are names. Raises RecordingError.
+        """
+        for logged_ns, data in self._raw[topic]:
+            try:
+                if self._is_ros_1:
+                    raise WireError("joint states of ROS 1 are not read; a bag of ROS 2 needed, or --tool with poses")
+                state = cdr.decode_joints(data)
+                position = in_order(state, names)[0] if names else state.position
+            except WireError as error:
+                raise RecordingError(f"{self.path}: {topic}: {error}") from None
+            yield logged_ns, state.stamp_ns or logged_ns, position
 
     def joint_topic(self, settings: Settings) -> str:
         """The one topic with joint states of the arm's joints; empty: none, or several."""
         found = []
-        for topic, raw in self._raw.items():
+        for topic in self._raw:
             if self.topics[topic] == JOINTS.type:
-                try:
-                    in_order(self._joint_state(raw[0][1]), settings.joints.names)
-                except WireError:
-                    continue
-                found.append(topic)
+                with contextlib.suppress(RecordingError):
+                    next(self._joint_states(topic, settings.joints.names))
+                    found.append(topic)
         exact = [topic for topic in found if f"/{topic}".endswith(f"/{JOINT_STATES}")]
         return exact[0] if len(exact) == 1 else found[0] if len(found) == 1 else ""
 
@@ -333,25 +323,11 @@ def _poses_in(recorded: Recorded) -> str:
     return f"its topics: {', '.join(sorted(recorded.topics)) or 'none'}; of these hold poses: {poses or 'none'}"
 
 
-def _full(kind: str) -> str:
-    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`."""
-    return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
+@functools.cache
+def _typestore(name: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore  # takes a moment, and few recordings need it
 
-
-def _decoder(store: str, function: str) -> Callable[[bytes, str], Any]:
-    """A decoder of messages, whose library is loaded at the first message that needs it."""
-    made: list[Callable[[bytes, str], Any]] = []
-
-    def decode(data: bytes, kind: str) -> Any:
-        if kind == POSE.type and function == "deserialize_cdr":
-            return cdr.decode_pose(data)
-        if not made:
-            from rosbags.typesys import Stores, get_typestore  # takes a moment
-
-            made.append(getattr(get_typestore(Stores[store]), function))
-        return made[0](data, kind)
-
-    return decode
+    return get_typestore(Stores[name])
 
 
 def _poses(kind: str, message: Any) -> Iterator[tuple[str, int, str, tuple[float, ...]]]:

@@ -6,9 +6,10 @@ import contextlib
 import functools
 import os
 import platform
+from collections.abc import Iterator
 from importlib import metadata as packages
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from mcap.writer import MCAP0_MAGIC, IndexType, Writer
@@ -17,6 +18,8 @@ from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 from service.core.frame import definitions
 
+_MEDIA = {".json": "application/json", ".urdf": "application/xml"}
+_BYTES = "application/octet-stream"
 CHUNK_BYTES = 128 * 1024  # a kill loses at most this between two flushes; a reader holds at most this
 
 
@@ -54,7 +57,7 @@ class _WholeWrites:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         self._size = 0
         self.closed = False
 
@@ -62,10 +65,10 @@ class _WholeWrites:
         rest = memoryview(data)
         try:
             while rest:
-                rest = rest[os.write(self._fd, rest) :]
+                rest = rest[os.write(self.descriptor, rest) :]
         except OSError:
             with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, self._size)
+                os.ftruncate(self.descriptor, self._size)
             raise
         self._size += len(data)
         return len(data)
@@ -76,15 +79,10 @@ class _WholeWrites:
     def flush(self) -> None:
         """Does nothing: all data is written already."""
 
-    def links(self) -> tuple[int, tuple[int, int]]:
-        """The number of names of the file, and its device and inode."""
-        found = os.fstat(self._fd)
-        return found.st_nlink, (found.st_dev, found.st_ino)
-
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            os.close(self._fd)
+            os.close(self.descriptor)
 
 
 class McapFile:
@@ -106,7 +104,7 @@ class McapFile:
         kinds = IndexType.ALL if attached else IndexType.CHUNK | IndexType.MESSAGE
         self.writer = Writer(self._stream, chunk_size=1 << 62, index_types=kinds, enable_data_crcs=True)  # type: ignore[arg-type]
         self._definitions = definitions(joints)
-        self._pending = 0  # bytes
+        self._unflushed = 0  # bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         try:
@@ -136,40 +134,62 @@ class McapFile:
             channel = self.writer.register_channel(topic, "cdr", self._schemas[kind], {"offered_qos_profiles": qos})
             self._channels[topic] = channel
         self.writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
-        self._pending += len(data)
+        self._unflushed += len(data)
 
-    def part_ends(self) -> bool:
-        """Lets a chunk end here; whether it did, so that all before is in the file."""
-        if self._pending < CHUNK_BYTES:
-            return False
-        self.flush()
-        return True
+    def attach(self, name: str, data: bytes, time_ns: int) -> None:
+        """Attaches a file; its name's ending says of which media type."""
+        self.writer.add_attachment(time_ns, time_ns, name, _MEDIA.get(Path(name).suffix, _BYTES), data)
+
+    def part_ends(self) -> None:
+        """Lets a chunk end here."""
+        if self._unflushed >= CHUNK_BYTES:
+            self.flush()
 
     def flush(self) -> None:
         """Ends the chunk in progress: what was written so far survives a kill of the process."""
         self.writer.flush()  # type: ignore[no-untyped-call]
-        self._pending = 0
+        self._unflushed = 0
 
     def lost_name(self) -> str:
         """Empty while the file is at its path; else `removed`, or `moved` to another name."""
-        links, own_file = self._stream.links()
+        own_file = os.fstat(self._stream.descriptor)
         with contextlib.suppress(OSError):
-            found = os.stat(self.path)
-            if (found.st_dev, found.st_ino) == own_file:
+            if os.path.samestat(self.path.stat(), own_file):
                 return ""
-        return "moved" if links else "removed"
+        return "moved" if own_file.st_nlink else "removed"
 
     def close(self) -> None:
-        """Ends the file; it is closed even if its end cannot be written."""
-        if not self._stream.closed:
+        """Ends the file; it is closed even if that fails. A second call does nothing."""
+        if not self.closed:
             try:
+                self.flush()
                 self.writer.finish()  # type: ignore[no-untyped-call]
             finally:
-                self._stream.close()
+                self.abandon()
 
     def abandon(self) -> None:
-        """Closes the file as it is, without a summary."""
+        """Closes the file as it is, without what is not flushed, and without a summary."""
         self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def whole_file(path: Path, *, joints: int) -> Iterator[McapFile]:
+    """An MCAP file that is at `path` once it is complete, and before that beside it."""
+    part = path.with_name(f".{path.name}.part")
+    file = McapFile(part, joints=joints)
+    try:
+        yield file
+        file.close()
+        part.replace(path)
+    finally:
+        file.abandon()
+        part.unlink(missing_ok=True)
 
 
 def existing(path: str | Path) -> Path:

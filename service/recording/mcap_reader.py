@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -22,24 +25,14 @@ from service.recording.mcap_file import RecordingError
 Found = tuple[Schema | None, Channel, Message]
 _HEAD = struct.Struct("<BQ")  # opcode, bytes that follow
 _FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
-_COMPRESSIONS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4"))
+_COMPRESSION = re.compile(b"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _BEFORE_COMPRESSION = _HEAD.size + 28  # bytes of a chunk
 _BLOCK = 1 << 20
 _NAMING = {
     int(kind): record
     for kind, record in ((Opcode.SCHEMA, Schema), (Opcode.CHANNEL, Channel), (Opcode.METADATA, Metadata))
 }
-_BROKEN = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    UnicodeDecodeError,
-    ValueError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    MemoryError,
-)
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, LookupError, OverflowError, MemoryError)
 
 
 class FileFault(NamedTuple):
@@ -75,9 +68,10 @@ class Messages:
     def __iter__(self) -> Iterator[Found]:
         with self.path.open("rb") as stream:
             reading = _Reading(stream, self.faults)
-            schemas, channels = reading.named_in_summary()
+            schemas: dict[int, Schema] = {}
+            channels: dict[int, Channel] = {}
             unnamed = False
-            for record in reading.records():
+            for record in itertools.chain(reading.named_in_summary(), reading.records()):
                 if isinstance(record, Message):
                     channel = channels.get(record.channel_id)
                     if channel is not None:
@@ -110,24 +104,16 @@ class _Reading:
         self._footer = self._bytes(self._footer_at, _FOOTER.size) if self._footer_at > 0 else b""
         self._closed = self._closed and self._footer[:9] == _HEAD.pack(Opcode.FOOTER, _FOOTER.size - _HEAD.size)
 
-    def named_in_summary(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+    def named_in_summary(self) -> Iterator[McapRecord]:
         """The schemas and channels that the file's end repeats, if it has one that is whole: so the
         chunk that held them first may be damaged.
         """
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        if self._closed and (at := self._summary()):
-            while at < self._footer_at:
-                opcode, length = _HEAD.unpack(self._bytes(at, _HEAD.size))
-                content = ReadDataStream(BytesIO(self._bytes(at + _HEAD.size, length)))
-                if opcode == Opcode.SCHEMA:
-                    schema = Schema.read(content)
-                    schemas[schema.id] = schema
-                elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(content)
-                    channels[channel.id] = channel
-                at += _HEAD.size + length
-        return schemas, channels
+        at = self._summary() if self._closed else 0
+        while 0 < at < self._footer_at:
+            opcode, end = self._head(at)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._parsed(opcode, self._content(at, end))
+            at = end
 
     def _summary(self) -> int:
         """The first byte of the summary if its checksum is right, else 0."""
@@ -144,7 +130,7 @@ class _Reading:
             end = None
             try:
                 opcode, end = self._head(at)
-                content = self._bytes(at + _HEAD.size, end - at - _HEAD.size)
+                content = self._content(at, end)
                 found = self._parsed(opcode, content)
             except _BROKEN as error:
                 self._checksum = None
@@ -181,7 +167,7 @@ class _Reading:
         if opcode == Opcode.CHUNK:
             self._chunked = True
             return breakup_chunk(Chunk.read(stream), validate_crc=True)
-        if content[28:].startswith(_COMPRESSIONS):
+        if _COMPRESSION.match(content, 28):
             raise ValueError(f"a chunk by its content, of type {opcode} by its head")
         if opcode == Opcode.MESSAGE:
             if self._chunked:
@@ -207,38 +193,25 @@ class _Reading:
         there, else the next whole chunk; None where there is none.
         """
         if end is not None:
-            try:
+            with contextlib.suppress(ValueError):
                 self._head(end)
                 return end
-            except ValueError:
-                pass
-        return self._next_chunk(at + 1)
-
-    def _next_chunk(self, start: int) -> int | None:
-        """The first byte of the next whole chunk; None where there is none."""
-        block_at = start
-        while block_at < self._size:
+        for block_at in range(at + 1, self._size, _BLOCK):
             block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)
-            offsets = sorted(offset for mark in _COMPRESSIONS for offset in _offsets(block, mark))
-            for offset in offsets:
-                at = block_at + offset - _BEFORE_COMPRESSION
-                if at >= start and self._is_chunk(at):
-                    return at
-            block_at += _BLOCK
+            for mark in _COMPRESSION.finditer(block):
+                chunk_at = block_at + mark.start() - _BEFORE_COMPRESSION
+                if chunk_at > at and self._is_chunk(chunk_at):
+                    return chunk_at
         return None
 
     def _is_chunk(self, at: int) -> bool:
         try:
             opcode, end = self._head(at)
-            if opcode != Opcode.CHUNK:
-                return False
-            breakup_chunk(
-                Chunk.read(ReadDataStream(BytesIO(self._bytes(at + _HEAD.size, end - at - _HEAD.size)))),
-                validate_crc=True,
-            )
+            if opcode == Opcode.CHUNK:
+                breakup_chunk(Chunk.read(ReadDataStream(BytesIO(self._content(at, end)))), validate_crc=True)
         except _BROKEN:
             return False
-        return True
+        return opcode == Opcode.CHUNK
 
     def _end(self, at: int) -> None:
         """Verifies what follows the data section."""
@@ -251,16 +224,18 @@ class _Reading:
             why = "the closing bytes are not those of MCAP" if whole else "nothing closes the file"
             self._faults.append(FileFault(not whole, at, self._size - at, why))
 
+    def _content(self, at: int, end: int) -> bytes:
+        return self._bytes(at + _HEAD.size, end - at - _HEAD.size)
+
     def _bytes(self, at: int, count: int) -> bytes:
         self._stream.seek(at)
         return self._stream.read(count)
 
 
-def _offsets(block: bytes, mark: bytes) -> Iterator[int]:
-    at = block.find(mark)
-    while at >= 0:
-        yield at
-        at = block.find(mark, at + 1)
+def full_name(schema: Schema | None) -> str:
+    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`; empty without a schema."""
+    kind = "" if schema is None else schema.name
+    return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
 
 
 def next_whole(messages: Iterator[Found], path: Path) -> Found | None:

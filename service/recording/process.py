@@ -31,7 +31,7 @@ from service import child
 from service.config import urdf_path
 from service.core.frame import state_layout
 from service.recording.paths import RecordingPaths
-from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, unpack, unpack_note
+from service.recording.protocol import LARGEST_MESSAGE, Note, ScribeReport, ScribeSetup, unpack
 from service.recording.segments import Segments
 
 if TYPE_CHECKING:
@@ -166,27 +166,23 @@ class ScribeProcess:
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
         """Writes and draws one message."""
-        if (note := unpack_note(message)) is not None:
-            key, text, time_ns = note
-            self._segments.note(key, text, time_ns)
-            if key != "status" and self._drawing is not None:
-                viewer = self._drawing.viewer
-                self._drawing.put(lambda: viewer.note(key, text, time_ns))
+        received, drawing = unpack(message, skills, joints=self._joints), self._drawing
+        if isinstance(received, Note):
+            key, text, noted_ns = received.key, received.text, received.time_ns
+            self._segments.note(key, text, noted_ns)
+            if key != "status" and drawing is not None:
+                drawing.put(lambda: drawing.viewer.note(key, text, noted_ns))
             return
-        received = unpack(message, skills, joints=self._joints)
-        time_ns = int(received.timing["time_ns"])
-        if missing := self._segments.write(received):
-            self._show(f"{missing} ticks before tick {received.tick.index} are not recorded", "WARN", time_ns)
-        if self._drawing is not None:
-            viewer, events = self._drawing.viewer, [(event.kind, event.payload) for event in received.tick.inbox]
-            if (skill := received.skill) is not None:
-                self._drawing.put(lambda: viewer.learn(skill))
-            self._drawing.put(lambda: viewer.add(received.frame, time_ns, received.timing, events))
-
-    def _show(self, text: str, level: str, time_ns: int) -> None:
-        if self._drawing is not None:
-            viewer = self._drawing.viewer
-            self._drawing.put(lambda: viewer.log(text, level, time_ns))
+        missing, time_ns = self._segments.write(received), int(received.timing["time_ns"])
+        if drawing is None:
+            return
+        if missing:
+            gap = f"{missing} ticks before tick {received.tick.index} are not recorded"
+            drawing.put(lambda: drawing.viewer.log(gap, "WARN", time_ns))
+        if (skill := received.skill) is not None:
+            drawing.put(lambda: drawing.viewer.learn(skill))
+        events = [(event.kind, event.payload) for event in received.tick.inbox]
+        drawing.put(lambda: drawing.viewer.add(received.frame, time_ns, received.timing, events))
 
     def flush(self) -> None:
         """Hands what was recorded to the operating system, and reports it."""

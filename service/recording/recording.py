@@ -13,8 +13,7 @@ import shlex
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 from mcap.exceptions import McapError
@@ -22,7 +21,7 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, Quaternion, SceneObject, Transform, Vector3
+from service.contract.messages import BASE, SceneObject, Transform
 from service.contract.records import SIDES
 from service.core.frame import Record, Tick, encode
 from service.core.outputs import Outputs
@@ -42,11 +41,8 @@ _LATCHED = (
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-class Recorder:
-    """Writes a recording.
-
-    Errors of the file system are raised; `flush` bounds what a kill can lose.
-    """
+class Recorder(McapFile):
+    """A recording that is being written; `flush` bounds what a kill can lose."""
 
     def __init__(
         self,
@@ -60,39 +56,23 @@ class Recorder:
         time_ns: int = 0,
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
-        self._settings, self._skill, self._state = settings, skill, state
+        self._settings, self.skill, self._state = settings, skill, state  # the skill in force, a file
         self._begun, self._sequence = False, 0
         self._links = Urdf(self._urdf)
         self._topics = {
             channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
         }
-        self._file = McapFile(Path(path), joints=len(settings.joints.names))
-        self.path = self._file.path
+        super().__init__(Path(path), joints=len(settings.joints.names))
         about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
         self.kept = self.pending = 0  # ticks in the file, ticks that wait for the end of their chunk
-        writer = self._file.writer
         try:
-            writer.add_metadata("thirdhand", about)
-            writer.add_attachment(time_ns, time_ns, "settings.json", "application/json", msgspec.json.encode(settings))
-            writer.add_attachment(time_ns, time_ns, "skill.npz", "application/octet-stream", skill)
-            writer.add_attachment(time_ns, time_ns, "arm.urdf", "application/xml", self._urdf.encode())
+            self.writer.add_metadata("thirdhand", about)
+            self.attach("settings.json", msgspec.json.encode(settings), time_ns)
+            self.attach("skill.npz", skill, time_ns)
+            self.attach("arm.urdf", self._urdf.encode(), time_ns)
         except OSError:
-            self._file.abandon()
+            self.abandon()
             raise
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file."""
-        return self._file.size
-
-    @property
-    def skill(self) -> bytes:
-        """The file of the skill in force."""
-        return self._skill
-
-    def lost_name(self) -> str:
-        """Empty while the file is at its path; else `removed` or `moved`."""
-        return self._file.lost_name()
 
     def _begin(self, time_ns: int) -> None:
         """Writes the robot's description and the initial state, timed as the first message."""
@@ -103,9 +83,7 @@ class Recorder:
 
     def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
         """Writes one message on a channel, in the type in which its events are kept."""
-        channel = channels.BY_KEY[key]
-        kind = channel.kept_as.type
-        self._file.put(self._topics[key], kind, data, time_ns, self._sequence, qos=qos)
+        self.put(self._topics[key], channels.BY_KEY[key].kept_as.type, data, time_ns, self._sequence, qos=qos)
 
     def write(
         self,
@@ -132,7 +110,7 @@ class Recorder:
         put("tick", cdr.encode_tick(tick.index, kinds, lost), time_ns)
         for event in tick.inbox:
             if event.kind == "skill":
-                self._skill = event.payload
+                self.skill = event.payload
                 put("skill", cdr.encode_skill(event.payload), time_ns)
             else:
                 put(event.kind, event.payload, time_ns)
@@ -141,18 +119,14 @@ class Recorder:
             put("timing", encode(timing), time_ns)
         if state is not None:
             put("state", encode(state), time_ns)
-        if skill is not None and skill != self._skill:
-            self._skill = skill
+        if skill is not None and skill != self.skill:
+            self.skill = skill
             put("skill_in_force", cdr.encode_skill(skill), time_ns)
         for key, payload in outputs:
             put(key, payload, time_ns)
         if tick.index % channels.BY_KEY["/tf"].every == 0:
             put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
-        if self._file.part_ends():
-            self._keep()
-
-    def _keep(self) -> None:
-        self.kept, self.pending = self.kept + self.pending, 0
+        self.part_ends()
 
     def _transforms(self, frame: Record) -> list[Transform]:
         """Transforms for viewers: the arm's links, tool, setpoint, target and hands."""
@@ -161,12 +135,15 @@ class Recorder:
         found = self._links.transforms(joints)
         offset = settings.tool.plate_from_tool
         found.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
-        found.append(Transform(BASE, "setpoint", _point(frame["setpoint"]), _quaternion(frame["setpoint_orientation"])))
+        setpoint, turn, target, target_turn = (
+            tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
+        )
+        found.append(Transform(BASE, "setpoint", setpoint, turn))
         for side, name in enumerate(SIDES):
             if frame["hand_ages"][side] >= 0:
-                found.append(Transform(BASE, f"{name}_hand", _point(frame["hands"][side]), _UPRIGHT))
+                found.append(Transform(BASE, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
         if frame["covariance"].any():  # without both hands nothing is predicted
-            found.append(Transform(BASE, "target", _point(frame["target"]), _quaternion(frame["orientation"])))
+            found.append(Transform(BASE, "target", target, target_turn))
         return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
@@ -181,47 +158,17 @@ class Recorder:
             objects = msgspec.json.decode(text, type=tuple[SceneObject, ...])
             return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, objects), time_ns)
         topic = channels.topic(self._settings.cell, key)
-        self._file.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
+        self.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
         return None
 
     def flush(self) -> None:
-        """Ends the chunk in progress: what was written so far survives a kill of the process."""
-        self._file.flush()
-        self._keep()
+        super().flush()
+        self.kept, self.pending = self.kept + self.pending, 0
 
     def close(self) -> None:
-        """Ends the file; it is closed even if that fails. A second call does nothing."""
-        if self._file.closed:
-            return
-        if not self._begun and self._state is not None:
+        if not self.closed and not self._begun and self._state is not None:
             self._begin(0)
-        try:
-            self.flush()
-            self._file.close()
-        finally:
-            self._file.abandon()
-
-    def abandon(self) -> None:
-        """Closes the file as it is, without what is pending."""
-        self._file.abandon()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-def _point(position: Any) -> Vector3:
-    x, y, z = position.tolist()
-    return x, y, z
-
-
-def _quaternion(orientation: Any) -> Quaternion:
-    x, y, z, w = orientation.tolist()
-    return x, y, z, w
+        super().close()
 
 
 def _take_hint(path: Path) -> str:

@@ -135,9 +135,7 @@ class Scribe:
         if target is None or self._pause:
             self._pause = max(0, self._pause - 1)
             if self._wanted:
-                self._gap += 1
-                self._lost += 1
-                self._send_all = True
+                self.skip()
             return
         send_all = self._send_all
         self._since_state += 1
@@ -154,9 +152,7 @@ class Scribe:
             else:
                 target.send(message)
         except OSError:
-            self._gap += 1
-            self._lost += 1
-            self._send_all = True
+            self.skip()
             self._pause = self._settings.rate_hz // 10  # one gap rather than many
             return
         self._sent += 1
@@ -198,20 +194,17 @@ class Scribe:
                 self._errors.append(f"the scribe was silent for {patience_s:g} s and is replaced")
                 process.kill()
             return
+        if self._socket is not None:
+            self._errors.append(f"the scribe ended with code {process.returncode}")
+            self._socket = None
         if now - self._started >= self._restart_s:
             self._bury()
             self._child.socket.close()
             self._restarts += 1
             self._child = self._spawn(None, None)
-        elif self._socket is not None:
-            self._errors.append(f"the scribe ended with code {process.returncode}")
-            self._socket = None
 
     def _bury(self) -> None:
         """Counts the ticks that were sent to a dead process and are not on disk."""
-        if self._child is not None and self._socket is not None:
-            self._errors.append(f"the scribe ended with code {self._child.process.returncode}")
-        self._socket = None
         self._listen(timeout_s=0.0)
         self._socket, last = None, self._report
         unreported = max(0, self._sent - self._sent_before - last.kept - last.lost)

@@ -29,10 +29,10 @@ class Step(NamedTuple):
     """
 
     tick: int
-    events: tuple[tuple[str, bytes], ...]
-    frame: Record | None
-    timing: Record | None
-    state: Record | None
+    events: tuple[tuple[str, bytes], ...] = ()
+    frame: Record | None = None
+    timing: Record | None = None
+    state: Record | None = None
     skill: bytes | None = None
     lost: int = 0
     time_ns: int = 0
@@ -70,8 +70,17 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
 
     def finished() -> Iterator[Step]:
         """The step in progress, unless its rest is damaged or cut."""
-        if step is not None and (len(messages.faults) == seen or _is_whole(step, outputs=outputs)):
-            yield _finished(step, outputs=outputs)
+        if step is None:
+            return
+        numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
+        lacks_frame = outputs and "frame" not in step
+        if len(messages.faults) > seen and (len(came) != len(numbers) or lacks_frame):
+            return
+        kinds = [_kind(number) for number in numbers]
+        if came != kinds or lacks_frame:
+            frame = "a" if "frame" in step else "no"
+            raise WireError(f"tick {step['tick']} lists {kinds}; {came} and {frame} frame follow")
+        yield Step(**step | {"events": tuple(step["events"])})
 
     try:
         for _, channel, message in messages:
@@ -91,7 +100,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
             elif step is None:
                 if name == "state":
                     alone = decode(data, layouts["state"])
-                    yield Step(int(alone["tick"]), (), None, None, alone, damage=damage)
+                    yield Step(int(alone["tick"]), state=alone, damage=damage)
                     damage = ""
             elif name in _RECORDS:
                 step[name] = decode(data, layouts[name])
@@ -102,31 +111,6 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
         yield from finished()
     except WireError as error:
         raise RecordingError(f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
-
-
-def _is_whole(step: dict[str, Any], *, outputs: bool) -> bool:
-    return len(step["events"]) == len(step["kinds"]) and ("frame" in step or not outputs)
-
-
-def _finished(step: dict[str, Any], *, outputs: bool) -> Step:
-    kinds, events = [_kind(number) for number in step["kinds"]], step["events"]
-    if [kind for kind, _ in events] != kinds or (outputs and "frame" not in step):
-        raise WireError(
-            f"tick {step['tick']} lists {kinds}; "
-            f"{[kind for kind, _ in events]} and {'a' if 'frame' in step else 'no'} frame follow"
-        )
-    timing, state, skill = (step.get(name) for name in ("timing", "state", "skill"))
-    return Step(
-        step["tick"],
-        tuple(events),
-        step.get("frame"),
-        timing,
-        state,
-        skill,
-        step["lost"],
-        step["time_ns"],
-        step["damage"],
-    )
 
 
 def _kind(number: int) -> str:

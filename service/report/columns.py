@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -122,7 +122,9 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             block.clear()
             progress(BLOCK * len(blocks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
-    found.statuses = list(_statuses(recording))
+    for _, text, _ in recording.notes("status"):
+        with contextlib.suppress(msgspec.DecodeError):  # of another version
+            found.statuses.append(msgspec.json.decode(text, type=Said))
     found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
     if found.skills and len(found.frames):
         found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
@@ -149,15 +151,6 @@ def _take_skill(found: Columns, file: bytes, tick: int) -> None:
         return
     if not found.skills or skill.digest != found.skills[-1].skill.digest:
         found.skills.append(InForce(tick, skill))
-
-
-def _statuses(recording: Recording) -> Iterator[Said]:
-    """What the statuses said, in order; those of another version that are not understood are left
-    out.
-    """
-    for _, text, _ in recording.notes("status"):
-        with contextlib.suppress(msgspec.DecodeError):
-            yield msgspec.json.decode(text, type=Said)
 
 
 def runs(values: NDArray[Any]) -> list[tuple[int, int]]:

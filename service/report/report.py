@@ -5,7 +5,6 @@ near to people, how well places were met, and which limits were touched.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from service.core.frame import Vector
 from service.recording.recording import Recording
 from service.report.causes import before, why
 from service.report.columns import Columns, read, runs
-from service.report.visits import Place, places
+from service.report.visits import places
 
 SHARES = (50, 99, 100)
 
@@ -112,29 +111,35 @@ class Figure(NamedTuple):
     digits: int
 
 
-@dataclass(frozen=True, eq=False)
 class Report:
     """What one recording tells. `columns` is what it is made of."""
 
-    path: Path
-    columns: Columns
-    begins: str  # the system clock's time of its first tick
-    skill: str
-    lasts_s: float
-    lacks: tuple[str, ...]  # gaps, damage, a cut, what is not understood
-    spans: tuple[Span, ...]
-    rate_hz: float
-    missed: int
-    lateness_us: Percentiles | None
-    work_us: Percentiles | None
-    latency_ms: Percentiles | None
-    lag_mm: Percentiles | None  # from the tool to its target, while it follows
-    approach: Approach | None
-    places: tuple[Place, ...]
-    limits: tuple[Limit, ...]
-    joints: tuple[Joint, ...]
-    rejections: tuple[Rejection, ...]
-    hands_hz: dict[str, float]
+    def __init__(self, columns: Columns) -> None:
+        recording, frames, timing = columns.recording, columns.frames, columns.timing
+        following = frames[frames["mode"] == Mode.FOLLOW]
+        sent = frames[frames["commanded"] > 0]
+        passed_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9 if len(timing) > 1 else 0.0
+        lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
+        begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        self.path, self.columns = recording.path, columns
+        self.begins = begins if len(frames) else "never: it holds no tick"  # by the system clock
+        self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
+        self.lasts_s = lasts_s
+        self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, what is not understood
+        self.spans = tuple(_spans(columns))
+        self.rate_hz = (len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0
+        self.missed = int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0
+        self.lateness_us = Percentiles.of(timing["lateness_us"])
+        self.work_us = Percentiles.of(timing["work_us"])
+        self.latency_ms = Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0)
+        lag_mm = 1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)
+        self.lag_mm = Percentiles.of(lag_mm)  # from the tool to its target, while it follows
+        self.approach = _approach(columns, self.spans)
+        self.places = tuple(places(columns))
+        self.limits = tuple(_limits(columns))
+        self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
+        self.rejections = tuple(_rejections(columns))
+        self.hands_hz = {side: columns.samples[f"hands/{side}"] / lasts_s if lasts_s else 0.0 for side in SIDES}
 
     @property
     def faults(self) -> tuple[Span, ...]:
@@ -182,40 +187,7 @@ class Report:
 
 def reported(path: str | Path, *, progress: Callable[[int], None] = lambda ticks: None) -> Report:
     """What the recording in a file tells. Raises RecordingError."""
-    recording = Recording.open(path)
-    return report(read(recording, progress=progress))
-
-
-def report(columns: Columns) -> Report:
-    """What these columns tell."""
-    recording, frames, timing = columns.recording, columns.frames, columns.timing
-    spans = tuple(_spans(columns))
-    begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    following = frames[frames["mode"] == Mode.FOLLOW]
-    sent = frames[frames["commanded"] > 0]
-    passed_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9 if len(timing) > 1 else 0.0
-    lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
-    return Report(
-        path=recording.path,
-        columns=columns,
-        begins=begins if len(frames) else "never: it holds no tick",
-        skill=columns.skills[-1].skill.name if columns.skills else "not understood",
-        lasts_s=lasts_s,
-        lacks=(*columns.gaps, *columns.remarks),
-        spans=spans,
-        rate_hz=(len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0,
-        missed=int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0,
-        lateness_us=Percentiles.of(timing["lateness_us"]),
-        work_us=Percentiles.of(timing["work_us"]),
-        latency_ms=Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0),
-        lag_mm=Percentiles.of(1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)),
-        approach=_approach(columns, spans),
-        places=tuple(places(columns)),
-        limits=tuple(_limits(columns)),
-        joints=tuple(_joints(columns, sent)) if len(sent) else (),
-        rejections=tuple(_rejections(columns)),
-        hands_hz={side: columns.samples[f"hands/{side}"] / lasts_s if lasts_s else 0.0 for side in SIDES},
-    )
+    return Report(read(Recording.open(path), progress=progress))
 
 
 def _spans(columns: Columns) -> Iterator[Span]:
@@ -287,18 +259,14 @@ def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]
     """Names and values of the settings, and of the versions and machine, that two recordings do
     not share.
     """
-    found = []
-    told = [
+    a, b = (
         _flat(msgspec.to_builtins(r.columns.recording.settings), "")
         | {f"made with {name}": value for name, value in r.columns.recording.metadata.items()}
         | {"skill": r.skill}
         for r in (one, other)
-    ]
-    for name in sorted({*told[0], *told[1]}):
-        values = [told[i].get(name, "not told") for i in (0, 1)]
-        if values[0] != values[1]:
-            found.append((name, *values))
-    return found
+    )
+    values = ((name, a.get(name, "not told"), b.get(name, "not told")) for name in sorted({*a, *b}))
+    return [found for found in values if found[1] != found[2]]
 
 
 def _flat(value: Any, path: str) -> dict[str, Any]:

@@ -125,12 +125,13 @@ def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]
 
 def summary(report: Report) -> list[str]:
     """What a report begins with, a line each."""
+    lacks, faults = len(report.lacks), len(report.faults)
     hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
     return [
         f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
-        f"Something is missing in it, {_times_in_words(len(report.lacks))}." if report.lacks else NOTHING_MISSING,
+        f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}." if lacks else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
-        _counted(len(report.faults), "fault"),
+        f"{faults or 'No'} fault{'s' * (faults != 1)}.",
     ]
 
 
@@ -172,14 +173,6 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> str:
         return NONE
     text = f"{other - one:+.{figure.digits}f}"
     return "same" if float(text) == 0.0 else text
-
-
-def _times_in_words(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count or 'No'} {what}{'' if count == 1 else 's'}."
 
 
 def _short(value: object) -> str:

@@ -71,7 +71,7 @@ class DynamicScene:
         self._followed = False
         self._shown: tuple[int, int] | None = None
         self._mode_sent_ns = 0
-        self._scene_at = self._trail_at = -1
+        self._last_tick = -1
         self._start_ns: int | None = None
         self.end_s = 0.0
         self.peaks: dict[str, list[float]] = {}  # of each view of curves, one for each batch
@@ -106,14 +106,11 @@ class DynamicScene:
         seen = frames["hand_ages"] >= 0
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, times, columns)
-        sampled = np.flatnonzero(ticks // self._every != np.concatenate([[self._scene_at], ticks[:-1] // self._every]))
-        self._scene_at = int(ticks[-1]) // self._every
+        before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
+        sampled = np.flatnonzero(ticks // self._every != before // self._every)
         if len(sampled):
             yield from self._scene(batch, frames, sampled, seen, columns)
-        corners = np.flatnonzero(
-            ticks // self._trail_every != np.concatenate([[self._trail_at], ticks[:-1] // self._trail_every])
-        )
-        self._trail_at = int(ticks[-1]) // self._trail_every
+        corners = np.flatnonzero(ticks // self._trail_every != before // self._trail_every)
         if len(corners):
             yield from self._trail(frames, corners, columns)
 
@@ -138,8 +135,9 @@ class DynamicScene:
         near = np.flatnonzero(seen.any(axis=1))
         yield from scalars("/separation/distance", near, frames["hand_distance"])
         yield from scalars("/separation/limit", near, frames["hand_limit"])
-        aimed = np.flatnonzero(seen.all(axis=1))
-        following = seen.all(axis=1) & (frames["mode"] == Mode.FOLLOW)
+        known = seen.all(axis=1)
+        aimed = np.flatnonzero(known)
+        following = known & (frames["mode"] == Mode.FOLLOW)
         off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
         gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
         self._followed = bool(following[-1])
@@ -148,7 +146,6 @@ class DynamicScene:
             "/turn/target", np.flatnonzero(following | gap_starts), self._rotation_error(frames, following), "/turn"
         )
         std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
-        known = seen.all(axis=1)
         yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
         gripping = known & (frames["closure"] >= 0)
         yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")

@@ -9,26 +9,25 @@ from __future__ import annotations
 import contextlib
 import io
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from service import palette
 from service.contract.requests import ViaPoint
+from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
 from service.learning.demonstration import Demonstration, fingerprint
 from service.recording.mcap_file import RecordingError
+from service.viewer.scene_objects import Column, row
 
 MOST_POINTS = 300  # of a line
 MOST_FILES, MOST_FOLDERS = 60, 20
-Points = NDArray[np.float64]
 Point = tuple[float, float, float]
-Column = Callable[..., rr.chunk.Chunk]
 
 
 class MarkedViaPoint(NamedTuple):
@@ -51,7 +50,7 @@ class SkillContents(NamedTuple):
 
     name: str
     learned_from: str
-    reference: Points
+    reference: Vector
     via_points: tuple[MarkedViaPoint, ...]
     threshold: float
     figures: dict[str, Any]
@@ -77,16 +76,7 @@ def skill_contents(skill: bytes) -> SkillContents:
             float(arrays.get("threshold", np.inf)),
             msgspec.json.decode(str(arrays["figures"])) if "figures" in arrays else {},
         )
-    except (
-        OSError,
-        KeyError,
-        TypeError,
-        EOFError,
-        ValueError,
-        zipfile.BadZipFile,
-        msgspec.DecodeError,
-        msgspec.ValidationError,
-    ) as error:
+    except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"a skill of which nothing can be drawn: {error}") from None
 
 
@@ -126,33 +116,24 @@ def skill_chunks(skill: SkillContents, shown: list[Demonstration], at: Column) -
         trajectories = [getattr(one, name)[:, :3] for one in shown]
         lines = [one[:: 1 + len(one) // MOST_POINTS].astype(np.float32) for one in trajectories]
         style = {"colors": [palette.faint(colour, 0.22)] * len(lines), "radii": [0.001] * len(lines)}
-        yield at(f"/skill/demonstrations/{name}", *_one(rr.LineStrips3D, len(lines), strips=lines, **style))
+        yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
     count = len(skill.reference)
     style = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}
-    yield at("/skill/reference", *_one(rr.Points3D, count, positions=skill.reference, **style))
+    yield at("/skill/reference", *row(rr.Points3D, count, positions=skill.reference, **style))
     points, count = skill.via_points, len(skill.via_points)
     style = {"colors": [palette.PLACE] * count, "radii": [0.01] * count, "labels": [point.name for point in points]}
-    yield at("/skill/places/tool", *_one(rr.Points3D, count, positions=[point.tool for point in points], **style))
+    yield at("/skill/places/tool", *row(rr.Points3D, count, positions=[point.tool for point in points], **style))
     for side, colour in (("left", palette.LEFT), ("right", palette.RIGHT)):
         centres = [getattr(point, side) for point in points]
         half = [[max(point.radius, 0.004)] * 3 for point in points]
         style = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
         style |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
-        yield at(f"/skill/places/{side}", *_one(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style))
+        yield at(f"/skill/places/{side}", *row(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style))
     lines = [[point.left, point.tool, point.right] for point in points]
     style = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
-    yield at("/skill/places/belong", *_one(rr.LineStrips3D, count, strips=lines, **style))
+    yield at("/skill/places/belong", *row(rr.LineStrips3D, count, strips=lines, **style))
     text = about(skill, len(shown))
     yield at("/about/skill", *rr.TextDocument.columns(text=[text], media_type=["text/markdown"]))
-
-
-def _one(kind: Any, count: int, **columns: Any) -> Any:
-    """Columns of one row with `count` elements; 0 removes those that were shown."""
-    if not count:
-        key = next(iter(columns))
-        flat = kind.columns(**{key: np.empty((0, 2, 3) if key == "strips" else (0, 3))})
-        return flat.partition([0])
-    return kind.columns(**columns).partition([count])
 
 
 def about(skill: SkillContents, shown: int) -> str:

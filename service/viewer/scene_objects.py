@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+import numpy as np
 import rerun as rr
 
 from service import palette
@@ -33,21 +34,25 @@ def object_chunks(objects: Iterable[SceneObject], before: Iterable[str], at: Col
         yield at(path, *rr.CoordinateFrame.columns(frame=[frame]))
         if found.shape == "cylinder":
             radius = (found.size[0] + found.size[1]) / 4
-            yield at(path, *_row(rr.Cylinders3D, lengths=[found.size[2]], radii=[radius], **pose, **style))
+            yield at(path, *row(rr.Cylinders3D, 1, lengths=[found.size[2]], radii=[radius], **pose, **style))
         else:
             kind = rr.Boxes3D if found.shape == "box" else rr.Ellipsoids3D
-            yield at(path, *_row(kind, half_sizes=half, **pose, **style))
+            yield at(path, *row(kind, 1, half_sizes=half, **pose, **style))
         x, y, z = found.position
         label_at = (x, y, z + (LABEL_OFFSET_M if found.frame_id == BASE else -LABEL_OFFSET_M))
         label = {"labels": [found.name], "show_labels": [True], "colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
-        yield at(f"{path}/name", *_row(rr.Points3D, positions=[label_at], radii=[0.0], **label))
+        yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[label_at], radii=[0.0], **label))
     for name in set(before) - names:
         yield at(_path(name), *rr.Clear.columns(is_recursive=[True]))
 
 
-def _row(kind: Any, **columns: Any) -> Any:
-    return kind.columns(**columns).partition([1])
+def row(kind: Any, count: int, **columns: Any) -> Any:
+    """Columns of one row with `count` elements; 0 removes those that were shown."""
+    if not count:
+        key = next(iter(columns))
+        columns = {key: np.empty((0, 2, 3) if key == "strips" else (0, 3))}
+    return kind.columns(**columns).partition([count])
 
 
 def _path(name: str) -> str:

@@ -6,6 +6,7 @@ Millimetres, microseconds and degrees of transparency are chosen here, in `dynam
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -136,21 +137,15 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
 def _log_names(fix: Any, settings: Settings) -> None:
     """Logs names, units and colours of the curves, and the labels and colours of the modes."""
     joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
-    multiple: list[tuple[str, list[str], str, tuple[palette.Colour, ...]]] = [
-        (f"/joints/{quantity}", joints, unit, palette.JOINTS)
+    series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
+        (f"/joints/{quantity}", [f"{joint} [{unit}]" for joint in joints], palette.JOINTS)
         for quantity, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
     ]
-    multiple += [
-        ("/timing/stages", list(STAGES), "µs", palette.JOINTS),
-        ("/age", [f"{side} hand" for side in SIDES], "ms", (palette.LEFT, palette.RIGHT)),
+    series += [
+        ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.JOINTS),
+        ("/age", [f"{side} hand [ms]" for side in SIDES], (palette.LEFT, palette.RIGHT)),
     ]
-    for path, names, unit, colours in multiple:
-        style: dict[str, Any] = {
-            "colors": [colours[i % len(colours)] for i in range(len(names))],
-            "widths": [1.5] * len(names),
-        }
-        fix(path, rr.SeriesLines(names=[f"{name} [{unit}]" for name in names], **style, **_aggregation(path)))
-    for path, name, colour in (
+    single = (
         ("/error/target", "tool to target [mm]", palette.TOOL),
         ("/turn/target", "tool rotated from the target [°]", palette.TOOL),
         ("/turn/std", "target's standard deviation [°]", palette.TARGET),
@@ -168,8 +163,15 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),
-    ):
-        fix(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, **_aggregation(path)))
+    )
+    series += [(path, [name], (colour,)) for path, name, colour in single]
+    for path, names, colours in series:
+        coloured = list(itertools.islice(itertools.cycle(colours), len(names)))
+        # how values that share one pixel column are drawn: of times and ages, the largest
+        is_largest = path.startswith(("/timing", "/latency", "/age"))
+        policy = rr.components.AggregationPolicy.Max if is_largest else None
+        widths = [1.5] * len(names)
+        fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
     for path, names, colours_packed in (
         ("/mode/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
         ("/mode/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
@@ -177,12 +179,6 @@ def _log_names(fix: Any, settings: Settings) -> None:
         labels = [name.replace("_", " ") for name in names]
         fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))
     fix("/scene/banner", _board())
-
-
-def _aggregation(path: str) -> dict[str, Any]:
-    """How values that share one pixel column are drawn: of times and ages, the largest."""
-    is_largest = path.startswith(("/timing", "/latency", "/age"))
-    return {"aggregation_policy": rr.components.AggregationPolicy.Max} if is_largest else {}
 
 
 def _board() -> rr.Mesh3D:

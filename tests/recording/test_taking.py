@@ -96,7 +96,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
-    assert Recorded.open(path).settings == SETTINGS
+    assert Recorded(path).settings == SETTINGS
     longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
     of_joints = {"tool": PoseTopic("bench/joints/state")}
     np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
@@ -278,7 +278,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     with pytest.raises(RecordingError, match=r"takes is a folder: give its files, .*takes/\*\.mcap"):
         read_demonstration(path.parent)
     assert summary(path).demonstration.places == Scene().via_points()
-    assert Recorded.open(path).settings == Settings()
+    assert Recorded(path).settings == Settings()
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
     assert main(["record", "--list", *folder]) == 1
