@@ -71,51 +71,32 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
         rules.append(rule | {"messages": messages, "key_exprs": key_exprs})
         return str(rule["id"])
 
-    hear = [allow("hear", "ingress", ["declare_subscriber"], heard), allow("hear", "egress", ["put"], heard)]
-    told = keys((*HANDS, *ARM, *TOOL))
-    record = [
-        allow("record", "ingress", ["declare_subscriber"], told),
-        allow("record", "egress", ["put"], told),
-    ]
-    ask = [
-        allow("ask", "ingress", ["query"], asked),
-        allow("ask", "egress", ["declare_queryable", "reply"], asked),
-    ]
+    def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
+        return [allow(name, "ingress", ingress, key_exprs), allow(name, "egress", egress, key_exprs)]
+
+    hear = both("hear", ["declare_subscriber"], ["put"], heard)
+    record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL)))
+    ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
     status, present = keys(("status",)), [channels.presence(cell)]
     tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
-    see = [
-        allow("see", "ingress", ["query"], status),
-        allow("see", "egress", ["declare_queryable", "reply"], status),
-        allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]),
-        allow("see who lives", "egress", tokens, present),
-    ]
+    see = both("see", ["query"], ["declare_queryable", "reply"], status)
+    see.append(allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]))
+    see.append(allow("see who lives", "egress", tokens, present))
+    alive, answers = [*tokens, *queries], ["query", "reply", "declare_queryable"]
     if ros2_domain is not None:
-        domain = [ros2.all_tokens(ros2_domain)]
-        see += [
-            allow("see topics", "ingress", [*tokens, *queries], domain),
-            allow("see topics", "egress", [*tokens, *queries], domain),
-        ]
-
-    neighbours = [  # two daemons see that they are two
-        rule
-        for flow in ("ingress", "egress")
-        for rule in (
-            allow("neighbours", flow, [*tokens, *queries], present),
-            allow("neighbours' status", flow, ["query", "reply", "declare_queryable"], status),
-        )
-    ]
+        see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
+    # two daemons see that they are two
+    neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
 
     def policies() -> Iterator[tuple[str, list[str]]]:
         for name, role in ROLES.items():
             publish: list[str] = []
             if role.publishes:
                 published = keys(role.publishes, topics=True)
-                publish.append(allow(f"{name} publish", "ingress", ["put"], published))
-                publish.append(allow(f"{name} publish", "egress", ["declare_subscriber"], published))
-            through = (name == ROUTER) * neighbours
+                publish = both(f"{name} publish", ["put"], ["declare_subscriber"], published)
             heard_of = role.hears * hear + role.hears_inputs * record
-            yield name, publish + see + heard_of + role.asks * ask + through
+            yield name, publish + see + heard_of + role.asks * ask + (name == ROUTER) * neighbours
         yield DAEMON, neighbours
 
     granted = [
