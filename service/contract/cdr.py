@@ -234,8 +234,7 @@ def decode_pose(data: bytes) -> PoseStamped:
 
 def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     """The PoseWithCovarianceStamped in CDR bytes. Raises WireError."""
-    *pose, covariance = _read_pose(data, _POSE, _COVARIANCE)
-    return PoseWithCovarianceStamped(*pose, covariance)
+    return PoseWithCovarianceStamped(*_read_pose(data, _POSE, _COVARIANCE))
 
 
 class _JointLayout(NamedTuple):

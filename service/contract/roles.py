@@ -4,7 +4,7 @@ certificate of its own lets each role do what stands here and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from service.contract import channels, ros2
@@ -89,27 +89,22 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
     # two daemons see that they are two
     neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
 
-    def policies() -> Iterator[tuple[str, list[str]]]:
-        for name, role in ROLES.items():
-            publish: list[str] = []
-            if role.publishes:
-                published = keys(role.publishes, topics=True)
-                publish = both(f"{name} publish", ["put"], ["declare_subscriber"], published)
-            heard_of = role.hears * hear + role.hears_inputs * record
-            yield name, publish + see + heard_of + role.asks * ask + (name == ROUTER) * neighbours
-        yield DAEMON, neighbours
-
-    granted = [
-        (role, valid, rules_of)
-        for role, rules_of in policies()
-        if (valid := [name for name in names(role) if name not in revoked])  # no name at all would mean everybody
-    ]
+    allowed = {}
+    for name, role in ROLES.items():
+        allowed[name] = see + role.hears * hear + role.hears_inputs * record + role.asks * ask
+        allowed[name] += (name == ROUTER) * neighbours
+        if role.publishes:
+            published = keys(role.publishes, topics=True)
+            allowed[name] += both(f"{name} publish", ["put"], ["declare_subscriber"], published)
+    allowed[DAEMON] = neighbours
+    valid = {role: [name for name in names(role) if name not in revoked] for role in allowed}
+    granted = [role for role in allowed if valid[role]]  # no name at all would mean everybody
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
             "rules": rules,
-            "subjects": [{"id": role, "cert_common_names": valid} for role, valid, _ in granted],
-            "policies": [{"subjects": [role], "rules": rules_of} for role, _, rules_of in granted],
+            "subjects": [{"id": role, "cert_common_names": valid[role]} for role in granted],
+            "policies": [{"subjects": [role], "rules": allowed[role]} for role in granted],
         }
     }

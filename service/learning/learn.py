@@ -87,14 +87,13 @@ def learn(
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     task = task_of(demonstrations) if components is None and ell is None else ""
-    if isinstance(task, str):
-        remarks += [task] if task else []
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
             progress(f"learning between the via-points {', '.join(task.names)}")
             found = learned(task, demonstrations, paths, progress)
         else:
+            remarks += [task] if task else []
             if components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
                 fit = _from_demonstrations(paths, points, ell)
@@ -122,13 +121,8 @@ def learn(
         if isinstance(error, SkillError):
             raise SkillError(f"{error}{left_out}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
-    judged = figures(demonstrations, paths, names, found.held_out, found.gate, reach=reach or Reach(), remarks=remarks)
-    judged = msgspec.structs.replace(
-        judged,
-        orientation_error_deg=posed.turn_error_deg,
-        gripper_right=posed.gripper_right,
-        warnings=(*judged.warnings, *posed.warnings),
-        unsafe=(*judged.unsafe, *posed.unsafe),
+    judged = figures(
+        demonstrations, paths, names, found.held_out, found.gate, posed, reach=reach or Reach(), remarks=remarks
     )
     tools = np.concatenate([pairs[i][1] for i in kept])
     skill = StoredSkill(
