@@ -93,17 +93,14 @@ def launched(
     command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
-    try:
-        yield Launched(process, _endpoint(process, log, say), log)
-    finally:
-        if process.poll() is None:
+    with process:
+        try:
+            yield Launched(process, _endpoint(process, log, say), log)
+        finally:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10)
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+            process.kill()
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:

@@ -40,7 +40,7 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        return self._ask(timeout_s, "load", path, None, 0.0)
+        return self._ask(timeout_s, path)
 
     def adapt(
         self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
@@ -49,7 +49,7 @@ class SkillWorker:
 
         Raises SkillError, also after `timeout_s` [s].
         """
-        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance)
+        return self._ask(timeout_s, skill.file, tuple(via_points), tolerance)
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -105,17 +105,15 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(kind: str, source: Any, via_points: Sequence[ViaPoint] | None, tolerance: float) -> StoredSkill:
-    if kind == "load":
+def _work(source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0) -> StoredSkill:
+    """The skill in a file, or the one in force (the bytes of its file) through these via-points."""
+    if isinstance(source, bytes):
+        skill = adapted(decoded(source, origin="the skill in force"), via_points, tolerance=tolerance)
+    else:
         try:
-            data = Path(source).read_bytes()
+            skill = decoded(source.read_bytes(), origin=str(source))
         except OSError as error:
             raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
-        skill = decoded(data, origin=str(source))
-    else:
-        skill = decoded(source, origin="the skill in force")
-    if via_points is not None:
-        skill = adapted(skill, via_points, tolerance=tolerance)
     hands = skill.hands[0].reshape(2, 3)
     skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
     return skill

@@ -36,8 +36,8 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
         names = [point.name for point in via_points]
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     inputs, outputs, deviations = neighbourhoods(via_points)
-    _check_agreement(via_points, inputs, outputs, deviations)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    _check_agreement(owners, inputs, outputs, deviations)
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
@@ -60,19 +60,18 @@ def _weight(skill: Skill) -> float:
     return 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
 
 
-def _check_agreement(via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
+def _check_agreement(owners: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
     """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
-    contradict each other.
+    contradict each other; `owners` are those via-points.
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
     allowed = STEEPEST * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
-    owners = [name for point in via_points for name in [point.name] * points_made_of([point])]
     for i, j in np.argwhere(tools > allowed)[:1].tolist():
         raise SkillError(
-            f"via-points {owners[i]!r} and {owners[j]!r} contradict each other: their hands are {hands[i, j]:.4f} m "
-            f"apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, {STEEPEST:g} "
-            "times the hands' distance and what their std allow"
+            f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
+            f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
+            f"{STEEPEST:g} times the hands' distance and what their std allow"
         )
 
 
