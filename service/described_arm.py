@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from service.contract.explain import ExplainedError
 from service.urdf import Urdf
-
-if TYPE_CHECKING:
-    from service.config import JointSettings
 
 FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
 NEAREST_POINT = 0.4
@@ -17,6 +14,14 @@ NEAREST_POINT = 0.4
 
 class SettingsError(ExplainedError, ValueError):
     """A configuration that cannot be used: names the field, what was given and what is accepted."""
+
+
+class Limits(Protocol):
+    """The joints' settings, as far as a URDF says them."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In the order of the chain."""
 
 
 def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
@@ -51,7 +56,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     return {**given, "arm": arm, "joints": joints, "reach": reach}
 
 
-def check(joints: JointSettings, urdf: Urdf, plate: str) -> None:
+def check(joints: Limits, urdf: Urdf, plate: str) -> None:
     """Raises SettingsError for joints that the arm does not have, and for limits wider than the
     URDF's.
     """

@@ -46,7 +46,7 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
-        return self._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
+        return Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
 
 
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
