@@ -25,12 +25,6 @@ STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
 
 
-NO_BENCH = (
-    "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last that "
-    "PyBullet has wheels for (others compile it: pip install pybullet)"
-)
-
-
 class LaunchError(ExplainedError, RuntimeError):
     """A daemon did not start or did not end; the message has its output."""
 
@@ -42,7 +36,10 @@ def check_bench() -> None:
     except ValueError:  # raised for a module that was removed from sys.modules on purpose
         found = None
     if found is None:
-        raise LaunchError(NO_BENCH)
+        raise LaunchError(
+            "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last "
+            "that PyBullet has wheels for (others compile it: pip install pybullet)"
+        )
 
 
 @dataclass(frozen=True)

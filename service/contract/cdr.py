@@ -107,9 +107,7 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
 
 @functools.cache
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
-    """What follows the stamp in every command of these joints up to its first number, and the
-    layout from there on.
-    """
+    """What is between stamp and first number of commands to these joints; the layout after it."""
     n = len(names)
     empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
     return empty[_STAMPED : len(empty) - layout.size], layout

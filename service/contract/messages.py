@@ -38,9 +38,7 @@ class PoseWithCovarianceStamped(NamedTuple):
 
 
 class JointState(NamedTuple):
-    """`sensor_msgs/msg/JointState`: position [rad], velocity [rad/s], effort [N m]; each as long as
-    names, or empty.
-    """
+    """`sensor_msgs/msg/JointState` [rad, rad/s, N m]; each as long as names, or empty."""
 
     stamp_ns: int
     names: tuple[str, ...]

@@ -95,10 +95,8 @@ class Deadlines:
 class Granted(NamedTuple):
     """The loop's requests that the operating system granted."""
 
-    realtime: bool
-    """The thread has real-time scheduling."""
-    locked: bool
-    """The process's memory is not paged out once it was touched."""
+    realtime: bool  # scheduling of the thread
+    locked: bool  # the process's memory, which is not paged out once it was touched
 
 
 def ask_for_real_time() -> Granted:

@@ -180,10 +180,9 @@ class Queryables:
             try:
                 if str(query.key_expr) != key and suffix != "status":
                     raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
-                size = 0 if query.payload is None else len(query.payload)
-                if size > channels.LARGEST_REQUEST:
-                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
                 payload = b"" if query.payload is None else query.payload.to_bytes()
+                if (size := len(payload)) > channels.LARGEST_REQUEST:
+                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
                 answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")

@@ -1,6 +1,4 @@
-"""A demonstration: how the tool went with the two hands, checked, and with a tool that lags brought
-into phase.
-"""
+"""A demonstration: how the tool went with the two hands, checked, and the tool's lag taken out."""
 
 from __future__ import annotations
 

@@ -51,9 +51,7 @@ def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float)
 
 
 def gate_between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
-    """The gate between what held-out demonstrations reach (T,) [m] and what each kind of planted
-    nonsense does.
-    """
+    """The gate between what held-out demonstrations (T,) and each kind of nonsense reach [m]."""
     most = float(held_out.max())
     least = min(float(np.quantile(x, MISSED)) for x in wrong)
     if least > most:

@@ -42,9 +42,7 @@ class HeldOut(NamedTuple):
 
 
 class Posed(NamedTuple):
-    """What was learned of how the tool is turned and of the gripper, and what is to be said of
-    that.
-    """
+    """What was learned of the tool's turns and of the gripper, and what is to be said of them."""
 
     orientation: Vector  # (4,) the mean one, quaternion x y z w
     turn: LearnedOrientation | None  # None: it is constant
@@ -124,9 +122,7 @@ def figures(
 
 
 def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
-    """The demonstrations that repeat an earlier one, and which: as many stamps as that has, or
-    other ones.
-    """
+    """The demonstrations that repeat an earlier one, at as many or other stamps, and which."""
     paths = []
     for hands, tool in pairs:
         both, at = np.hstack([hands, tool[:, :3]]), np.linspace(0.0, 1.0, COMPARED)

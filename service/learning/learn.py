@@ -43,7 +43,7 @@ class Evidence(NamedTuple):
 
 
 Looked = TypeVar("Looked")
-Fit = Callable[[Sequence[int]], KMP]  # the primitive of the demonstrations with these indices
+Fit = Callable[[int | None], KMP]  # the primitive of all demonstrations but one, or of all
 
 
 def learn(
@@ -160,7 +160,7 @@ def _learned(
 ) -> Learned:
     """What demonstrations tell where they name no via-points."""
     progress(f"learning from all {len(paths)}")
-    primitive, hands = fit(range(len(paths))), [hands for hands, _ in paths]
+    primitive, hands = fit(None), [hands for hands, _ in paths]
     held_out = list(_held_out(paths, fit, progress))
     found = gate(
         primitive,
@@ -176,11 +176,7 @@ def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, el
     parameters = choice.parameters(ell)
     residuals = choice.residuals(parameters.ell, parameters.noise)
 
-    def fit(members: Sequence[int]) -> KMP:
-        (without,) = {*range(len(paths))} - {*members} or {None}
-        return choice.primitive(parameters, residuals, without=without)
-
-    return fit
+    return lambda left_out: choice.primitive(parameters, residuals, without=left_out)
 
 
 def _from_mixture(
@@ -193,8 +189,8 @@ def _from_mixture(
     spread_m: float,
     seed: int,
 ) -> Fit:
-    def fit(members: Sequence[int]) -> KMP:
-        samples = np.concatenate([np.hstack(paths[i]) for i in members])
+    def fit(left_out: int | None) -> KMP:
+        samples = np.concatenate([np.hstack(path) for i, path in enumerate(paths) if i != left_out])
         mixture = GaussianMixture.fit(samples, components=components, seed=seed)
         inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)
         reference = mixture.regress(inputs)
@@ -213,8 +209,7 @@ def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callab
     """What is predicted of each demonstration from the others; of a single one, from itself."""
     for h, (hands, tool) in enumerate(paths):
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
-        primitive = fit([i for i in range(len(paths)) if i != h] or [h])
-        predicted = primitive.predict(hands)
+        predicted = fit(h if len(paths) > 1 else None).predict(hands)
         yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
 
 

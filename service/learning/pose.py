@@ -101,9 +101,7 @@ def mean_orientation(quaternions: ArrayLike) -> Vector:
 def _learned_turn(
     mean: Vector, inputs: Sequence[Vector], unit: Sequence[Vector], points: int
 ) -> tuple[LearnedOrientation | None, float | None]:
-    """The primitive of the orientations (T, 4), None where they are constant, and its error
-    [degrees].
-    """
+    """The primitive of orientations (T, 4), None where they are constant, and its error [deg]."""
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None
     zetas = [log(_near(q, mean), mean) for q in unit]
@@ -115,9 +113,7 @@ def _learned_turn(
 
 
 def _near(quaternions: Vector, mean: Vector) -> Vector:
-    """The same orientations (T, 4), with signs that make neighbours near, and most near the
-    mean.
-    """
+    """The same orientations (T, 4), signed so that neighbours are near, and most near the mean."""
     smooth = continuous(quaternions)
     return np.asarray(smooth if (smooth @ mean).sum() >= 0.0 else -smooth)
 
@@ -131,9 +127,7 @@ def _learned_gripper(
     ell: float,
     warnings: list[str],
 ) -> tuple[LearnedGripper | None, float | None]:
-    """The primitive of the gripper, and in how much of what was held out it is right [%]; to the
-    warnings is added what is to be said.
-    """
+    """The gripper, and in how much held out it is right [%]; what is to be said is added."""
     told = [(x, c[:, None]) for x, c in zip(inputs, closures, strict=True) if c is not None]
     if not told:
         return None, None
@@ -163,9 +157,7 @@ def _right(choice: Choice, held_out: int, prior: Vector, ell: float) -> NDArray[
 
 
 def _fitted(inputs: Vector, outputs: Vector, kernel: Kernel, prior: Vector) -> KMP:
-    """A primitive of points as exact as each other, of standard deviation DEVIATION far from
-    them.
-    """
+    """A primitive of equally exact points, of standard deviation DEVIATION far from them."""
     width, scale = outputs.shape[1], len(inputs) / DEVIATION**2
     covariance = np.tile(POINT_NOISE / scale * np.eye(width), (len(inputs), 1, 1))
     return KMP.fit(

@@ -1,6 +1,4 @@
-"""Via-points: a skill made to go through the poses that were taught to it, and how far it then
-misses each.
-"""
+"""Via-points: a skill made to go through taught poses, and how far it then misses each."""
 
 from __future__ import annotations
 
@@ -43,21 +41,16 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
-            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=_weight(skill)))
+            # The covariance of IJRR 2019 is N times that of a point that stands alone. Where the
+            # reference was scaled to that, so that predicted deviations are true, a via-point's
+            # variance must be too.
+            weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
+            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
             at = skill.model.inputs(inputs)
             turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, turn=turn, gripper=gripper))
-
-
-def _weight(skill: Skill) -> float:
-    """What a via-point's variance is multiplied by.
-
-    The covariance of IJRR 2019 is N times that of a point that stands alone. Where the reference
-    was scaled to that, so that predicted deviations are true, a via-point's must be too.
-    """
-    return 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
 
 
 def _check_agreement(owners: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector) -> None:
