@@ -51,9 +51,7 @@ def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Reference points of H demonstrations: inputs (N, 6) and outputs (N, 3) [m], and whose each is
-    (N,).
-    """
+    """Reference points of H demonstrations: inputs (N, 6), outputs (N, 3) [m], and owners (N,)."""
 
     inputs: Vector
     outputs: Vector

@@ -21,10 +21,10 @@ from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
-from service.learning.gate import gate
+from service.learning.gate import CEILING_M, gate_between, nonsense
 from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.pose import learned_pose
-from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.learning.skill_file import HIGHEST_GATE_M, SkillError, StoredSkill, with_file
 from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
@@ -162,13 +162,11 @@ def _learned(
     progress(f"learning from all {len(paths)}")
     primitive, hands = fit(None), [hands for hands, _ in paths]
     held_out = list(_held_out(paths, fit, progress))
-    found = gate(
-        primitive,
-        np.concatenate([some[:: max(1, len(some) // 50)] for some in hands]),
-        np.concatenate([one.gate_m for one in held_out]),
-        calibration=_calibration(held_out) if calibrated else 1.0,
-    )
-    return Learned(HandsKMP(primitive), held_out, found, hands)
+    reached = np.concatenate([one.gate_m for one in held_out])
+    some = np.concatenate([one[:: max(1, len(one) // 50)] for one in hands])
+    wrong = [standard_deviations(primitive.predict(one).covariance) for one in nonsense(some)]
+    ceiling = min(CEILING_M * (_calibration(held_out) if calibrated else 1.0), HIGHEST_GATE_M)  # it holds for errors
+    return Learned(HandsKMP(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), hands)
 
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
