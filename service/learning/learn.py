@@ -165,7 +165,8 @@ def _learned(
     reached = np.concatenate([one.gate_m for one in held_out])
     some = np.concatenate([one[:: max(1, len(one) // 50)] for one in hands])
     wrong = [standard_deviations(primitive.predict(one).covariance) for one in nonsense(some)]
-    ceiling = min(CEILING_M * (_calibration(held_out) if calibrated else 1.0), HIGHEST_GATE_M)  # it holds for errors
+    calibration = _calibration(held_out) if calibrated else 1.0  # of deviations, where the ceiling is of errors
+    ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
     return Learned(HandsKMP(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), hands)
 
 

@@ -127,7 +127,7 @@ def _learned_gripper(
     ell: float,
     warnings: list[str],
 ) -> tuple[LearnedGripper | None, float | None]:
-    """The gripper, and in how much held out it is right [%]; what is to be said is added."""
+    """The gripper, and in how much of what is held out it is right [%]; adds to the warnings."""
     told = [(x, c[:, None]) for x, c in zip(inputs, closures, strict=True) if c is not None]
     if not told:
         return None, None
