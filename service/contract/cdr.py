@@ -120,9 +120,8 @@ def encode_command(
     in a tenth of its time.
     """
     prefix, layout = _command_layout(names)
-    return b"".join(
-        (CDR_HEADER, _STAMP.pack(*_stamp(stamp_ns)), prefix, layout.pack(*position, len(names), *velocity, 0))
-    )
+    head = CDR_HEADER + _STAMP.pack(*_stamp(stamp_ns)) + prefix
+    return head + layout.pack(*position, len(names), *velocity, 0)
 
 
 def encode_string(text: str) -> bytes:

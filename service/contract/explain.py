@@ -15,9 +15,7 @@ T = TypeVar("T")
 
 
 class ExplainedError(Exception):
-    """An error whose message tells people what failed, what was given and what is accepted:
-    commands print it and exit 1.
-    """
+    """Tells people what failed, was given and is accepted: commands print it and exit 1."""
 
 
 class InvalidError(ExplainedError, ValueError):

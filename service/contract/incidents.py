@@ -107,6 +107,8 @@ def _mode(mode: Mode) -> tuple[str, str]:
         case Mode.FAULT:
             ends = "by `thirdhand reset`, once the cause is mended"
             return "has come to rest; commands are no longer sent", ends
+        case _:
+            assert_never(mode)
 
 
 def _reason(reason: Reason, seen: Evidence) -> Incident:
@@ -182,6 +184,8 @@ def _flag(flag: Flag) -> tuple[str, str]:
             about += "or stops"
             remedy = "give it room; `hand_distance_m` and `hand_limit_m_s` in the status say how near and how fast"
             return about, remedy
+        case _:
+            assert_never(flag)
 
 
 def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:

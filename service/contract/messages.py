@@ -1,6 +1,4 @@
-"""The messages of the streams, as values: the ROS 2 messages that we send and take in, and what
-rides with every output.
-"""
+"""The streams' messages as values: the ROS 2 ones in and out, and what rides with outputs."""
 
 from __future__ import annotations
 
