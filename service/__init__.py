@@ -1,3 +1,1 @@
-"""The daemon that turns live hand poses into safe joint commands, and everything a client of it
-imports.
-"""
+"""The daemon that turns live hand poses into safe joint commands, and what its clients import."""

@@ -1,6 +1,4 @@
-"""A child process with a socket to it, and bytes handed over as memory that both map: no copy
-through the socket.
-"""
+"""A child process with a socket to it, and bytes handed over as memory that both map, uncopied."""
 
 from __future__ import annotations
 
@@ -30,9 +28,7 @@ class Child(NamedTuple):
 
 
 def python(*arguments: str) -> tuple[list[str], dict[str, str]]:
-    """Command line and environment of a Python that finds the packages beside this one, whatever
-    the working directory holds.
-    """
+    """Command line and environment of a Python that finds these packages in any directory."""
     root = str(Path(__file__).parents[1])
     path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
     return [sys.executable, "-P", *arguments], os.environ | {"PYTHONPATH": path}
@@ -74,9 +70,7 @@ def end_with_parent(grace_s: float = 0.0) -> None:
 
 
 def in_memory(*parts: Any) -> int:
-    """The descriptor of a file in memory that holds the parts (anything with a buffer), one after
-    the other.
-    """
+    """The descriptor of a file in memory that holds the parts (anything with a buffer) in order."""
     fd = os.memfd_create("thirdhand")
     with open(fd, "wb", closefd=False) as file:
         for view in (memoryview(part).cast("B") for part in parts):

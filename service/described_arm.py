@@ -57,9 +57,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
 
 
 def check(joints: Limits, urdf: Urdf, plate: str) -> None:
-    """Raises SettingsError for joints that the arm does not have, and for limits wider than the
-    URDF's.
-    """
+    """Raises SettingsError for joints the arm does not have, and limits wider than the URDF's."""
     moving = urdf.movable(plate)
     names = tuple(joint.name for joint in moving)
     if joints.names != names:

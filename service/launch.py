@@ -25,12 +25,6 @@ STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
 
 
-NO_BENCH = (
-    "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last that "
-    "PyBullet has wheels for (others compile it: pip install pybullet)"
-)
-
-
 class LaunchError(ExplainedError, RuntimeError):
     """A daemon did not start or did not end; the message has its output."""
 
@@ -42,7 +36,10 @@ def check_bench() -> None:
     except ValueError:  # raised for a module that was removed from sys.modules on purpose
         found = None
     if found is None:
-        raise LaunchError(NO_BENCH)
+        raise LaunchError(
+            "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last "
+            "that PyBullet has wheels for (others compile it: pip install pybullet)"
+        )
 
 
 @dataclass(frozen=True)
@@ -93,17 +90,14 @@ def launched(
     command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
-    try:
-        yield Launched(process, _endpoint(process, log, say), log)
-    finally:
-        if process.poll() is None:
+    with process:
+        try:
+            yield Launched(process, _endpoint(process, log, say), log)
+        finally:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10)
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+            process.kill()
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:

@@ -43,9 +43,8 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
 
     def __post_init__(self) -> None:
-        endpoints = {f"listen[{i}]": endpoint for i, endpoint in enumerate(self.listen)}
-        endpoints |= {f"connect[{i}]": endpoint for i, endpoint in enumerate(self.connect)}
-        for name, endpoint in endpoints.items():
+        given = {"listen": self.listen, "connect": self.connect}
+        for name, endpoint in ((f"{key}[{i}]", one) for key, some in given.items() for i, one in enumerate(some)):
             if self.certificate and not endpoint.startswith("tls/"):
                 raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
             if not self.certificate and endpoint.startswith("tls/"):

@@ -1,6 +1,4 @@
-"""Reads an arm's URDF: the joints along the chain to the tool, their limits, the links' poses and
-shapes.
-"""
+"""Reads an arm's URDF: the chain's joints to the tool, their limits, links' poses and shapes."""
 
 from __future__ import annotations
 

@@ -33,86 +33,63 @@ _MOST_LAYOUTS = 16
 _LONGEST = 8192  # bytes of what the loop reads: the time it takes is bounded
 
 
-def _stamp(stamp_ns: int) -> bytes:
+def _stamp(stamp_ns: int) -> tuple[int, int]:
     """A time that does not fit loses its upper bits: no clock, however wrong, stops the loop."""
     seconds, nanoseconds = divmod(stamp_ns, _NS)
-    return _STAMP.pack(seconds & 0xFFFFFFFF, nanoseconds)
+    return seconds & 0xFFFFFFFF, nanoseconds
 
 
-def _header(stamp_ns: int, frame: str) -> bytearray:
-    out = bytearray(CDR_HEADER)
-    out += _stamp(stamp_ns)
-    _put_string(out, frame)
-    return out
-
-
-def _align(out: bytearray, size: int) -> None:
-    out += bytes(-(len(out) - 4) % size)
-
-
-def _put_string(out: bytearray, text: str) -> None:
-    raw = text.encode() + b"\0"
-    _align(out, 4)
-    out += _LENGTH.pack(len(raw))
-    out += raw
-
-
-def _put_doubles(out: bytearray, values: tuple[float, ...]) -> None:
-    _align(out, 4)
-    out += _LENGTH.pack(len(values))
-    if values:
-        _align(out, 8)
-        out += struct.pack(f"<{len(values)}d", *values)
-
-
-class Writer:
-    """CDR bytes, put together piece by piece; for what the loop does not send."""
+class Writer(bytearray):
+    """CDR bytes, put together piece by piece."""
 
     def __init__(self) -> None:
-        self._out = bytearray(CDR_HEADER)
+        super().__init__(CDR_HEADER)
 
     def pack(self, layout: struct.Struct, *values: Any, align: int) -> None:
-        _align(self._out, align)
-        self._out += layout.pack(*values)
+        self += bytes(-(len(self) - 4) % align)
+        self += layout.pack(*values)
 
     def string(self, text: str) -> None:
-        _put_string(self._out, text)
+        raw = text.encode() + b"\0"
+        self.pack(_LENGTH, len(raw), align=4)
+        self += raw
+
+    def doubles(self, values: Sequence[float]) -> None:
+        self.pack(_LENGTH, len(values), align=4)
+        if values:
+            self.pack(struct.Struct(f"<{len(values)}d"), *values, align=8)
 
     def header(self, stamp_ns: int, frame: str) -> None:
-        _align(self._out, 4)
-        self._out += _stamp(stamp_ns)
+        self.pack(_STAMP, *_stamp(stamp_ns), align=4)
         self.string(frame)
 
-    def bytes(self) -> bytes:
-        return bytes(self._out)
+
+def _posed(message: PoseStamped | PoseWithCovarianceStamped) -> Writer:
+    out = Writer()
+    out.header(message.stamp_ns, message.frame_id)
+    out.pack(_POSE, *message.position, *message.orientation, align=8)
+    return out
 
 
 def encode_pose(message: PoseStamped) -> bytes:
     """CDR bytes of a PoseStamped."""
-    out = _header(message.stamp_ns, message.frame_id)
-    _align(out, 8)
-    out += _POSE.pack(*message.position, *message.orientation)
-    return bytes(out)
+    return bytes(_posed(message))
 
 
 def encode_pose_with_covariance(message: PoseWithCovarianceStamped) -> bytes:
     """CDR bytes of a PoseWithCovarianceStamped."""
-    out = _header(message.stamp_ns, message.frame_id)
-    _align(out, 8)
-    out += _POSE.pack(*message.position, *message.orientation)
-    out += _COVARIANCE.pack(*message.covariance)
-    return bytes(out)
+    return bytes(_posed(message) + _COVARIANCE.pack(*message.covariance))
 
 
 def encode_joints(message: JointState) -> bytes:
     """CDR bytes of a JointState."""
-    out = _header(message.stamp_ns, message.frame_id)
-    _align(out, 4)
-    out += _LENGTH.pack(len(message.names))
+    out = Writer()
+    out.header(message.stamp_ns, message.frame_id)
+    out.pack(_LENGTH, len(message.names), align=4)
     for name in message.names:
-        _put_string(out, name)
+        out.string(name)
     for values in (message.position, message.velocity, message.effort):
-        _put_doubles(out, values)
+        out.doubles(values)
     return bytes(out)
 
 
@@ -130,9 +107,7 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
 
 @functools.cache
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
-    """What follows the stamp in every command of these joints up to its first number, and the
-    layout from there on.
-    """
+    """What is between stamp and first number of commands to these joints; the layout after it."""
     n = len(names)
     empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
     return empty[_STAMPED : len(empty) - layout.size], layout
@@ -145,27 +120,25 @@ def encode_command(
     in a tenth of its time.
     """
     prefix, layout = _command_layout(names)
-    return b"".join((CDR_HEADER, _stamp(stamp_ns), prefix, layout.pack(*position, len(names), *velocity, 0)))
+    head = CDR_HEADER + _STAMP.pack(*_stamp(stamp_ns)) + prefix
+    return head + layout.pack(*position, len(names), *velocity, 0)
 
 
 def encode_string(text: str) -> bytes:
     """CDR bytes of a `std_msgs/msg/String`."""
-    out = bytearray(CDR_HEADER)
-    _put_string(out, text)
+    out = Writer()
+    out.string(text)
     return bytes(out)
 
 
 def encode_transforms(stamp_ns: int, transforms: Sequence[Transform]) -> bytes:
     """CDR bytes of a `tf2_msgs/msg/TFMessage`."""
-    out = bytearray(CDR_HEADER + _LENGTH.pack(len(transforms)))
-    stamp = _stamp(stamp_ns)
+    out = Writer()
+    out.pack(_LENGTH, len(transforms), align=4)
     for item in transforms:
-        _align(out, 4)
-        out += stamp
-        _put_string(out, item.parent)
-        _put_string(out, item.child)
-        _align(out, 8)
-        out += _POSE.pack(*item.translation, *item.rotation)
+        out.header(stamp_ns, item.parent)
+        out.string(item.child)
+        out.pack(_POSE, *item.translation, *item.rotation, align=8)
     return bytes(out)
 
 
@@ -243,23 +216,22 @@ class Reader:
             raise WireError(f"{len(self._data) - self._at} bytes follow the message")
 
 
-def decode_pose(data: bytes) -> PoseStamped:
-    """The PoseStamped in CDR bytes. Raises WireError."""
+def _read_pose(data: bytes, *layouts: struct.Struct) -> tuple[Any, ...]:
     reader = Reader(data, _LONGEST)
     stamp, frame = reader.header()
-    values = reader.unpack(_POSE, 8)
+    pose, *more = (reader.unpack(layout, 8) for layout in layouts)
     reader.end()
-    return PoseStamped(stamp, frame, values[:3], values[3:])
+    return stamp, frame, pose[:3], pose[3:], *more
+
+
+def decode_pose(data: bytes) -> PoseStamped:
+    """The PoseStamped in CDR bytes. Raises WireError."""
+    return PoseStamped(*_read_pose(data, _POSE))
 
 
 def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     """The PoseWithCovarianceStamped in CDR bytes. Raises WireError."""
-    reader = Reader(data, _LONGEST)
-    stamp, frame = reader.header()
-    values = reader.unpack(_POSE, 8)
-    covariance = reader.unpack(_COVARIANCE, 8)
-    reader.end()
-    return PoseWithCovarianceStamped(stamp, frame, values[:3], values[3:], covariance)
+    return PoseWithCovarianceStamped(*_read_pose(data, _POSE, _COVARIANCE))
 
 
 class _JointLayout(NamedTuple):

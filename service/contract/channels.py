@@ -145,9 +145,7 @@ def topic(cell: str, suffix: str) -> str:
 
 
 def keys_by_topic(cell: str, suffixes: Iterable[str]) -> dict[str, str]:
-    """The channels' keys by their topics, with and without the slash that earlier recordings
-    lack.
-    """
+    """The channels' keys by their topics, also without the slash, which earlier recordings lack."""
     return {name: suffix for suffix in suffixes for name in (topic(cell, suffix), key(cell, suffix))}
 
 

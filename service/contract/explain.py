@@ -1,6 +1,4 @@
-"""Validation errors in words: where in the input, what was given there, what would have been
-accepted.
-"""
+"""Validation errors in words: where in the input, what was given, what would be accepted."""
 
 from __future__ import annotations
 
@@ -17,9 +15,7 @@ T = TypeVar("T")
 
 
 class ExplainedError(Exception):
-    """An error whose message tells people what failed, what was given and what is accepted:
-    commands print it and exit 1.
-    """
+    """Tells people what failed, was given and is accepted: commands print it and exit 1."""
 
 
 class InvalidError(ExplainedError, ValueError):
@@ -129,14 +125,8 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
 def _chosen(node: Any, value: Any) -> Any:
     """The one of several tagged structs that a value says it is."""
     if isinstance(node, inspect.UnionType) and isinstance(value, dict):
-        return next(
-            (
-                t
-                for t in node.types
-                if isinstance(t, inspect.StructType) and t.tag_field and value.get(t.tag_field) == t.tag
-            ),
-            node,
-        )
+        tagged = (one for one in node.types if isinstance(one, inspect.StructType) and one.tag_field)
+        return next((one for one in tagged if value.get(one.tag_field) == one.tag), node)
     return node
 
 
@@ -151,12 +141,10 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
             return f"{_range(node)} accepted"
         case inspect.TupleType(item_types):
             return f"{len(item_types)} needed" if isinstance(value, list) else f"{len(item_types)} numbers needed"
-        case inspect.VarTupleType() if node.min_length or node.max_length:
-            return (
-                f"{node.min_length or 0} to {node.max_length} needed"
-                if node.max_length
-                else f"at least {node.min_length} needed"
-            )
+        case inspect.VarTupleType(max_length=most) if most:
+            return f"{node.min_length or 0} to {most} needed"
+        case inspect.VarTupleType(min_length=least) if least:
+            return f"at least {least} needed"
         case inspect.StrType():
             return "a text needed"
         case inspect.StructType() | inspect.UnionType():

@@ -94,8 +94,6 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Incident:
             return Incident(*_flag(member))
         case Cause() | "malformed":
             return _cause(member, seen)
-        case _:
-            assert_never(member)
 
 
 def _mode(mode: Mode) -> tuple[str, str]:
@@ -281,12 +279,10 @@ def _not_ready(seen: Evidence) -> str:
         return ""
     if _is_refused(source):
         return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
-    at = (
-        ""
-        if out is None
-        else f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
-    )
-    return _silence(source) or at or "the arm has not told one posture for long enough"
+    at = "the arm has not told one posture for long enough"
+    if out is not None:
+        at = f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+    return _silence(source) or at
 
 
 def _is_refused(source: Source) -> bool:

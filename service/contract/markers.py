@@ -47,7 +47,7 @@ def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
         out.string("")
         out.pack(_COUNT, 0, align=4)
         out.pack(_BYTE, 0, align=1)
-    return out.bytes()
+    return bytes(out)
 
 
 def decode_objects(data: bytes) -> tuple[SceneObject, ...]:

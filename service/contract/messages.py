@@ -1,6 +1,4 @@
-"""The messages of the streams, as values: the ROS 2 messages that we send and take in, and what
-rides with every output.
-"""
+"""The streams' messages as values: the ROS 2 ones in and out, and what rides with outputs."""
 
 from __future__ import annotations
 
@@ -38,9 +36,7 @@ class PoseWithCovarianceStamped(NamedTuple):
 
 
 class JointState(NamedTuple):
-    """`sensor_msgs/msg/JointState`: position [rad], velocity [rad/s], effort [N m]; each as long as
-    names, or empty.
-    """
+    """`sensor_msgs/msg/JointState` [rad, rad/s, N m]; each as long as names, or empty."""
 
     stamp_ns: int
     names: tuple[str, ...]

@@ -137,9 +137,8 @@ def decode_request(data: bytes, kind: Any) -> Any:
         raise RequestError(explained(error, given, kind)) from None
 
 
-def encode_json(value: Any) -> bytes:
-    """JSON bytes of a request, reply or status."""
-    return msgspec.json.encode(value)
+encode_json = msgspec.json.encode
+"""JSON bytes of a request, reply or status."""
 
 
 class Percentiles(msgspec.Struct, frozen=True):

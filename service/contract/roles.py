@@ -4,7 +4,7 @@ certificate of its own lets each role do what stands here and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from service.contract import channels, ros2
@@ -71,64 +71,40 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
         rules.append(rule | {"messages": messages, "key_exprs": key_exprs})
         return str(rule["id"])
 
-    hear = [allow("hear", "ingress", ["declare_subscriber"], heard), allow("hear", "egress", ["put"], heard)]
-    told = keys((*HANDS, *ARM, *TOOL))
-    record = [
-        allow("record", "ingress", ["declare_subscriber"], told),
-        allow("record", "egress", ["put"], told),
-    ]
-    ask = [
-        allow("ask", "ingress", ["query"], asked),
-        allow("ask", "egress", ["declare_queryable", "reply"], asked),
-    ]
+    def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
+        return [allow(name, "ingress", ingress, key_exprs), allow(name, "egress", egress, key_exprs)]
+
+    hear = both("hear", ["declare_subscriber"], ["put"], heard)
+    record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL)))
+    ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
     status, present = keys(("status",)), [channels.presence(cell)]
     tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
-    see = [
-        allow("see", "ingress", ["query"], status),
-        allow("see", "egress", ["declare_queryable", "reply"], status),
-        allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]),
-        allow("see who lives", "egress", tokens, present),
-    ]
+    see = both("see", ["query"], ["declare_queryable", "reply"], status)
+    see.append(allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]))
+    see.append(allow("see who lives", "egress", tokens, present))
+    alive, answers = [*tokens, *queries], ["query", "reply", "declare_queryable"]
     if ros2_domain is not None:
-        domain = [ros2.all_tokens(ros2_domain)]
-        see += [
-            allow("see topics", "ingress", [*tokens, *queries], domain),
-            allow("see topics", "egress", [*tokens, *queries], domain),
-        ]
+        see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
+    # two daemons see that they are two
+    neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
 
-    neighbours = [  # two daemons see that they are two
-        rule
-        for flow in ("ingress", "egress")
-        for rule in (
-            allow("neighbours", flow, [*tokens, *queries], present),
-            allow("neighbours' status", flow, ["query", "reply", "declare_queryable"], status),
-        )
-    ]
-
-    def policies() -> Iterator[tuple[str, list[str]]]:
-        for name, role in ROLES.items():
-            publish: list[str] = []
-            if role.publishes:
-                published = keys(role.publishes, topics=True)
-                publish.append(allow(f"{name} publish", "ingress", ["put"], published))
-                publish.append(allow(f"{name} publish", "egress", ["declare_subscriber"], published))
-            through = (name == ROUTER) * neighbours
-            heard_of = role.hears * hear + role.hears_inputs * record
-            yield name, publish + see + heard_of + role.asks * ask + through
-        yield DAEMON, neighbours
-
-    granted = [
-        (role, valid, rules_of)
-        for role, rules_of in policies()
-        if (valid := [name for name in names(role) if name not in revoked])  # no name at all would mean everybody
-    ]
+    allowed = {}
+    for name, role in ROLES.items():
+        allowed[name] = see + role.hears * hear + role.hears_inputs * record + role.asks * ask
+        allowed[name] += (name == ROUTER) * neighbours
+        if role.publishes:
+            published = keys(role.publishes, topics=True)
+            allowed[name] += both(f"{name} publish", ["put"], ["declare_subscriber"], published)
+    allowed[DAEMON] = neighbours
+    valid = {role: [name for name in names(role) if name not in revoked] for role in allowed}
+    granted = [role for role in allowed if valid[role]]  # no name at all would mean everybody
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
             "rules": rules,
-            "subjects": [{"id": role, "cert_common_names": valid} for role, valid, _ in granted],
-            "policies": [{"subjects": [role], "rules": rules_of} for role, _, rules_of in granted],
+            "subjects": [{"id": role, "cert_common_names": valid[role]} for role in granted],
+            "policies": [{"subjects": [role], "rules": allowed[role]} for role in granted],
         }
     }

@@ -1,3 +1,1 @@
-"""The control process around the core: its clock, its channels, its requests, and the process that
-computes for them.
-"""
+"""The control process around the core: clock, channels, requests, and their skill worker."""

@@ -95,10 +95,8 @@ class Deadlines:
 class Granted(NamedTuple):
     """The loop's requests that the operating system granted."""
 
-    realtime: bool
-    """The thread has real-time scheduling."""
-    locked: bool
-    """The process's memory is not paged out once it was touched."""
+    realtime: bool  # scheduling of the thread
+    locked: bool  # the process's memory, which is not paged out once it was touched
 
 
 def ask_for_real_time() -> Granted:
@@ -164,8 +162,6 @@ class Window:
 
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and maximum over the window; zeros while it is empty."""
-        values = self._values[: self._count] if self._count < len(self._values) else self._values
-        if not len(values):
+        if not self._count:
             return Percentiles()
-        p50, p99, top = np.percentile(values, (50, 99, 100))
-        return Percentiles(round(float(p50), 3), round(float(p99), 3), round(float(top), 3))
+        return Percentiles(*np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist())

@@ -41,13 +41,12 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
-from service.daemon.measured_tool import MeasuredTool
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
-from service.daemon.status import CellStatus
+from service.daemon.status import CellStatus, MeasuredTool
 from service.learning.skill_file import SkillError, StoredSkill
 from service.recording.scribe import Scribe
 

@@ -9,7 +9,6 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from service.contract import channels
-from service.contract.markers import LARGEST
 from service.contract.messages import WireError
 from service.contract.requests import encode_json
 
@@ -37,8 +36,6 @@ class ObjectListener:
         if sample is None:
             return
         try:
-            if len(sample.payload) > LARGEST:
-                raise WireError(f"{len(sample.payload)} bytes")
             found = channels.BY_KEY[KEY].codec.decode(sample.payload.to_bytes())
         except WireError as error:
             if str(error) != self._error:

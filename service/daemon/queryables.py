@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -57,25 +58,23 @@ class PendingEvent:
 
     def __init__(self, event: Event) -> None:
         self._event = event
-        self._tick = -1
-        self._claim = threading.Lock()
-        self._taken = threading.Event()
+        self._tick: Future[int] = Future()
 
     def claimed(self, tick: int) -> Event | None:
         """The event, consumed by this tick, or None where it was withdrawn. Called by the loop."""
-        if not self._claim.acquire(blocking=False):
+        if not self._tick.set_running_or_notify_cancel():
             return None
-        self._tick = tick
-        self._taken.set()
+        self._tick.set_result(tick)
         return self._event
 
     def wait(self) -> int:
         """The tick that consumed it. Raises RequestError where none does, nor ever will."""
-        if not self._taken.wait(ADOPTION_TIMEOUT_S):
-            if self._claim.acquire(blocking=False):
-                raise RequestError("the loop did not take the request: it is starting, ending or stalled")
-            self._taken.wait()
-        return self._tick
+        try:
+            return self._tick.result(ADOPTION_TIMEOUT_S)
+        except TimeoutError:
+            if self._tick.cancel():
+                raise RequestError("the loop did not take the request: it is starting, ending or stalled") from None
+            return self._tick.result()
 
 
 class RequestQueue:
@@ -181,10 +180,9 @@ class Queryables:
             try:
                 if str(query.key_expr) != key and suffix != "status":
                     raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
-                size = 0 if query.payload is None else len(query.payload)
-                if size > channels.LARGEST_REQUEST:
-                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
                 payload = b"" if query.payload is None else query.payload.to_bytes()
+                if (size := len(payload)) > channels.LARGEST_REQUEST:
+                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
                 answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")

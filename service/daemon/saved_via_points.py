@@ -54,11 +54,7 @@ class SavedViaPoints:
             saved = json.loads(content)
             if saved.pop("checksum") != _checksum(saved):
                 raise ValueError("its checksum is wrong: it was changed since; remove it, and teach them again")
-            request = (
-                decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
-                if saved["request"]
-                else None
-            )
+            request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
             if saved["learned_from"] != skill.learned_from:
                 return None
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -69,11 +65,9 @@ class SavedViaPoints:
         """A temporary file, flushed to disk, with this skill's via-points, to be renamed over the
         old one. Raises SkillError.
         """
-        request = (
-            {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
-            if skill.via_points
-            else None
-        )
+        request = None
+        if skill.via_points:
+            request = {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
         saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
         content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         try:

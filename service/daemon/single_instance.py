@@ -17,6 +17,7 @@ from typing import Any
 import zenoh
 
 from service.client import Client, RefusedError, UnreachableError
+from service.client.presence import living
 from service.contract import channels
 from service.contract.explain import ExplainedError
 
@@ -25,7 +26,6 @@ MOST_DESCRIPTORS = 65536
 MOST_HANDSHAKES = 16  # at once: those that time out are closed together, which delays the others
 HANDSHAKE_TIMEOUT_MS = 2000
 ENVELOPE = 1024  # bytes of key, attachment and Zenoh's headers around the largest request
-NEIGHBOURS_TIMEOUT_S = 5.0
 
 BOUNDS: dict[str, Any] = {
     "transport/unicast/max_sessions": MOST_SESSIONS,
@@ -109,17 +109,13 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     Raises OccupiedError where another daemon on this network does. Of two that start at once, both
     may be refused.
     """
-    own = channels.presence(cell, str(session.zid()))
-    token = session.liveliness().declare_token(own)
-    others = [
-        str(reply.ok.key_expr)
-        for reply in session.liveliness().get(channels.presence(cell), timeout=NEIGHBOURS_TIMEOUT_S)
-        if reply.ok is not None and str(reply.ok.key_expr) != own
-    ]
+    own = str(session.zid())
+    token = session.liveliness().declare_token(channels.presence(cell, own))
+    others = living(session, cell) - {own}
     if not others:
         return token
     token.undeclare()  # type: ignore[no-untyped-call]
-    holder = f"Zenoh session {others[0].rsplit('/', 1)[1]}"
+    holder = f"Zenoh session {min(others)}"
     with contextlib.suppress(UnreachableError, RefusedError):
         found = Client(session, cell, timeout_s=2.0).status()
         holder += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"

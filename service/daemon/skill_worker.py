@@ -41,7 +41,7 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        return self._ask(timeout_s, "load", path)
+        return self._ask(timeout_s, path)
 
     def adapt(
         self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
@@ -50,7 +50,7 @@ class SkillWorker:
 
         Raises SkillError, also after `timeout_s` [s].
         """
-        return self._ask(timeout_s, "adapt", skill.file, tuple(via_points), tolerance, self._max_gain)
+        return self._ask(timeout_s, skill.file, tuple(via_points), tolerance, self._max_gain)
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -106,17 +106,19 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(kind: str, source: Any, *adaptation: Any) -> StoredSkill:
-    if kind == "load":
+def _work(
+    source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
+) -> StoredSkill:
+    """The skill in a file, or the one in force (the bytes of its file) through these via-points."""
+    if isinstance(source, bytes):
+        skill = adapted(
+            decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain
+        )
+    else:
         try:
-            data = Path(source).read_bytes()
+            skill = decoded(source.read_bytes(), origin=str(source))
         except OSError as error:
             raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
-        skill = decoded(data, origin=str(source))
-    else:
-        via_points, tolerance, max_gain = adaptation
-        skill = decoded(source, origin="the skill in force")
-        skill = adapted(skill, via_points, tolerance=tolerance, max_gain=max_gain)
     hands = skill.hands[0].reshape(2, 3)
     skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
     return skill

@@ -12,6 +12,7 @@ from service.contract.incidents import MALFORMED, Evidence, Outside, explained, 
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
+from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.decision.decision import RETURNING
 from service.core.frame import Frame, Record
@@ -20,6 +21,8 @@ from service.core.intake.intake import SCATTERED_M, SETTLED
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames
+
+OLDEST_S = 0.2  # of the measured joints
 
 
 class CellStatus(NamedTuple):
@@ -103,6 +106,20 @@ class CellStatus(NamedTuple):
         found = map(Outside, joints.names, measured, joints.lower, joints.upper)
         returning = int(self.state["arm_ready"]) == RETURNING
         return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
+
+
+class MeasuredTool:
+    """Forward kinematics of the joints measured last."""
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        self._period_s = settings.period_s
+        self._arm = Arm(settings, urdf)  # not the loop's, which works at the same time
+
+    def position(self, state: Record) -> Vector3 | None:
+        """The tool's position [m] in frame `base`; None where no joints were measured lately."""
+        if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= OLDEST_S:
+            return None
+        return _point(self._arm.at(state["measured"].copy()).position)
 
 
 def outcome(frame: Frame) -> tuple[Mode, Reason]:

@@ -1,3 +1,1 @@
-"""From demonstrations to a skill, from a skill to one that goes through taught via-points, and the
-skill's file.
-"""
+"""From demonstrations to a skill, from that to one through taught via-points, and its file."""

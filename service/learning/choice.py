@@ -51,9 +51,7 @@ def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Reference points of H demonstrations: inputs (N, 6) and outputs (N, 3) [m], and whose each is
-    (N,).
-    """
+    """Reference points of H demonstrations: inputs (N, 6), outputs (N, 3) [m], and owners (N,)."""
 
     inputs: Vector
     outputs: Vector
@@ -87,12 +85,8 @@ class Choice:
                 f"{count} demonstration given: at least 2 needed, as what is learned from the others must predict "
                 "each; record another"
             )
-        tried = [
-            (rms(self.residuals(one, noise)), one, noise)
-            for one in (ELLS if ell is None else (ell,))
-            for noise in NOISES
-        ]
-        _, ell, noise = min(tried)
+        ells = ELLS if ell is None else (ell,)
+        _, ell, noise = min((rms(self.residuals(one, noise)), one, noise) for one in ells for noise in NOISES)
         residuals = self.residuals(ell, noise)
         spread = self._spread(ell, residuals)
         unscaled = Parameters(ell, noise, spread, 1.0)

@@ -1,6 +1,4 @@
-"""A demonstration: how the tool went with the two hands, checked, and with a tool that lags brought
-into phase.
-"""
+"""A demonstration: how the tool went with the two hands, checked, and the tool's lag taken out."""
 
 from __future__ import annotations
 
@@ -46,9 +44,7 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
-        stamps_ns, left, right, tool = self.stamps_ns[::step], self.left[::step], self.right[::step], self.tool[::step]
-        gripper = None if self.gripper is None else self.gripper[::step]
-        return self._replace(stamps_ns=stamps_ns, left=left, right=right, tool=tool, gripper=gripper)
+        return Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
 
 
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
@@ -93,9 +89,7 @@ def lag(demonstration: Demonstration, longest_s: float = 1.0) -> int:
     Raises SkillError for a demonstration that nothing can be learned from.
     """
     if len({len(part) for part in demonstration[:4]}) > 1:
-        counts = ", ".join(
-            f"{len(part)} {name}" for name, part in zip(Demonstration._fields[:4], demonstration[:4], strict=True)
-        )
+        counts = ", ".join(f"{len(getattr(demonstration, name))} {name}" for name in Demonstration._fields[:4])
         raise SkillError(f"a demonstration of {counts}: as many of each needed")
     hands, tool, period_s = demonstration.hands, demonstration.tool, demonstration.period_s
     if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
@@ -103,10 +97,8 @@ def lag(demonstration: Demonstration, longest_s: float = 1.0) -> int:
     if len(hands) < 4 or period_s <= 0 or int(longest_s / period_s) < 1:
         raise SkillError(f"a demonstration of {len(hands)} samples is too short to learn from")
     reach = min(int(longest_s / period_s), len(hands) // 4)
-    if max(np.abs(hands).max(), np.abs(tool[:, :3]).max()) > FARTHEST_M:
-        raise SkillError(
-            f"a demonstration goes {max(np.abs(hands).max(), np.abs(tool[:, :3]).max()):.0f} m away: is it in metres?"
-        )
+    if (farthest := max(np.abs(hands).max(), np.abs(tool[:, :3]).max())) > FARTHEST_M:
+        raise SkillError(f"a demonstration goes {farthest:.0f} m away: is it in metres?")
     if min(np.ptp(hands, axis=0).max(), np.ptp(tool[:, :3], axis=0).max()) < LEAST_M:
         raise SkillError(
             f"a demonstration in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teaches nothing"

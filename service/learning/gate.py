@@ -11,10 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kmp import KMP
 from service.core.frame import Vector
-from service.core.skill.model import standard_deviations
-from service.learning.skill_file import HIGHEST_GATE_M
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
 CEILING_M = 0.15  # and no tool is followed that may be so far off, each axis: a thing held is as large
@@ -39,21 +36,8 @@ class Gate(NamedTuple):
     capped: bool  # whether the ceiling alone made it
 
 
-def gate(primitive: KMP, hands: Vector, held_out: Vector, *, calibration: float) -> Gate:
-    """The gate of a primitive, for hands (M, 6) [m] that were demonstrated and the deviations (T,)
-    [m] of held-out demonstrations.
-
-    `calibration`: by how much deviations are greater than errors; 1 where they were made alike. The
-    ceiling holds for errors.
-    """
-    wrong = [standard_deviations(primitive.predict(x).covariance) for x in nonsense(hands)]
-    return gate_between(held_out, wrong, ceiling=min(CEILING_M * calibration, HIGHEST_GATE_M))
-
-
 def gate_between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
-    """The gate between what held-out demonstrations reach (T,) [m] and what each kind of planted
-    nonsense does.
-    """
+    """The gate between what held-out demonstrations (T,) and each kind of nonsense reach [m]."""
     most = float(held_out.max())
     least = min(float(np.quantile(x, MISSED)) for x in wrong)
     if least > most:

@@ -4,7 +4,7 @@ and what makes it unsafe.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -13,6 +13,7 @@ import numpy as np
 from service.config import Reach
 from service.contract.messages import BASE
 from service.core.frame import Vector
+from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import is_reachable
 from service.learning.choice import REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
@@ -38,6 +39,18 @@ class HeldOut(NamedTuple):
     errors: Vector
     covariance: Vector
     gate_m: Vector
+
+
+class Posed(NamedTuple):
+    """What was learned of the tool's turns and of the gripper, and what is to be said of them."""
+
+    orientation: Vector  # (4,) the mean one, quaternion x y z w
+    turn: LearnedOrientation | None  # None: it is constant
+    gripper: LearnedGripper | None  # None: the demonstrations tell of none
+    turn_error_deg: float | None  # root mean square of demonstrations that were held out
+    gripper_right: float | None  # [%] of the held-out samples
+    warnings: Sequence[str]
+    unsafe: Sequence[str]
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,16 +88,20 @@ def figures(
     names: Sequence[str],
     held_out: Sequence[HeldOut],
     gate: Gate,
+    posed: Posed,
     *,
     reach: Reach,
-    remarks: Sequence[str] = (),
+    remarks: Sequence[str],
 ) -> Figures:
     """The figures of a skill: its demonstrations, their hands (T, 6) and tools (T, 3) [m] in phase,
-    what was predicted of each, and its gate.
+    what was predicted of each, its gate, and what it learned besides.
     """
     rows = tuple(_row(name, one, gate.threshold) for name, one in zip(names, held_out, strict=True))
     total = HeldOut(*(np.concatenate(parts) for parts in zip(*held_out, strict=True)))
-    ambiguous, contradiction = ambiguity(paths, names)
+    hands, tools = zip(*paths, strict=True)
+    ambiguous, contradiction = ambiguity(
+        hands, tools, names, _lengths, apart=APART_M, told=lambda apart_m: f"{1000 * apart_m:.0f} mm"
+    )
     out = np.array([not is_reachable(at, reach) for _, tool in paths for at in tool[:: max(1, len(tool) // COMPARED)]])
     found = Figures(
         demonstrations=rows,
@@ -95,15 +112,17 @@ def figures(
         one_beside=100 * gate.caught.one_beside,
         ambiguous=100 * ambiguous,
         beyond_reach=100 * float(out.mean()),
+        orientation_error_deg=posed.turn_error_deg,
+        gripper_right=posed.gripper_right,
     )
     warnings, unsafe = _verdicts(found, demonstrations, contradiction, capped=gate.capped)
-    return msgspec.structs.replace(found, warnings=(*remarks, *warnings), unsafe=tuple(unsafe))
+    return msgspec.structs.replace(
+        found, warnings=(*remarks, *warnings, *posed.warnings), unsafe=(*unsafe, *posed.unsafe)
+    )
 
 
 def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
-    """The demonstrations that repeat an earlier one, and which: as many stamps as that has, or
-    other ones.
-    """
+    """The demonstrations that repeat an earlier one, at as many or other stamps, and which."""
     paths = []
     for hands, tool in pairs:
         both, at = np.hstack([hands, tool[:, :3]]), np.linspace(0.0, 1.0, COMPARED)
@@ -117,24 +136,40 @@ def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
     return out
 
 
-def ambiguity(paths: Sequence[tuple[Vector, Vector]], names: Sequence[str]) -> tuple[float, str]:
-    """The share of samples that have another with the same hands and the tool elsewhere, and the
-    worst such pair in words.
+def ambiguity(
+    hands: Sequence[Vector],
+    tools: Sequence[Vector],
+    names: Sequence[str],
+    distances: Callable[[Vector], Vector],
+    *,
+    apart: float,
+    told: Callable[[float], str],
+) -> tuple[float, str]:
+    """The share of samples that have another with the same hands and the tool `apart` from theirs,
+    and the worst such pair in words.
+
+    `distances` are those (M, M) from each to each of some tools, and `told` one of them in words.
     """
-    at = [np.linspace(0, len(hands) - 1, min(COMPARED, len(hands))).round().astype(int) for hands, _ in paths]
-    hands = np.concatenate([h[i] for (h, _), i in zip(paths, at, strict=True)])
-    tools = np.concatenate([t[i] for (_, t), i in zip(paths, at, strict=True)])
-    owner = [(name, int(i)) for name, some in zip(names, at, strict=True) for i in some]
-    squares = (hands**2).sum(axis=1)
-    near = squares[:, None] + squares - 2 * hands @ hands.T < NEAR_M**2
-    squares = (tools**2).sum(axis=1)
-    apart = np.sqrt(np.maximum(squares[:, None] + squares - 2 * tools @ tools.T, 0.0)) * near
-    i, j = np.unravel_index(int(apart.argmax()), apart.shape)
+    at = [np.linspace(0, len(some) - 1, min(COMPARED, len(some))).round().astype(int) for some in hands]
+    known, shown = (np.concatenate([x[i] for x, i in zip(some, at, strict=True)]) for some in (hands, tools))
+    owner = [f"{name} (sample {i})" for name, some in zip(names, at, strict=True) for i in some]
+    found = distances(shown) * (_squares(known) < NEAR_M**2)
+    i, j = np.unravel_index(int(found.argmax()), found.shape)
     worst = (
-        f"{owner[i][0]} (sample {owner[i][1]}) and {owner[j][0]} (sample {owner[j][1]}) have the hands "
-        f"{1000 * np.linalg.norm(hands[i] - hands[j]):.0f} mm from each other and the tools {1000 * apart[i, j]:.0f} mm"
+        f"{owner[i]} and {owner[j]} have the hands {1000 * np.linalg.norm(known[i] - known[j]):.0f} mm from each other "
+        f"and the tools {told(found[i, j])}"
     )
-    return float((apart.max(axis=1) > APART_M).mean()), worst
+    return float((found.max(axis=1) > apart).mean()), worst
+
+
+def _squares(points: Vector) -> Vector:
+    """Squared distances (M, M) of points (M, D) from each other."""
+    squares = (points**2).sum(axis=1)
+    return np.asarray(squares[:, None] + squares - 2 * points @ points.T)
+
+
+def _lengths(points: Vector) -> Vector:
+    return np.sqrt(np.maximum(_squares(points), 0.0))
 
 
 def _row(name: str, one: HeldOut, threshold: float) -> Row:
@@ -157,7 +192,7 @@ def _verdicts(
     warnings: list[str] = []
     unsafe: list[str] = []
 
-    def say(text: str, *, bad: bool) -> None:
+    def say(text: str, *, bad: bool = False) -> None:
         (unsafe if bad else warnings).append(text)
 
     overall = found.all
@@ -165,15 +200,9 @@ def _verdicts(
     if len(frames) > 1:
         say(f"the demonstrations are in different frames: {', '.join(map(repr, frames))}; one needed", bad=True)
     elif frames[0] not in ("", BASE):
-        say(
-            f"the demonstrations are in frame {frames[0]!r}: it is taken to be {BASE!r}, the arm's base plate",
-            bad=False,
-        )
+        say(f"the demonstrations are in frame {frames[0]!r}: it is taken to be {BASE!r}, the arm's base plate")
     if len(found.demonstrations) < 3:
-        say(
-            f"{len(found.demonstrations)} demonstration(s) tell little of how sure the skill may be; 5 advised",
-            bad=False,
-        )
+        say(f"{len(found.demonstrations)} demonstration(s) tell little of how sure the skill may be; 5 advised")
     if overall.error_mm > NOTED_MM:
         say(
             f"held-out demonstrations are missed by {overall.error_mm:.0f} mm: where the hands are tells little of "
@@ -183,7 +212,7 @@ def _verdicts(
     usual = float(np.median([row.error_mm for row in found.demonstrations]))
     for row in found.demonstrations:
         if len(found.demonstrations) > 2 and row.error_mm > max(STANDS_OUT * usual, NOTED_MM / 2):
-            say(f"{row.name} is unlike the others: missed by {row.error_mm:.0f} mm, they by {usual:.0f}", bad=False)
+            say(f"{row.name} is unlike the others: missed by {row.error_mm:.0f} mm, they by {usual:.0f}")
     if found.ambiguous > NOTED:
         say(
             f"{found.ambiguous:.0f} % of the samples contradict others, up to {UNSAFE:.0f} % accepted: {contradiction}",
@@ -209,15 +238,14 @@ def _verdicts(
             say(f"the gate holds {share:.1f} % of {what}, {wanted}", bad=bad)
     for nominal, share, (low, high) in zip((50, 95), (overall.within_50, overall.within_95), COVERAGE, strict=True):
         if not low <= share <= high:
-            say(f"the {nominal} % regions hold {share:.0f} % of held-out samples", bad=False)
+            say(f"the {nominal} % regions hold {share:.0f} % of held-out samples")
     return warnings, unsafe
 
 
 def table(found: Figures) -> str:
     """The figures as a short table for a terminal."""
-    width = max(len(row.name) for row in (*found.demonstrations, found.all))
     which = "held out" if len(found.demonstrations) > 1 else "learned from"
-    width = max(width, len(which))
+    width = max(len(text) for text in (which, *(row.name for row in (*found.demonstrations, found.all))))
     lines = [f"{which:<{width}}   error  predicted   worst   in 50 %  in 95 %   held"]
     for row in (*found.demonstrations, found.all):
         lines.append(
@@ -229,17 +257,10 @@ def table(found: Figures) -> str:
         f"30 cm beside, {found.one_beside:.0f} % of one hand 30 cm beside",
         f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
         "out of reach",
-        *(
-            [f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms"]
-            if found.orientation_error_deg is not None
-            else []
-        ),
-        *(
-            [f"the gripper is right in {found.gripper_right:.0f} % of the samples"]
-            if found.gripper_right is not None
-            else []
-        ),
-        *(f"warning: {text}" for text in found.warnings),
-        *(f"unsafe: {text}" for text in found.unsafe),
     ]
-    return "\n".join(lines)
+    if found.orientation_error_deg is not None:
+        lines.append(f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms")
+    if found.gripper_right is not None:
+        lines.append(f"the gripper is right in {found.gripper_right:.0f} % of the samples")
+    lines += (f"warning: {text}" for text in found.warnings)
+    return "\n".join([*lines, *(f"unsafe: {text}" for text in found.unsafe)])

@@ -21,10 +21,10 @@ from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
-from service.learning.gate import gate
+from service.learning.gate import CEILING_M, gate_between, nonsense
 from service.learning.judgement import Figures, HeldOut, figures, repeated
 from service.learning.pose import learned_pose
-from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.learning.skill_file import HIGHEST_GATE_M, SkillError, StoredSkill, with_file
 from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
@@ -43,7 +43,7 @@ class Evidence(NamedTuple):
 
 
 Looked = TypeVar("Looked")
-Fit = Callable[[Sequence[int]], KMP]  # the primitive of the demonstrations with these indices
+Fit = Callable[[int | None], KMP]  # the primitive of all demonstrations but one, or of all
 
 
 def learn(
@@ -87,14 +87,13 @@ def learn(
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     task = task_of(demonstrations) if components is None and ell is None else ""
-    if isinstance(task, str):
-        remarks += [task] if task else []
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
             progress(f"learning between the via-points {', '.join(task.names)}")
             found = learned(task, demonstrations, paths, progress)
         else:
+            remarks += [task] if task else []
             if components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
                 fit = _from_demonstrations(paths, points, ell)
@@ -122,13 +121,8 @@ def learn(
         if isinstance(error, SkillError):
             raise SkillError(f"{error}{left_out}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
-    judged = figures(demonstrations, paths, names, found.held_out, found.gate, reach=reach or Reach(), remarks=remarks)
-    judged = msgspec.structs.replace(
-        judged,
-        orientation_error_deg=posed.turn_error_deg,
-        gripper_right=posed.gripper_right,
-        warnings=(*judged.warnings, *posed.warnings),
-        unsafe=(*judged.unsafe, *posed.unsafe),
+    judged = figures(
+        demonstrations, paths, names, found.held_out, found.gate, posed, reach=reach or Reach(), remarks=remarks
     )
     tools = np.concatenate([pairs[i][1] for i in kept])
     skill = StoredSkill(
@@ -166,15 +160,14 @@ def _learned(
 ) -> Learned:
     """What demonstrations tell where they name no via-points."""
     progress(f"learning from all {len(paths)}")
-    primitive, hands = fit(range(len(paths))), [hands for hands, _ in paths]
+    primitive, hands = fit(None), [hands for hands, _ in paths]
     held_out = list(_held_out(paths, fit, progress))
-    found = gate(
-        primitive,
-        np.concatenate([some[:: max(1, len(some) // 50)] for some in hands]),
-        np.concatenate([one.gate_m for one in held_out]),
-        calibration=_calibration(held_out) if calibrated else 1.0,
-    )
-    return Learned(HandsKMP(primitive), held_out, found, hands)
+    reached = np.concatenate([one.gate_m for one in held_out])
+    some = np.concatenate([one[:: max(1, len(one) // 50)] for one in hands])
+    wrong = [standard_deviations(primitive.predict(one).covariance) for one in nonsense(some)]
+    calibration = _calibration(held_out) if calibrated else 1.0  # of deviations, where the ceiling is of errors
+    ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
+    return Learned(HandsKMP(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), hands)
 
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
@@ -182,11 +175,7 @@ def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, el
     parameters = choice.parameters(ell)
     residuals = choice.residuals(parameters.ell, parameters.noise)
 
-    def fit(members: Sequence[int]) -> KMP:
-        (without,) = {*range(len(paths))} - {*members} or {None}
-        return choice.primitive(parameters, residuals, without=without)
-
-    return fit
+    return lambda left_out: choice.primitive(parameters, residuals, without=left_out)
 
 
 def _from_mixture(
@@ -199,8 +188,8 @@ def _from_mixture(
     spread_m: float,
     seed: int,
 ) -> Fit:
-    def fit(members: Sequence[int]) -> KMP:
-        samples = np.concatenate([np.hstack(paths[i]) for i in members])
+    def fit(left_out: int | None) -> KMP:
+        samples = np.concatenate([np.hstack(path) for i, path in enumerate(paths) if i != left_out])
         mixture = GaussianMixture.fit(samples, components=components, seed=seed)
         inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)
         reference = mixture.regress(inputs)
@@ -219,8 +208,7 @@ def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callab
     """What is predicted of each demonstration from the others; of a single one, from itself."""
     for h, (hands, tool) in enumerate(paths):
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
-        primitive = fit([i for i in range(len(paths)) if i != h] or [h])
-        predicted = primitive.predict(hands)
+        predicted = fit(h if len(paths) > 1 else None).predict(hands)
         yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
 
 

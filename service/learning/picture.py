@@ -16,7 +16,7 @@ from service.learning.learn import Evidence
 
 SHARES = np.linspace(0.05, 0.95, 19)
 TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
-NONSENSE = "0.7", "0.5", "0.3"  # shades of grey, for what no hand does
+NONSENSE = {"hands swapped": "0.7", "both 30 cm beside": "0.5", "one 30 cm beside": "0.3"}  # shades of grey
 
 
 def draw(evidence: Evidence, path: Path) -> None:
@@ -56,12 +56,7 @@ def draw(evidence: Evidence, path: Path) -> None:
 
     hands = np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in evidence.paths])
     shown = {"held-out demonstrations": (np.concatenate([one.gate_m for one in held_out]), OFF)}
-    for name, colour, wrong in zip(
-        ("hands swapped", "both 30 cm beside", "one 30 cm beside"),
-        NONSENSE,
-        nonsense(hands),
-        strict=True,
-    ):
+    for (name, colour), wrong in zip(NONSENSE.items(), nonsense(hands), strict=True):
         shown[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +21,10 @@ from service.core.geometry import angles
 from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation
 from service.core.skill.skill import decided
 from service.learning.choice import Choice, Parameters, rms
+from service.learning.judgement import Posed, ambiguity
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned
-NEAR_M, APART_RAD = 0.02, math.radians(30.0)  # hands so near with tools turned so far apart contradict each other
-COMPARED = 100  # samples of a demonstration, of which each is compared with each
+APART_RAD = math.radians(30.0)  # tools turned so far apart, with the hands the same, contradict each other
 NOTED, UNSAFE = 0.01, 0.10  # shares of the samples that contradict others
 NOTED_DEG = 15.0  # error of demonstrations that were held out
 ALONE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # of a single demonstration, which tells nothing of others
@@ -33,18 +32,6 @@ UNDECIDED = 0.5  # closure off all data, where a gripper stays as it is
 POINT_NOISE = 0.1  # a point's variance over the kernel's
 DEVIATION = 0.2  # [rad, half the angle], or of the closure
 GRIPPER_WRONG = 0.15  # share of the held-out time that is noted
-
-
-class Posed(NamedTuple):
-    """What was learned, and what is to be said of it."""
-
-    orientation: Vector  # (4,) the mean one, quaternion x y z w
-    turn: LearnedOrientation | None  # None: it is constant
-    gripper: LearnedGripper | None  # None: the demonstrations tell of none
-    turn_error_deg: float | None = None  # root mean square of demonstrations that were held out
-    gripper_right: float | None = None  # [%] of the held-out samples
-    warnings: tuple[str, ...] = ()
-    unsafe: tuple[str, ...] = ()
 
 
 def learned_pose(
@@ -61,10 +48,26 @@ def learned_pose(
     orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell.
     """
     mean = mean_orientation(np.concatenate(quaternions))
-    turn, turn_error = _learned_turn(mean, inputs, quaternions, points)
-    turn_warnings, unsafe = ((), ()) if turn is None else _verdicts(turn_error, *_ambiguity(hands, quaternions, names))
-    gripper, right, gripper_warnings = _learned_gripper(inputs, closures, names, points=points, ell=gripper_ell)
-    return Posed(mean, turn, gripper, turn_error, right, (*turn_warnings, *gripper_warnings), unsafe)
+    unit = [q / np.linalg.norm(q, axis=1)[:, None] for q in quaternions]
+    warnings: list[str] = []
+    unsafe: list[str] = []
+    turn, turn_error = _learned_turn(mean, inputs, unit, points)
+    if turn is not None:
+        share, worst = ambiguity(
+            hands,
+            unit,
+            names,
+            lambda tools: angles(tools[:, None], tools),
+            apart=APART_RAD,
+            told=lambda apart_rad: f"turned by {math.degrees(apart_rad):.0f}°",
+        )
+        if share > NOTED:
+            told = f"the tool's orientation contradicts itself in {100 * share:.0f} % of the samples, up to "
+            (unsafe if share > UNSAFE else warnings).append(f"{told}{100 * UNSAFE:.0f} % accepted: {worst}")
+    if turn_error is not None and turn_error > NOTED_DEG:
+        warnings.append(f"the tool's orientation in held-out demonstrations is missed by {turn_error:.0f}° rms")
+    gripper, right = _learned_gripper(inputs, closures, names, points=points, ell=gripper_ell, warnings=warnings)
+    return Posed(mean, turn, gripper, turn_error, right, warnings, unsafe)
 
 
 def flat_orientation(skill_inputs: Vector, kernel: Kernel, orientation: Vector) -> LearnedOrientation:
@@ -96,10 +99,9 @@ def mean_orientation(quaternions: ArrayLike) -> Vector:
 
 
 def _learned_turn(
-    mean: Vector, inputs: Sequence[Vector], quaternions: Sequence[Vector], points: int
+    mean: Vector, inputs: Sequence[Vector], unit: Sequence[Vector], points: int
 ) -> tuple[LearnedOrientation | None, float | None]:
-    """The primitive of the orientation, None where that is constant, and its error [degrees]."""
-    unit = [q / np.linalg.norm(q, axis=1)[:, None] for q in quaternions]
+    """The primitive of orientations (T, 4), None where they are constant, and its error [deg]."""
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None
     zetas = [log(_near(q, mean), mean) for q in unit]
@@ -110,53 +112,25 @@ def _learned_turn(
     return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg
 
 
-def _verdicts(error_deg: float | None, share: float, worst: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warnings, and reasons not to use it."""
-    warnings: list[str] = []
-    unsafe: list[str] = []
-    if share > NOTED:
-        told = f"the tool's orientation contradicts itself in {100 * share:.0f} % of the samples, up to "
-        (unsafe if share > UNSAFE else warnings).append(f"{told}{100 * UNSAFE:.0f} % accepted: {worst}")
-    if error_deg is not None and error_deg > NOTED_DEG:
-        warnings.append(f"the tool's orientation in held-out demonstrations is missed by {error_deg:.0f}° rms")
-    return tuple(warnings), tuple(unsafe)
-
-
 def _near(quaternions: Vector, mean: Vector) -> Vector:
-    """The same orientations (T, 4), with signs that make neighbours near, and most near the
-    mean.
-    """
+    """The same orientations (T, 4), signed so that neighbours are near, and most near the mean."""
     smooth = continuous(quaternions)
     return np.asarray(smooth if (smooth @ mean).sum() >= 0.0 else -smooth)
 
 
-def _ambiguity(hands: Sequence[Vector], quaternions: Sequence[Vector], names: Sequence[str]) -> tuple[float, str]:
-    """The share of samples that have another with the same hands and the tool turned elsewhere, and
-    the worst such pair in words.
-    """
-    at = [np.linspace(0, len(h) - 1, min(COMPARED, len(h))).round().astype(int) for h in hands]
-    known = np.concatenate([h[i] for h, i in zip(hands, at, strict=True)])
-    turns = np.concatenate([q[i] / np.linalg.norm(q[i], axis=1)[:, None] for q, i in zip(quaternions, at, strict=True)])
-    owner = [(name, int(i)) for name, some in zip(names, at, strict=True) for i in some]
-    apart = angles(turns[:, None], turns)
-    squares = (known**2).sum(axis=1)
-    apart *= squares[:, None] + squares - 2.0 * known @ known.T < NEAR_M**2
-    i, j = np.unravel_index(int(apart.argmax()), apart.shape)
-    worst = (
-        f"{owner[i][0]} (sample {owner[i][1]}) and {owner[j][0]} (sample {owner[j][1]}) have the hands "
-        f"{1000 * np.linalg.norm(known[i] - known[j]):.0f} mm from each other and the tools turned by "
-        f"{math.degrees(apart[i, j]):.0f}°"
-    )
-    return float((apart.max(axis=1) > APART_RAD).mean()), worst
-
-
 def _learned_gripper(
-    inputs: Sequence[Vector], closures: Sequence[Vector | None], names: Sequence[str], *, points: int, ell: float
-) -> tuple[LearnedGripper | None, float | None, tuple[str, ...]]:
+    inputs: Sequence[Vector],
+    closures: Sequence[Vector | None],
+    names: Sequence[str],
+    *,
+    points: int,
+    ell: float,
+    warnings: list[str],
+) -> tuple[LearnedGripper | None, float | None]:
+    """The gripper, and in how much of what is held out it is right [%]; adds to the warnings."""
     told = [(x, c[:, None]) for x, c in zip(inputs, closures, strict=True) if c is not None]
     if not told:
-        return None, None, ()
-    warnings: list[str] = []
+        return None, None
     silent = [name for name, closure in zip(names, closures, strict=True) if closure is None]
     if silent:
         warnings.append(f"{', '.join(silent)} told nothing of the gripper: it is learned from the others")
@@ -164,13 +138,11 @@ def _learned_gripper(
     right = None
     prior = np.array([UNDECIDED])
     if len(told) > 1:
-        right = 100.0 * float(
-            np.concatenate([_right(choice, held_out, prior, ell) for held_out in range(len(told))]).mean()
-        )
+        right = 100.0 * float(np.concatenate([_right(choice, i, prior, ell) for i in range(len(told))]).mean())
         if right < 100.0 * (1.0 - GRIPPER_WRONG):
             warnings.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it via-points")
     primitive = _fitted(choice.inputs, choice.outputs, GaussianKernel(ell), prior)
-    return LearnedGripper(primitive), right, tuple(warnings)
+    return LearnedGripper(primitive), right
 
 
 def _right(choice: Choice, held_out: int, prior: Vector, ell: float) -> NDArray[np.bool_]:
@@ -185,9 +157,7 @@ def _right(choice: Choice, held_out: int, prior: Vector, ell: float) -> NDArray[
 
 
 def _fitted(inputs: Vector, outputs: Vector, kernel: Kernel, prior: Vector) -> KMP:
-    """A primitive of points as exact as each other, of standard deviation DEVIATION far from
-    them.
-    """
+    """A primitive of equally exact points, of standard deviation DEVIATION far from them."""
     width, scale = outputs.shape[1], len(inputs) / DEVIATION**2
     covariance = np.tile(POINT_NOISE / scale * np.eye(width), (len(inputs), 1, 1))
     return KMP.fit(

@@ -133,9 +133,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise SkillError(f"{origin}: not a skill (no .npz archive)")
-            size = sum(item.file_size for item in archive.zip.infolist())  # type: ignore[misc, union-attr]
+            size = sum(item.file_size for item in archive.zip.infolist())
             if size > LARGEST_FILE:
                 raise SkillError(f"{origin}: {size} bytes unpacked, at most {LARGEST_FILE} accepted")
             arrays = dict(archive)
@@ -146,6 +144,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
         model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
+        turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
         skill = StoredSkill(
             name=str(arrays["name"]),
             model=model.from_arrays(arrays, via_points),
@@ -156,8 +155,8 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             components=int(arrays["components"]),
             via_points=via_points,
             tolerance=float(arrays["tolerance"]),
-            turn=_turn(_part(arrays, TURN)),
-            gripper=_gripper(_part(arrays, GRIPPER)),
+            turn=LearnedOrientation(KMP.from_arrays(turn), turn["auxiliary"]) if turn else None,
+            gripper=LearnedGripper(KMP.from_arrays(gripper)) if gripper else None,
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),
@@ -185,14 +184,6 @@ def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
     kind = arrays["format"].item()
     own = [model for model in MODELS if model.ranges.keys() & arrays.keys() and kind == POSED]
     return next((model for model in MODELS if kind in model.formats), (*own, MODELS[0])[0])
-
-
-def _turn(arrays: Mapping[str, NDArray[Any]]) -> LearnedOrientation | None:
-    return LearnedOrientation(KMP.from_arrays(arrays), arrays["auxiliary"]) if arrays else None
-
-
-def _gripper(arrays: Mapping[str, NDArray[Any]]) -> LearnedGripper | None:
-    return LearnedGripper(KMP.from_arrays(arrays)) if arrays else None
 
 
 def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[str]:

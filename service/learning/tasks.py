@@ -91,9 +91,7 @@ class Encoded:
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
-    """The task of demonstrations that name its via-points; or why there is none, empty where none
-    are named.
-    """
+    """The task of demonstrations, or why there is none, empty where no via-points are named."""
     named = [tuple(point.name for point in one.places) for one in demonstrations]
     if not any(named):
         return ""
@@ -167,9 +165,7 @@ def merged(task: Task, encode: Callable[[Task], list[Encoded]]) -> tuple[Task, l
 
 
 def _alike(task: Task, known: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
-    """Side and two inputs, for positions of a hand of which nothing shows that the tool tells them
-    apart.
-    """
+    """Side and two inputs, for positions of a hand that nothing shows the tool to tell apart."""
     out = []
     for side in (0, 1):
         for a, b in itertools.combinations(sorted({i for i in task.inputs[side].tolist() if i >= 0}), 2):
@@ -284,9 +280,7 @@ def _pairs(task: Task, known: dict[tuple[int, int], int]) -> tuple[Vector, Vecto
 
 
 def _corner(task: Task, left: int, right: int) -> Vector:
-    out = np.zeros(task.width)
-    out[[left, right]] = 1.0
-    return out
+    return np.asarray(np.eye(task.width)[[left, right]].sum(axis=0))
 
 
 class Learned(NamedTuple):
@@ -335,9 +329,7 @@ def learned(
 
 
 def _left_out(task: Task, encoded: Sequence[Encoded], parameters: Parameters) -> list[Vector]:
-    """The tool's errors (T, 3) [m] in each demonstration, as predicted from the others; of a single
-    one, from itself.
-    """
+    """The tool's errors (T, 3) [m] in each demonstration, predicted from the others or itself."""
     out = []
     for i, one in enumerate(encoded):
         without = fitted(task, [*encoded[:i], *encoded[i + 1 :]] or encoded, parameters)
@@ -347,10 +339,10 @@ def _left_out(task: Task, encoded: Sequence[Encoded], parameters: Parameters) ->
 
 def _gate(task: Task, encoded: Sequence[Encoded]) -> Gate:
     """The gate on how far a hand is off its via-points."""
-    wrong: list[list[Vector]] = [[], [], []]
+    wrong = []
     for one in encoded:
-        instance = TaskInstance.of(task, one.parameters)
-        for off, hands in zip(wrong, nonsense(one.hands[:: max(1, len(one.hands) // 50)]), strict=True):
-            off.append(instance.inputs(hands)[1])
+        instance, some = TaskInstance.of(task, one.parameters), one.hands[:: max(1, len(one.hands) // 50)]
+        wrong.append([instance.inputs(hands)[1] for hands in nonsense(some)])
     held_out = np.concatenate([one.gate_m for one in encoded])
-    return gate_between(held_out, [np.concatenate(off) for off in wrong], ceiling=CEILING_M, false=FALSE_HOLDS)
+    kinds = [np.concatenate(kind) for kind in zip(*wrong, strict=True)]
+    return gate_between(held_out, kinds, ceiling=CEILING_M, false=FALSE_HOLDS)

@@ -1,6 +1,4 @@
-"""Via-points: a skill made to go through the poses that were taught to it, and how far it then
-misses each.
-"""
+"""Via-points: a skill made to go through taught poses, and how far it then misses each."""
 
 from __future__ import annotations
 
@@ -39,14 +37,18 @@ def adapted(
         names = [point.name for point in via_points]
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     inputs, outputs, deviations = neighbourhoods(via_points)
-    _check_agreement(via_points, inputs, outputs, deviations, max_gain)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    _check_agreement(owners, inputs, outputs, deviations, max_gain)
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
-            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=_weight(skill)))
+            # The covariance of IJRR 2019 is N times that of a point that stands alone. Where the
+            # reference was scaled to that, so that predicted deviations are true, a via-point's
+            # variance must be too.
+            weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
+            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
             at = skill.model.inputs(inputs)
             turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
@@ -54,30 +56,20 @@ def adapted(
     return with_file(replace(skill, turn=turn, gripper=gripper))
 
 
-def _weight(skill: Skill) -> float:
-    """What a via-point's variance is multiplied by.
-
-    The covariance of IJRR 2019 is N times that of a point that stands alone. Where the reference
-    was scaled to that, so that predicted deviations are true, a via-point's must be too.
-    """
-    return 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
-
-
 def _check_agreement(
-    via_points: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector, max_gain: float
+    owners: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector, max_gain: float
 ) -> None:
     """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
-    contradict each other.
+    contradict each other; `owners` are those via-points.
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
     allowed = max_gain * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
-    owners = [name for point in via_points for name in [point.name] * points_made_of([point])]
     for i, j in np.argwhere(tools > allowed)[:1].tolist():
         raise SkillError(
-            f"via-points {owners[i]!r} and {owners[j]!r} contradict each other: their hands are {hands[i, j]:.4f} m "
-            f"apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, {max_gain:g} "
-            "times the hands' distance and what their std allow"
+            f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
+            f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
+            f"{max_gain:g} times the hands' distance and what their std allow"
         )
 
 

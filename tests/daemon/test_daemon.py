@@ -27,7 +27,7 @@ from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill
-from service.daemon.measured_tool import MeasuredTool
+from service.daemon.status import MeasuredTool
 from service.recording.recording import Recording
 from service.recording.replay import replay
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand
