@@ -53,6 +53,23 @@ class Outside(NamedTuple):
     unit: str = "rad"
 
 
+class Inside(NamedTuple):
+    """A part of the arm that is inside of something."""
+
+    joint: str  # that moves the part
+    thing: str
+    depth_m: float
+
+
+class Stuck(NamedTuple):
+    """A tool that does not come to its target, and what of a way out is known."""
+
+    off_m: float
+    at_limits: tuple[str, ...]  # joints
+    posture: int  # of the way out, that it goes to; 0: there is none
+    postures: int
+
+
 class Evidence(NamedTuple):
     """What is known at the time; what is not is left out."""
 
@@ -62,6 +79,8 @@ class Evidence(NamedTuple):
     gate_m: Excess | None = None  # what the skill's threshold is for
     measure: str = ""  # what that is, in words
     outside: Outside | None = None
+    inside: Inside | None = None
+    stuck: Stuck | None = None
     error_rad: Excess | None = None  # of a joint from its command, at the fault
     worst_joint: tuple[str, float] | None = None  # the one farthest from its command now [rad]
     measured_speed: Excess | None = None  # of the tool [m/s]
@@ -91,7 +110,7 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Incident:
         case Reason():
             return _reason(member, seen)
         case Flag():
-            return Incident(*_flag(member))
+            return Incident(*_flag(member), _stuck(seen.stuck) if member is Flag.STUCK else "")
         case Cause() | "malformed":
             return _cause(member, seen)
 
@@ -139,9 +158,17 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
         case Reason.OPERATOR:
             about, remedy = "somebody asked for it", "`thirdhand resume`"
         case Reason.ARM_NOT_READY:
-            about, found = "the arm does not say where it is, or does not rest within its limits yet", _not_ready(seen)
+            about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
+            found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
+            if seen.inside is not None:
+                remedy = "bring the arm out by hand, or by `thirdhand reset`, which moves it out slowly; "
+                remedy += "where nothing is there mend [table], [obstacles] or the URDF"
             remedy = _of_rejected(seen, "arm") or remedy
+        case Reason.BLOCKED:
+            about = "joints at their ends, or things around it, keep the tool from its target, wherever it goes"
+            remedy = "a way out is looked for, and gone; where none is found it tries again for another target"
+            found = _stuck(seen.stuck)
         case Reason.ARM_ERROR:
             about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
             remedy = "see what blocked or pushed it, then `thirdhand reset`"
@@ -184,6 +211,9 @@ def _flag(flag: Flag) -> tuple[str, str]:
             about += "or stops"
             remedy = "give it room; `hand_distance_m` and `hand_limit_m_s` in the status say how near and how fast"
             return about, remedy
+        case Flag.STUCK:
+            about = "the tool has come no nearer to its target for 0.8 s; a way out is looked for"
+            return about, "wait, or bring the hands elsewhere"
         case _:
             assert_never(flag)
 
@@ -282,7 +312,18 @@ def _not_ready(seen: Evidence) -> str:
     at = "the arm has not told one posture for long enough"
     if out is not None:
         at = f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+    elif seen.inside is not None:
+        at = "what {} moves is inside of {} by {:.3f} m".format(*seen.inside)
     return _silence(source) or at
+
+
+def _stuck(seen: Stuck | None) -> str:
+    """What is known of a tool that is stuck."""
+    if seen is None:
+        return ""
+    ends = f"{', '.join(seen.at_limits)} at the end of its way" if seen.at_limits else "it cannot come nearer"
+    way = f"on its way out, posture {seen.posture} of {seen.postures}" if seen.posture else "no way out is known yet"
+    return f"the tool is {seen.off_m:.2f} m off its target: {ends}; {way}"
 
 
 def _is_refused(source: Source) -> bool:

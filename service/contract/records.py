@@ -37,6 +37,7 @@ class Reason(enum.IntEnum):
     SETPOINT = 9  # passed a bound of its own, which cannot be
     TWO_SOURCES = 10  # of one hand or of the arm, which contradict each other
     SERVICE = 11  # a part of the service failed; the log says which
+    BLOCKED = 12  # joints at their ends or things around keep the tool from its target: it leaves, or waits
 
 
 class Flag(enum.IntFlag):
@@ -46,6 +47,7 @@ class Flag(enum.IntFlag):
     SPEED_LIMITED = 2
     NEAR_JOINT_LIMIT = 4
     SEPARATION = 8  # a hand, the table, a thing or the arm itself is near
+    STUCK = 16  # the tool comes no nearer to its target; a way out is looked for
 
 
 class Cause(enum.IntEnum):

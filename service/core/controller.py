@@ -15,7 +15,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.records import Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
-from service.core.decision.decision import FOLLOW, STARTS_MEASURED, Decision
+from service.core.decision.decision import FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
 from service.core.frame import (
     Event,
     Frame,
@@ -37,7 +37,7 @@ from service.core.skill.skill import Skill, SkillStage, Wanted
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
-SEPARATED = int(Flag.SEPARATION)
+SEPARATED, STUCK = int(Flag.SEPARATION), int(Flag.STUCK)
 SAMPLES = ("hands/left", "hands/right", "joints/state")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -146,6 +146,9 @@ class Controller:
     def _decide(self, frame: Frame, known: int, gate_m: float) -> Kinematics:
         """Decides; the arm's kinematics, where it is or has just appeared."""
         state, here, threshold = self._state, self._at(), self.skill.threshold
+        if state["arm_ready"] != READY:
+            joints = state["joints"][0] if state["arm_ready"] else state["measured"]
+            known |= INSIDE * (self._separation.intrusion(joints)[0] > INSIDE_M)
         starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
@@ -170,18 +173,24 @@ class Controller:
         if moved.too_fast:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)
             frame["commanded"] = moved.moving
-        flags = CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
+        flags = STUCK * (state["stuck"] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
         flags |= LIMITED * (met > 0 or solution.speed_limited or moved.limited)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
         lap("limiter")
 
     def _hold(self, frame: Frame, lap: Lap) -> None:
-        """Brakes the joints, or brings them into their limits; the setpoints stay with the tool."""
-        state, inwards = self._state, self.decision.inwards(self._state)
-        if inwards is None:
-            moved = self._limiter.stop(state, frame, self._separation)
+        """Brakes the joints, or brings them into their limits, out of a thing that they are in or
+        along a way out; the setpoints stay with the tool.
+        """
+        state, separation, here = self._state, self._separation, self._at()
+        own = self.decision.own_motion(state, here.tasks)
+        if own is None:
+            moved = self._limiter.stop(state, frame, separation)
         else:
-            moved = self._limiter.step(state, frame, inwards, self._separation)
+            own = own * separation.share(own)
+            if state["leaves"]:
+                own = own + self._arm.follow(state, here, separation).velocity
+            moved = self._limiter.step(state, frame, own, separation)
         self._here = moved.here
         lap("limiter")
         self._setpoint.begin(state, frame, moved.here)

@@ -15,9 +15,12 @@ from kmp import KMP, GaussianKernel, Gaussians
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
+from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
 from service.core.intake.intake import still_ticks
+from service.core.limiter.limiter import Limiter
+from service.core.separation.separation import Separation
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
 
@@ -41,8 +44,17 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     )
     for one in (plain, skill):
         one.predict(*np.zeros((3, 2, 3)))
+    _rarely(settings, urdf)
     for one in (skill, _as_sent(skill), _as_sent(plain)):
         _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
+
+
+def _rarely(settings: Settings, urdf: str) -> None:
+    """What the loop runs only near the tool's greatest speed, and on a way out."""
+    limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
+    still = np.zeros(len(posture))
+    limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
+    Separation(settings, urdf).share(still)
 
 
 def _as_sent(skill: Skill) -> Skill:

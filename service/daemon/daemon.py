@@ -26,7 +26,7 @@ from service.contract.roles import access_control
 from service.core.controller import Controller, run
 from service.core.frame import STAGES, Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import Outputs, outgoing
-from service.core.separation.separation import FARTHEST
+from service.core.separation.clearance import FARTHEST
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
 from service.daemon.cell_streams import CellStreams
@@ -46,7 +46,8 @@ from service.daemon.queryables import Queryables
 from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
-from service.daemon.status import CellStatus, MeasuredTool
+from service.daemon.status import CellStatus, MeasuredArm
+from service.daemon.way_finder import WayFinder
 from service.learning.skill_file import SkillError, StoredSkill
 from service.recording.scribe import Scribe
 
@@ -111,7 +112,7 @@ class Daemon:
         finally:
             slow.cancel()
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
-        self._measured_tool = MeasuredTool(settings, urdf)
+        self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
@@ -119,7 +120,8 @@ class Daemon:
         self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
-        self._faults: deque[Event] = deque()
+        self._own: deque[Event] = deque()  # events of the service's own: faults, ways out
+        self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
         self._notes = (0, 0)  # a second, and the number of notes in it
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
@@ -192,7 +194,7 @@ class Daemon:
     def _fail(self, what: str) -> None:
         """Reports a failure of the service; the next tick enters the mode `fault` for it."""
         self._failure = what
-        self._faults.append(order("fault", what))
+        self._own.append(order("fault", what))
         self._say(what)
 
     def _fail_in_the_loop(self, what: str) -> None:
@@ -225,8 +227,8 @@ class Daemon:
                     inbox.append(event)
                     if event.kind == "skill":
                         self._files = {self._controller.skill.digest: self._file, event.value.digest: event.payload}
-            while self._faults:
-                inbox.append(self._faults.popleft())
+            while self._own:
+                inbox.append(self._own.popleft())
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + STOP_TIMEOUT_S
@@ -288,6 +290,7 @@ class Daemon:
         logged_errors: deque[str] = deque(maxlen=50)
         while not self._ended.wait(0.1):
             status = self._status_now()
+            self._way_finder.poll(self._frame, self._controller.state)
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
@@ -311,7 +314,8 @@ class Daemon:
         """The status at this moment."""
         frame, state, clock = self._frame, self._controller.state, self._clock
         sources = self._sources.update(self._controller, state, time.monotonic())
-        return CellStatus(frame, self._controller, state, sources, self._settings, self._failure).status(
+        inside = self._measured_arm.inside(state)
+        return CellStatus(frame, self._controller, state, sources, self._settings, self._failure, inside).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
@@ -325,7 +329,7 @@ class Daemon:
             command_heard=self._streams.is_followed,
             endpoints=self.endpoints,
             version=self._version,
-            tool_measured_m=self._measured_tool.position(state),
+            tool_measured_m=self._measured_arm.position(state),
         )
 
 

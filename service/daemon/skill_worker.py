@@ -1,5 +1,5 @@
-"""The skill worker: another process that computes for requests, so that the control process need
-not.
+"""The skill worker: another process that computes for requests, and looks for ways out, so that the
+control process need not.
 
 A skill is returned as a small pickle with its arrays in shared memory, so that the control process
 copies and solves nothing.
@@ -21,7 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from service import child
+from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
+from service.core.frame import Vector
+from service.core.way_out import WayOut
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
 
@@ -41,7 +44,8 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        return self._ask(timeout_s, path)
+        loaded: StoredSkill = self._ask(timeout_s, path)
+        return loaded
 
     def adapt(
         self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
@@ -50,7 +54,13 @@ class SkillWorker:
 
         Raises SkillError, also after `timeout_s` [s].
         """
-        return self._ask(timeout_s, skill.file, tuple(via_points), tolerance, self._max_gain)
+        made: StoredSkill = self._ask(timeout_s, skill.file, tuple(via_points), tolerance, self._max_gain)
+        return made
+
+    def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = TIMEOUT_S) -> list[Vector]:
+        """As `WayOut.find` of the cell. Raises SkillError, also after `timeout_s` [s]."""
+        found: list[Vector] = self._ask(timeout_s, settings, *arguments)
+        return found
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -66,7 +76,7 @@ class SkillWorker:
             self._child.process.wait()
             self._child = None
 
-    def _ask(self, timeout_s: float, *request: Any) -> StoredSkill:
+    def _ask(self, timeout_s: float, *request: Any) -> Any:
         with self._busy:
             if self._child is None or self._child.process.poll() is not None:
                 self._end()
@@ -83,9 +93,9 @@ class SkillWorker:
             except (OSError, EOFError):
                 self._end()
                 raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
-        if isinstance(answer, StoredSkill):
-            return answer
-        raise SkillError(answer)
+        if isinstance(answer, str):
+            raise SkillError(answer)
+        return answer
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:
@@ -106,7 +116,15 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(
+def _work(*request: Any) -> StoredSkill | list[Vector]:
+    """What one request asks for."""
+    if isinstance(request[0], Settings):
+        settings, *arguments = request
+        return WayOut(settings, robot_description(settings)).find(*arguments)
+    return _skill(*request)
+
+
+def _skill(
     source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
     """The skill in a file, or the one in force (the bytes of its file) through these via-points."""
@@ -137,7 +155,7 @@ def _main(descriptor: int) -> None:
                 return
             buffers: list[pickle.PickleBuffer] = []
             try:
-                answer: StoredSkill | str = _work(*request)
+                answer: StoredSkill | list[Vector] | str = _work(*request)
             except Exception as error:  # any failure is an answer to the client
                 answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
             skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)

@@ -8,21 +8,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.config import Settings
-from service.contract.incidents import MALFORMED, Evidence, Outside, explained, word
+from service.contract.incidents import MALFORMED, Evidence, Inside, Outside, Stuck, explained, word
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.decision.decision import RETURNING
+from service.core.decision.decision import READY, RETURNING
 from service.core.frame import Frame, Record
 from service.core.geometry import off_target
 from service.core.intake.intake import SCATTERED_M, SETTLED
+from service.core.separation.clearance import NEAR_ITSELF
+from service.core.separation.separation import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames
 
 OLDEST_S = 0.2  # of the measured joints
+AT_LIMIT_RAD = 0.02  # so near to its limit a joint is at the end of its way
 
 
 class CellStatus(NamedTuple):
@@ -36,13 +39,15 @@ class CellStatus(NamedTuple):
     sources: dict[str, Source]
     settings: Settings
     failure: str = ""
+    inside: Inside | None = None  # of an arm that is not ready
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core knows nothing of."""
         frame, sources, settings = self.frame, self.sources, self.settings
         begun, seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
         skill, (mode, reason) = self.controller.skill, outcome(frame)
-        why = explained(reason if begun else Reason.NONE, self.evidence())
+        flags, seen_now = Flag(int(frame["flags"])), self.evidence()
+        why = explained(Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now)
         low, high = skill.demonstrated
         return Status(
             cell=settings.cell,
@@ -50,7 +55,7 @@ class CellStatus(NamedTuple):
             reason=word(reason) if begun else "",
             because=why.why,
             remedy=why.what_to_do,
-            flags=tuple(map(word, Flag(int(frame["flags"])))),
+            flags=tuple(map(word, flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
             places=tuple(point.name for point in skill.via_points),
@@ -93,6 +98,8 @@ class CellStatus(NamedTuple):
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
             measure=skill.model.measure,
             outside=self._outside(),
+            inside=self.inside,
+            stuck=self._stuck() if self.state["stuck"] else None,
             error_rad=(error_rad, settings.arm.fault_error_rad),
             worst_joint=(settings.joints.names[int(errors.argmax())], float(errors.max())),
             measured_speed=(speed, limit) if speed > limit else None,
@@ -107,13 +114,36 @@ class CellStatus(NamedTuple):
         returning = int(self.state["arm_ready"]) == RETURNING
         return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
 
+    def _stuck(self) -> Stuck:
+        """What keeps the tool from its target, and the way out."""
+        joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
+        ends = [
+            name
+            for name, at, low, high in zip(joints.names, q, joints.lower, joints.upper, strict=True)
+            if min(at - low, high - at) < AT_LIMIT_RAD
+        ]
+        off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
+        count = int(state["way_count"])
+        return Stuck(off_m, tuple(ends), min(int(state["way_next"]) + 1, count), count)
 
-class MeasuredTool:
-    """Forward kinematics of the joints measured last."""
+
+class MeasuredArm:
+    """Where the joints measured last put the arm."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
-        self._period_s = settings.period_s
-        self._arm = Arm(settings, urdf)  # not the loop's, which works at the same time
+        self._period_s, self._names = settings.period_s, settings.joints.names
+        # not the loop's, which work at the same time
+        self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
+
+    def inside(self, state: Record) -> Inside | None:
+        """What an arm that is not ready stands in."""
+        if state["arm_ready"] == READY or state["arm_tick"] < 0:
+            return None
+        depth_m, joint, thing = self._separation.intrusion(state["measured"].copy())
+        if depth_m <= 0.0:
+            return None
+        things = {0: "the table", NEAR_ITSELF: "another part of the arm"}
+        return Inside(self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m)
 
     def position(self, state: Record) -> Vector3 | None:
         """The tool's position [m] in frame `base`; None where no joints were measured lately."""

@@ -17,7 +17,7 @@ from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
 from service.core.geometry import between_segments, off_target, place
 from service.core.separation.body import body_of
-from service.core.separation.separation import FARTHEST
+from service.core.separation.clearance import FARTHEST
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.viewer.banner import banner, line

@@ -4,30 +4,49 @@ whether hands are known and where the skill is sure.
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
+from service.contract import cdr
 from service.contract.records import Mode, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
 
-READY = 1  # an arm within its limits
-RETURNING = 2  # an arm on its way into them
+READY = 1  # an arm within its limits, and in nothing
+RETURNING = 2  # an arm on its way to that
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
+STUCK_M = 0.02  # [m] a tool nearer to its target is there
+STUCK_S = 0.8  # a tool that comes nearer by less than the next within so long is stuck
+PROGRESS = 0.08  # share of its distance ...
+FREED = 0.25  # ... or this, once it was
+PROGRESS_SPEED = 0.3  # or share of the tool's greatest speed, where that is less
+MOVED_M = 0.02  # [m] by which a target may move in that time
+ANOTHER_M = 0.04  # [m] a target so far from the one that it was stuck for may be reached
+WAY_RADPS = 1.2  # [rad/s] at most, of the busiest joint on a way out
+WAY_SHARE = 0.5  # at most, of a joint's greatest speed
+WAY_MPS = 0.4  # [m/s] at most, of the tool on it: nobody asked for this motion
+WAY_GAIN = 4.0  # [1/s] with which it comes to a posture of the way
+WAY_NEAR = 0.02  # [rad] so near it goes on to the next
+WAY_S = 20.0  # that a way may take
+FREED_S = 1.0  # an arm that cannot get out of a thing stays as it is after so long
 GATE_EASE = 0.9  # of the threshold: what has been found far must come clearly nearer again
 
 # Plain numbers, as compiled functions and their callers need them.
 HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
-OPERATOR, NOT_READY = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY)
+OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
 ARM_ERROR, ARM_SILENT, TOOL_SPEED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT), int(Reason.TOOL_SPEED)
 STARTS_ASSUMED = 1  # what a step says: the arm is taken to be at the configured posture
 STARTS_MEASURED = 2  # the arm appeared, where it is measured
+INSIDE = 64  # beside what the intake says: a part of the arm is inside of a thing ...
+INSIDE_M = 0.01  # [m] ... by more than capsules are larger than links
+NOTICED, HELD = 1, 2  # of a tool that is stuck: it follows all the same; it holds, or is on a way out
 
 
 class Decision:
@@ -45,38 +64,60 @@ class Decision:
             is_assumed=int(settings.arm.source == "assumed"),
             max_error_rad=float(settings.arm.fault_error_rad),
             fault_speed=float(settings.tool.fault_speed),
+            max_speed=float(settings.tool.max_speed),
         )
+        self._way_mps = min(WAY_MPS, WAY_SHARE * settings.tool.max_speed)
+        self._way_speed = min(WAY_RADPS, WAY_SHARE * min(limits.velocity))
         self.measured = (0.0, 0.0)
 
     def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
         """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
         STARTS_MEASURED.
 
-        known: the flags that `Intake.step` gave. gate_m: what the skill compares with its
-        threshold, NaN where it predicts nothing.
+        known: the flags that `Intake.step` gave, and INSIDE. gate_m: what the skill compares with
+        its threshold, NaN where it predicts nothing.
         """
-        starts, error, speed = _step(as_array(state), here, self._parameters, known, gate_m, threshold)
+        gates = gate_m, threshold
+        starts, error, speed = _step(as_array(state), as_array(frame), here, self._parameters, known, *gates)
         frame["mode"], frame["reason"] = state["mode"], state["reason"]
         if error >= 0.0:
             self.measured = error, speed
         return int(starts)
 
-    def inwards(self, state: Record) -> Vector | None:
-        """Velocities (J,) [rad/s] of an arm on its way into its limits, None of any other."""
-        if state["arm_ready"] != RETURNING or state["reason"] != NOT_READY or state["operator_hold"]:
-            return None
-        q = state["joints"][0]
-        way: Vector = RETURN_RADPS * ((q < self._lower).astype(np.float64) - (q > self._upper))
-        return way
+    def own_motion(self, state: Record, tasks: Vector) -> Vector | None:
+        """Velocities (J,) [rad/s] of an arm in a hold on its way into its limits, or on a way out
+        of where it is stuck; None of any other. The arm's tasks are as in `Kinematics`.
+        """
+        q, velocity = state["joints"][0], None
+        if state["arm_ready"] == RETURNING and state["reason"] == NOT_READY and not state["operator_hold"]:
+            velocity = RETURN_RADPS * ((q < self._lower).astype(np.float64) - (q > self._upper))
+        elif state["reason"] == BLOCKED and state["way_next"] < state["way_count"]:
+            off = state["way"][state["way_next"]] - q
+            far = float(np.abs(off).max())
+            velocity = off * (min(self._way_speed, WAY_GAIN * far) / max(far, WAY_NEAR))
+            velocity /= max(1.0, float(np.linalg.norm(tasks[:3] @ velocity)) / self._way_mps)
+            state["way_next"] += far < WAY_NEAR
+        return velocity
 
     def take(self, state: Record, event: Event) -> None:
-        """A hold, resume, reset or fault that somebody asks for. Raises ValueError for others."""
+        """A hold, resume, reset or fault that somebody asks for, or a way out that was found.
+        Raises ValueError for others.
+        """
         match event.kind:
             case "hold" | "resume":
                 state["operator_hold"] = event.kind == "hold"
+                if event.kind == "resume":
+                    state["stuck"] = state["way_count"] = 0
             case "reset":
+                state["leaves"] = not state["arm_ready"]
                 if state["mode"] == FAULT:
                     state["mode"], state["arm_ready"] = HOLD, 0
+            case "way":
+                if state["stuck"]:
+                    postures = json.loads(cdr.decode_string(event.payload))
+                    count = state["way_count"] = len(postures)
+                    state["way"][:count] = np.reshape(postures, (count, len(self._lower)))
+                    state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
             case "fault":
                 if state["mode"] != FAULT:
                     state["mode"], state["reason"] = FAULT, Reason.SERVICE
@@ -92,7 +133,13 @@ class Decision:
 
 @compiled
 def _step(
-    states: Records, heres: Records, parameters: Records, known: int, gate_m: float, threshold: float
+    states: Records,
+    frames: Records,
+    heres: Records,
+    parameters: Records,
+    known: int,
+    gate_m: float,
+    threshold: float,
 ) -> tuple[int, float, float]:
     """`Decision.step`, and what was measured; -1: nothing."""
     state = states[0]
@@ -113,6 +160,9 @@ def _step(
     else:
         ease = GATE_EASE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else NONE
+    if reason == NONE:
+        state.stuck = _stuck(states, frames, heres, parameters)
+        reason = BLOCKED if state.stuck == HELD else NONE
     state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
     return starts, error, speed
 
@@ -120,7 +170,7 @@ def _step(
 @compiled
 def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
     """Whether the arm starts, what is wrong with it, its error and speed as measured."""
-    state, given, heard = states[0], parameters[0], known & ARM_HEARD
+    state, given, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & INSIDE
     if given.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
@@ -130,10 +180,10 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
     if not state.arm_ready:
         # what still moves comes to rest first; what was reported must have been one posture
-        if not known & ARM_STILL or moving:
+        if not known & ARM_STILL or moving or (inside and not state.leaves):
             return 0, NONE, -1.0, -1.0
-        state.arm_ready = RETURNING if _is_outside(state.measured, parameters) else READY
-        state.slow_tick = state.tick
+        state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
+        state.slow_tick = state.stuck_tick = state.tick
         return STARTS_MEASURED, NONE, -1.0, -1.0
     if not heard:
         if state.mode == FOLLOW or moving:
@@ -141,7 +191,10 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.arm_ready = 0
         return 0, NONE, -1.0, -1.0
     if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
-        state.arm_ready = READY
+        if moving:
+            state.stuck_tick = state.tick
+        if not inside or (state.tick - state.stuck_tick) * given.period_s > FREED_S:
+            state.arm_ready, state.leaves = READY, 0
     error, speed = measured_error(states, heres)
     if error > given.max_error_rad:
         return 0, ARM_ERROR, error, speed
@@ -149,6 +202,31 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.slow_tick = state.tick
     fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
     return 0, fault, error, speed
+
+
+@compiled
+def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
+    """Whether the tool comes no nearer to where it is to be: NOTICED or HELD; else 0."""
+    state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
+    gap = moved = 0.0
+    for i in range(3):
+        gap += (frame.target[i] - tool[i]) ** 2
+        moved += (frame.target[i] - state.stuck_target[i]) ** 2
+    gap, moved = math.sqrt(gap), math.sqrt(moved)
+    passed_s = (state.tick - state.stuck_tick) * given.period_s
+    if state.way_next < state.way_count and passed_s < WAY_S:
+        return HELD
+    if state.stuck == HELD and not state.way_count and moved < ANOTHER_M:
+        return HELD
+    state.way_next = state.way_count = 0
+    if state.stuck == NOTICED:
+        least = FREED * state.stuck_gap
+    else:
+        least = min(PROGRESS * state.stuck_gap, PROGRESS_SPEED * given.max_speed * STUCK_S)
+    if state.mode != FOLLOW or gap < STUCK_M or state.stuck_gap - gap > least or moved > MOVED_M:
+        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
+        return 0
+    return NOTICED if passed_s >= STUCK_S else 0
 
 
 @compiled

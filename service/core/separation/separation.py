@@ -25,8 +25,8 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
 from service.core.separation.body import body_of
+from service.core.separation.clearance import FARTHEST, NOBODY, PEOPLE, THINGS, clearance
 
-FARTHEST = 3.0  # [m] no distance is reported as greater
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
 THINGS_ROOM = 0.005  # [m] from things, likewise
@@ -41,7 +41,6 @@ CHANGE_S = 0.07  # over which a hand's acceleration fades
 RAMP_S = 0.08  # of a braking, and until a hand's new velocity is known
 UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
 CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
-PEOPLE, THINGS = 0, 1  # of a rule's parameters
 
 
 class Separation:
@@ -115,6 +114,28 @@ class Separation:
             self.constraints,
         )
         frame["hand_distance"], frame["hand_limit"] = self.nearest_m, self.speed_limit
+
+    def clearance(self, joints: Vector, hands: Vector) -> tuple[float, int, int]:
+        """How far the arm at joints (J,) [rad] is from people with hands (H, 3) [m], from things
+        and from itself, less what is kept from them [m]; the capsule that is nearest, and to what:
+        the number of a box, the table's is 0, or NEAR_HAND or NEAR_ITSELF.
+        """
+        found: tuple[float, int, int] = clearance(
+            joints, hands, self._parameters, self._capsules, self._pairs, self._boxes
+        )
+        return found
+
+    def intrusion(self, joints: Vector) -> tuple[float, int, int]:
+        """By how much [m] a part of the arm is inside of a thing or of another part, if above 0;
+        the number of the joint that moves it; and the thing, as `clearance` says.
+        """
+        clear, part, thing = self.clearance(joints, NOBODY)
+        link = int(self._capsules["link"][part])
+        return -clear - float(self._parameters["clearance"][0][THINGS]), link - 1, thing
+
+    def share(self, velocity: Vector) -> float:
+        """How much of joint velocities (J,) [rad/s] is slow enough for all that is near."""
+        return float(_share_of(self.constraints, self.count, velocity))
 
     def excess(self, velocity: Vector, acceleration: Vector) -> float:
         """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
@@ -321,6 +342,20 @@ def _bring_together(
         speed += n1 * (jacobian[1, j] + wz * x - wx * z)
         speed += n2 * (jacobian[2, j] + wx * y - wy * x)
         row[j] += sign * speed
+
+
+@compiled
+def _share_of(constraints: Records, count: int, velocity: Vector) -> float:
+    """`Separation.share`."""
+    share = 1.0
+    for k in range(count):
+        speed = 0.0
+        for j in range(len(velocity)):
+            speed += constraints[k].row[j] * velocity[j]
+        limit = max(constraints[k].planned, 0.5 * SLIP)
+        if speed > limit:
+            share = min(share, limit / speed)
+    return share
 
 
 @compiled

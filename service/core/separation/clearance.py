@@ -1,0 +1,45 @@
+"""How far an arm at some joints is from people, from things and from itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.core.frame import Records, Vector
+from service.core.geometry import between_segments, nearest_to_box, place, to_box
+
+FARTHEST = 3.0  # [m] no distance is reported as greater
+PEOPLE, THINGS = 0, 1  # of a rule's parameters
+NEAR_HAND, NEAR_ITSELF = -1, -2  # what a capsule is nearest to, but for boxes
+NOBODY = np.empty((0, 3))  # hands
+
+
+@compiled
+def clearance(
+    joints: Vector, hands: Vector, parameters: Records, capsules: Records, pairs: Vector, boxes: Vector
+) -> tuple[float, int, int]:
+    """`Separation.clearance`."""
+    given, near, forearm = parameters[0], np.empty(9), np.empty((2, 3))
+    placed = np.empty((len(capsules), 2, 3))
+    place(joints, given.frames, given.axes, capsules, placed)
+    least, part, thing = FARTHEST, -1, -1
+    for capsule in range(given.first, len(capsules)):
+        radius = capsules[capsule].radius
+        for hand in range(len(hands)):
+            forearm[0], forearm[1] = hands[hand], hands[hand] + given.forearm
+            apart = between_segments(placed[capsule], forearm, near) - radius - given.hand_radius
+            apart -= given.clearance[PEOPLE]
+            if apart < least:
+                least, part, thing = apart, capsule, NEAR_HAND
+        for box in range(len(boxes)):
+            inner = nearest_to_box(placed[capsule], boxes[box])
+            apart = to_box(placed[capsule], inner, boxes[box], near) - radius - given.clearance[THINGS]
+            if apart < least:
+                least, part, thing = apart, capsule, box
+    for pair in range(len(pairs)):
+        one, other = pairs[pair]
+        apart = between_segments(placed[one], placed[other], near) - given.clearance[THINGS]
+        apart -= capsules[one].radius + capsules[other].radius
+        if apart < least:
+            least, part, thing = apart, other, NEAR_ITSELF
+    return least, part, thing

@@ -1,0 +1,173 @@
+"""Ways out of places that a step-by-step controller cannot leave: a path in joint space from the
+arm's posture to one in which the tool is where it is to be.
+
+Not in the loop: found beside it, and brought to it as an event. Postures come from damped
+Gauss-Newton steps from many starts, the path between them from two trees that grow towards each
+other (RRT-Connect; Kuffner and LaValle, ICRA 2000), shortened afterwards. Everything on it keeps
+the limits of position, and more than the clearance from people as they are now, from things and
+from the arm itself.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from service.config import Settings
+from service.core.arm.arm import Arm, Kinematics
+from service.core.decision import WAY
+from service.core.frame import Vector
+from service.core.geometry import axis_of, quaternion_of, swing, turn_between
+from service.core.separation.separation import Separation
+
+STARTS, ITERATIONS = 60, 120  # of the search for postures, and steps of each
+STEP_RAD = 0.2  # at most, of a joint in one of them
+SLACK = 0.03  # [rad] kept from the position limits
+REACHED_M, REACHED_RAD = 2e-3, 0.1  # a posture so near to position and orientation will do
+DAMPING = 1e-5  # [m²] of those steps
+OPPOSITE = -0.9999  # cosine of directions between which no turn is the shortest
+GOALS = 6  # postures to which a path is looked for ...
+WAYS = 3  # ... until so many are found, of which the shortest is taken
+MARGIN_M = 0.02  # of clearance, kept more on the way, where both its ends do
+SMALL_M = 1e-3  # of that, which its ends need not have
+GRAIN_RAD = 0.05  # between postures of a path that are looked at
+REACH_RAD = 0.5  # at most, by which a tree grows at once
+NODES = 1500  # of both trees
+SHORTCUTS = 150  # tried
+
+
+class WayOut:
+    """Finds ways out for the arm of one cell; the same arguments give the same way."""
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
+        limits = settings.joints
+        self._lower, self._upper = np.array(limits.lower) + SLACK, np.array(limits.upper) - SLACK
+        self._home, self._whole = np.array(settings.arm.posture), settings.tool.orientation == "full"
+        self._lever = float(self._arm.parameters["turn_lever"][0])
+
+    def find(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> list[Vector]:
+        """Postures (J,) [rad] that lead from `joints` (J,) to one with the tool at a position (3,)
+        [m] in an orientation (4,), past hands (2, 3) [m] where they are; empty where none is found.
+        """
+        random, here_m = np.random.default_rng(0), self._separation.clearance(joints, hands)[0]
+        ways: list[list[Vector]] = []
+        for turned in (True, False):  # position goes before orientation
+            for goal in self._postures(joints, position, orientation if turned else None, hands, random):
+                least = min(here_m, self._separation.clearance(goal, hands)[0], MARGIN_M) - SMALL_M
+                path = self._connect(joints, goal, hands, least, random)
+                if path:
+                    ways.append(self._shortened(path, hands, least, random))
+                if len(ways) == WAYS:
+                    break
+            if ways:
+                break
+        return min(ways, key=_length, default=[])[1 : WAY + 1]
+
+    def _postures(
+        self, joints: Vector, position: Vector, orientation: Vector | None, hands: Vector, random: np.random.Generator
+    ) -> list[Vector]:
+        """Free postures with the tool there, the one nearest to `joints` first."""
+        drawn = random.uniform(self._lower, self._upper, (STARTS, len(joints)))
+        found: list[Vector] = []
+        for start in (self._home, *drawn):
+            q = self._solved(start, position, orientation)
+            if q is not None and self._separation.clearance(q, hands)[0] > 0.0:
+                found.append(q)
+            if len(found) >= 2 * GOALS:
+                break
+        return sorted(found, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
+
+    def _solved(self, q: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
+        """A posture with the tool there within the limits, from one (J,)."""
+        for _ in range(ITERATIONS):
+            here = self._arm.at(q)
+            error, tasks, turn = position - here.position, here.tasks[:3], 0.0
+            if orientation is not None:
+                left = here.rotation.T @ self._turn(here, orientation)
+                turn = float(np.linalg.norm(left))
+                error, tasks = np.append(error, self._lever * left[: len(here.tasks) - 3]), here.tasks
+            if np.linalg.norm(error[:3]) < REACHED_M and turn < REACHED_RAD:
+                return q
+            step = tasks.T @ np.linalg.solve(tasks @ tasks.T + DAMPING * np.eye(len(tasks)), error)
+            q = np.clip(q + step * min(1.0, STEP_RAD / max(float(np.abs(step).max()), 1e-9)), self._lower, self._upper)
+        return None
+
+    def _turn(self, here: Kinematics, orientation: Vector) -> Vector:
+        """The turn (3,) [rad] that is left, about no more than what the arm follows."""
+        turn, wanted = np.empty(3), np.empty(3)
+        if self._whole:
+            now = np.empty(4)
+            quaternion_of(here.rotation, now)
+            turn_between(now, orientation, turn)
+            return turn
+        axis_of(orientation, wanted)
+        now = np.ascontiguousarray(here.rotation[:, 2])
+        swing(now, wanted, turn)
+        return math.pi * here.rotation[:, 0] if now @ wanted < OPPOSITE else turn
+
+    def _is_free(self, a: Vector, b: Vector, hands: Vector, least: float) -> bool:
+        """Whether all on a straight line in joint space has so much clearance [m]."""
+        count = max(1, int(np.ceil(np.abs(b - a).max() / GRAIN_RAD)))
+        return all(self._separation.clearance(a + k / count * (b - a), hands)[0] > least for k in range(1, count + 1))
+
+    def _connect(
+        self, start: Vector, goal: Vector, hands: Vector, least: float, random: np.random.Generator
+    ) -> list[Vector]:
+        """A free path of straight lines; empty where none is found."""
+        if self._is_free(start, goal, hands, least):
+            return [start, goal]
+        trees = [([start], [-1]), ([goal], [-1])]
+        for number in range(NODES):
+            (grown, before), (other, other_before) = trees[number % 2], trees[1 - number % 2]
+            drawn = random.uniform(self._lower, self._upper)
+            new = self._grow(grown, before, drawn, hands, least)
+            while new is not None:
+                met = self._grow(other, other_before, new, hands, least)
+                if met is None:
+                    break
+                if np.array_equal(met, new):
+                    one, two = _back(grown, before), _back(other, other_before)[::-1]
+                    path = one[::-1] + two[::-1][1:] if number % 2 == 0 else two + one[1:]
+                    return path if np.array_equal(path[0], start) else path[::-1]
+        return []
+
+    def _grow(
+        self, nodes: list[Vector], before: list[int], toward: Vector, hands: Vector, least: float
+    ) -> Vector | None:
+        """The node by which a tree came nearer to a posture, or that posture, or None."""
+        nearest = int(np.argmin(np.abs(np.array(nodes) - toward).max(axis=1)))
+        way = toward - nodes[nearest]
+        far = float(np.abs(way).max())
+        new = toward if far <= REACH_RAD else nodes[nearest] + REACH_RAD / far * way
+        if not self._is_free(nodes[nearest], new, hands, least):
+            return None
+        nodes.append(new)
+        before.append(nearest)
+        return new
+
+    def _shortened(self, path: list[Vector], hands: Vector, least: float, random: np.random.Generator) -> list[Vector]:
+        """The path without the corners that can be left out."""
+        for _ in range(SHORTCUTS):
+            if len(path) < 3:
+                break
+            i, j = sorted(random.choice(len(path), 2, replace=False).tolist())
+            if j - i > 1 and self._is_free(path[i], path[j], hands, least):
+                path = path[: i + 1] + path[j:]
+        return path
+
+
+def _length(path: list[Vector]) -> float:
+    """The way of the busiest joint, each time [rad]."""
+    return sum(float(np.abs(b - a).max()) for a, b in itertools.pairwise(path))
+
+
+def _back(nodes: list[Vector], before: list[int]) -> list[Vector]:
+    """From the newest node of a tree to its root."""
+    path, at = [], len(nodes) - 1
+    while at >= 0:
+        path.append(nodes[at])
+        at = before[at]
+    return path

@@ -1,0 +1,51 @@
+"""Looks for a way out where the tool is stuck, beside the loop, and hands it to the loop."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from service.config import Settings
+from service.core.frame import Event, Frame, Record, order
+from service.daemon.skill_worker import SkillWorker
+from service.learning.skill_file import SkillError
+
+AGAIN_S = 2.0  # after which it is looked for once more, as what was in the way may have gone
+
+
+class WayFinder:
+    """One search at a time, in the skill worker."""
+
+    def __init__(
+        self, settings: Settings, worker: SkillWorker, send: Callable[[Event], object], say: Callable[[str], None]
+    ) -> None:
+        self._settings, self._worker, self._send, self._say = settings, worker, send, say
+        self._search: threading.Thread | None = None
+        self._next_s = 0.0
+
+    def poll(self, frame: Frame, state: Record) -> None:
+        """Begins a search where the arm is stuck and on no way out. Never waits."""
+        searching = self._search is not None and self._search.is_alive()
+        if not state["stuck"] or state["way_count"] or searching or time.monotonic() < self._next_s:
+            return
+        hands = np.array(frame["hands"])
+        arguments = state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands
+        self._search = threading.Thread(target=self._find, args=arguments, name="way out", daemon=True)
+        self._search.start()
+
+    def _find(self, *arguments: np.ndarray) -> None:
+        began_s = time.monotonic()
+        try:
+            found = self._worker.way_out(self._settings, *arguments)
+        except SkillError as error:
+            self._say(f"no way out was looked for: {error}")
+            return
+        finally:
+            self._next_s = time.monotonic() + AGAIN_S
+        self._send(order("way", json.dumps([posture.tolist() for posture in found])))
+        ways = f"a way out of {len(found)} postures" if found else "no way out"
+        self._say(f"the tool is stuck: {ways}, found in {time.monotonic() - began_s:.1f} s")
