@@ -13,9 +13,10 @@ from pathlib import Path
 
 import msgspec
 
-from service.client import endpoints, open_session
+from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.described_arm import SettingsError
 from service.launch import LaunchError, check_bench
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
@@ -40,12 +41,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="EP",
         action="append",
         default=[],
-        help=f"Zenoh endpoint of the service; may be repeated (default: {ENDPOINT})",
+        help=f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})",
     )
     p.add_argument(
         "--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated"
     )
-    p.add_argument("--cell", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    p.add_argument("--cell", help="prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument(
         "--scene",
         metavar="FILE",
@@ -124,8 +125,6 @@ def main(arguments: list[str] | None = None) -> int:
     """The exit code: 0, 1 on failure, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
-    if not (args.connect or args.listen):
-        args.connect = [ENDPOINT]
     if not 30 <= args.hands_rate <= 500:
         p.error(f"--hands-rate {args.hands_rate}: 30 to 500 accepted")
     if not 0.05 <= args.speed <= 20:
@@ -138,6 +137,9 @@ def main(arguments: list[str] | None = None) -> int:
             print(requests.encode_json(requests.Add(scene.via_points())).decode())
             return 0
         check_bench()
+        reach = client_settings(connect=args.connect, cell=args.cell)
+    except SettingsError as error:
+        p.error(str(error))
     except (SceneError, LaunchError) as error:
         print(f"python -m sim: {error}", file=sys.stderr)
         return 1
@@ -155,7 +157,7 @@ def main(arguments: list[str] | None = None) -> int:
         Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
     )
     live = Live(
-        cell=args.cell,
+        cell=reach.cell,
         hands_hz=args.hands_rate,
         once=args.once,
         duration_s=args.duration,
@@ -188,7 +190,8 @@ def main(arguments: list[str] | None = None) -> int:
         )
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
-        with Bench(script) as bench, open_session(connect=args.connect, listen=args.listen) as session:
+        session = open_session(connect=args.connect, listen=args.listen) if args.listen else reach.session()
+        with session, Bench(script) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)

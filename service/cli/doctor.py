@@ -16,8 +16,8 @@ import msgspec
 
 from service.cli.diagnosis import Finding, findings, wrong
 from service.cli.status import heard
-from service.cli.usage import CONNECT_TIMEOUT_S
-from service.client import Overheard, UnreachableError, open_session
+from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
+from service.client import Overheard, UnreachableError
 from service.contract.channels import ENDPOINT
 
 PROBE_S = 1.0
@@ -40,11 +40,10 @@ def doctor(args: argparse.Namespace) -> int:
 
 
 def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
-    connect = args.connect or [ENDPOINT]
     try:
-        session = open_session(connect=connect, timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate)
+        session = reached(args)
     except UnreachableError as error:
-        yield from (unreachable(endpoint, str(error)) for endpoint in connect)
+        yield from (unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT])
         return
     with session, Overheard(session, *PUBLISHED) as published:
         try:

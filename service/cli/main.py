@@ -17,12 +17,14 @@ from typing import Any
 
 from service import interrupt
 from service.cli import record_options
-from service.cli.usage import Parser, UsageError, check_cell, option, within
+from service.cli.usage import Parser, UsageError, option, reaching, within
+from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
+from service.described_arm import SettingsError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
@@ -31,7 +33,7 @@ RUN_BY = {  # the modules that are not named as their command
     "bench": "timing.benchmark",
 }
 SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
-ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself (default: $THIRDHAND_ZENOH_CONFIG)"
+ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 
 
@@ -121,7 +123,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command("record", record_options.ABOUT, record_options.EXAMPLE)
     record_options.add_options(c)
-    _reach(c, cell=None)
+    _reach(c)
 
     c = command(
         "report",
@@ -253,17 +255,19 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _reach(
-    sub: argparse.ArgumentParser, cell: str | None = "thirdhand", *, one: bool = True
-) -> argparse.ArgumentParser:
+def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.ArgumentParser:
     """The same parser, with the options by which a daemon is reached; `one`: and named."""
+    group = sub.add_argument_group(
+        "how it is reached", f"What is not given is taken from these variables, else from the file\n{CLIENT_FILE}."
+    )
     endpoint = "Zenoh endpoint of the daemon or of a router; of several the first that answers"
-    option(sub, "--connect", "EP", f"{endpoint} (default: {channels.ENDPOINT})", action="append")
+    option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
-        option(sub, "--cell", "NAME", "prefix of all keys" + " (default: as configured)" * (cell is None), cell)
-    role = "of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)"
-    option(sub, "--certificate", "DIR", role)
-    option(sub, "--zenoh-config", "FILE", ZENOH_CONFIG)
+        option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
+    role = "of one's role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
+    option(group, "--certificate", "DIR", role)
+    option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
+    sub.set_defaults(reaches=True)
     return sub
 
 
@@ -272,12 +276,12 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     module, function = args.run.rsplit(".", 1)
     try:
-        if "cell" in args and args.cell is not None:  # also rejects a wildcard, which would reach every cell
-            check_cell(args.cell)
+        if "reaches" in args and not vars(args).get("config"):
+            args.cell = reaching(args).cell
         run = getattr(importlib.import_module(f"service.{module}"), function)
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
-    except UsageError as error:
+    except (UsageError, SettingsError) as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended

@@ -14,11 +14,10 @@ from typing import Any, NoReturn
 
 import zenoh
 
-from service.client import open_session
-from service.config import RATES_HZ, converted
-from service.contract.channels import ENDPOINT
+from service.client import ClientSettings, client_settings
+from service.config import RATES_HZ
+from service.contract.channels import lacking
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
-from service.described_arm import SettingsError
 
 CONNECT_TIMEOUT_S = 3.0
 
@@ -50,28 +49,28 @@ def within(kind: type[float], low: float, high: float, unit: str = "") -> Callab
     return read
 
 
+def endpoint(given: str) -> str:
+    """Reads a Zenoh endpoint from the command line."""
+    if lacks := lacking(given):
+        raise argparse.ArgumentTypeError(lacks)
+    return given
+
+
 KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     **dict.fromkeys(("M", "S"), float),
     "HZ": within(int, *RATES_HZ, " Hz"),
+    "EP": endpoint,
 }
 
 
 def option(
-    c: argparse.ArgumentParser, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
+    c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
 ) -> None:
     """Adds an option or argument that takes a value; its help tells its default."""
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
     c.add_argument(name, metavar=metavar, help=about, default=default, **{"type": KINDS.get(metavar, str), **more})
-
-
-def check_cell(name: str) -> None:
-    """Raises UsageError where a cell cannot have this name."""
-    try:
-        converted({"cell": name}, origin="--cell")
-    except SettingsError as error:
-        raise UsageError(str(error)) from None
 
 
 def check_writable(path: Path, suffix: str = "") -> None:
@@ -89,15 +88,19 @@ def check_writable(path: Path, suffix: str = "") -> None:
         raise UsageError(f"{path} cannot be written: no permission")
 
 
-def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router that the command line names. Raises UnreachableError."""
-    return open_session(
-        connect=args.connect or (),
-        otherwise=[ENDPOINT],
-        timeout_s=timeout_s,
+def reaching(args: argparse.Namespace) -> ClientSettings:
+    """How the daemon or router is reached. Raises SettingsError."""
+    return client_settings(
+        connect=args.connect,
+        cell=vars(args).get("cell"),
         certificate=args.certificate,
         zenoh_config=args.zenoh_config,
     )
+
+
+def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A session to the daemon or router. Raises UnreachableError."""
+    return reaching(args).session(timeout_s=timeout_s)
 
 
 def added_in(path: Path) -> Add:

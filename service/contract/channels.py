@@ -10,6 +10,7 @@ only recorded, a hash in `ros2`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -18,6 +19,7 @@ from service.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
 LARGEST_REQUEST = 256 * 1024  # bytes
+_ENDPOINT = re.compile(r"[a-z]+/.+:.+|unixsock-stream/.+")
 PRESENCE = "daemon"  # below it each daemon's liveliness token, named by its Zenoh session
 PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
@@ -127,6 +129,15 @@ CHANNELS = (
 BY_KEY = {channel.key: channel for channel in CHANNELS}
 EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if channel.event is not None}
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
+
+
+def lacking(endpoint: str) -> str:
+    """What a Zenoh endpoint lacks to be one, in words; empty: nothing."""
+    if _ENDPOINT.fullmatch(endpoint):
+        return ""
+    address = re.sub(r"^[a-z]*:?/+", "", endpoint)
+    meant = f"tcp/{address}{'' if ':' in address else ':7447'}"
+    return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
 
 
 def key(cell: str, suffix: str) -> str:
