@@ -56,16 +56,13 @@ def main() -> None:
     p.add_argument("--swap", action="store_true", help="left and right: some versions take pictures for mirrored")
     p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
     args = p.parse_args()
-    client = client_settings(connect=args.connect)
-    vision = mp.tasks.vision
+    client, vision = client_settings(connect=args.connect), mp.tasks.vision
     options = vision.HandLandmarkerOptions(
         mp.tasks.BaseOptions(model_asset_path=args.model), running_mode=vision.RunningMode.VIDEO, num_hands=2
     )
     camera, names = cv2.VideoCapture(args.camera), ("right", "left") if args.swap else ("left", "right")
-    with (
-        vision.HandLandmarker.create_from_options(options) as landmarker,
-        client.session(timeout_s=None) as session,
-    ):
+    seeing = vision.HandLandmarker.create_from_options(options)
+    with seeing as landmarker, client.session(timeout_s=None) as session:
         hands = {side: session.declare_publisher(f"{client.cell}/hands/{side}") for side in names}
         while (read := camera.read())[0]:
             stamp_ns, (height, width) = time.time_ns(), read[1].shape[:2]

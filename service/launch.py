@@ -120,7 +120,7 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
     called with its progress. Raises LaunchError.
     """
     at = ("--connect", endpoint, "--cell", "thirdhand")
-    command, environment = python("-m", "sim", *at, "--once", "--json", "-", *arguments)
+    command, environment = python("-m", "sim", *at, "--once", "--output", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
     clock.start()

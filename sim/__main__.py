@@ -1,4 +1,4 @@
-"""`python -m sim`: the bench as a process, on Zenoh, in real time."""
+"""`thirdhand sim`: the bench as a process, on Zenoh, in real time."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 
+from service import interrupt
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
@@ -23,16 +24,16 @@ from sim.script import Clock, HandScript, Pause
 
 EXAMPLE = """example:
   thirdhand serve &
-  python -m sim --once --json report.json
+  thirdhand sim --once --output report.json
 """
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
-        prog="python -m sim",
+        prog="thirdhand sim",
         description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the "
-        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --json.",
+        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -62,10 +63,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--once",
         action="store_true",
-        help="end after one run; its report goes to standard output unless --json says otherwise",
+        help="end after one run; its report goes to standard output unless --output says otherwise",
     )
-    p.add_argument("--json", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
-    p.add_argument("--duration", metavar="S", type=float, default=float("inf"), help="end after so many seconds")
+    p.add_argument("--output", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
+    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
+    p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after so long")
+    p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
     p.add_argument(
         "--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)"
@@ -141,14 +144,19 @@ def main(arguments: list[str] | None = None) -> int:
     except SettingsError as error:
         p.error(str(error))
     except (SceneError, LaunchError) as error:
-        print(f"python -m sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
     from sim.bench import Bench  # PyBullet, which may not be there
     from sim.network import BenchError, Dropout, Live, RunReport, run
 
-    stop = threading.Event()
+    stop, came = threading.Event(), list[int]()
+
+    def end(number: int, _: object) -> None:
+        came.append(number)
+        stop.set()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, end)
     try:
         Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
@@ -160,11 +168,11 @@ def main(arguments: list[str] | None = None) -> int:
         cell=reach.cell,
         hands_hz=args.hands_rate,
         once=args.once,
-        duration_s=args.duration,
+        duration_s=args.seconds,
         wait_s=args.wait,
         dropout=dropout,
     )
-    target = args.json or ("-" if args.once else None)
+    target = args.output or ("-" if args.once else None)
 
     def report(result: RunReport) -> None:
         line = msgspec.json.encode(result).decode() + "\n"
@@ -196,9 +204,9 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
     except (BenchError, OSError) as error:
-        print(f"python -m sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
-    return 0
+    return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 
 if __name__ == "__main__":

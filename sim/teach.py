@@ -11,6 +11,7 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -114,7 +115,9 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
     return msgspec.convert(rows, tuple[ViaPoint, ...])
 
 
-def perform(scene: Scene, *, seed: int, reach: ClientSettings, speed: float, wait_s: float, rate_hz: int = 100) -> bool:
+def perform(
+    scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
+) -> bool:
     """Publishes one demonstration in real time, as a tracker of hands and tool would, from when
     somebody listens to the hands until nobody does: they rest for BEFORE_S first, and AFTER_S at
     the end.
@@ -122,9 +125,9 @@ def perform(scene: Scene, *, seed: int, reach: ClientSettings, speed: float, wai
     Whether somebody listened to its end. Raises UnreachableError.
     """
     script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
-    with reach.session(timeout_s=wait_s) as session:
+    with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
-        publishers = [session.declare_publisher(key(reach.cell, name)) for name in names]
+        publishers = [session.declare_publisher(key(cell, name)) for name in names]
         until, of_hands = time.monotonic() + wait_s, publishers[:2]
         while not _are_heard(of_hands):
             if time.monotonic() > until:
@@ -228,7 +231,9 @@ def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) 
     """The exit code: 1 where nobody listened to the end of each."""
     seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
-        heard = perform(scene, seed=1000 * seed + number, reach=reach, speed=args.speed, wait_s=args.wait)
+        heard = perform(
+            scene, seed=1000 * seed + number, connect=reach.connect, cell=reach.cell, speed=args.speed, wait_s=args.wait
+        )
         if not heard:
             print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)
             return 1

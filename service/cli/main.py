@@ -32,8 +32,16 @@ RUN_BY = {  # the modules that are not named as their command
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
-SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
+SIM = "The PyBullet bench: publishes hands and joint states, and follows commands."
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
+GROUPS = {
+    "run": ("demo", "serve", "sim", "play"),
+    "stop and go on": ("hold", "resume", "reset"),
+    "teach": ("record", "learn", "via-points"),
+    "look": ("status", "view", "report"),
+    "check": ("doctor", "cells", "replay", "bench"),
+    "set up": ("certificates", "completion"),
+}
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 
 
@@ -42,10 +50,11 @@ def parser() -> argparse.ArgumentParser:
     top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
-        epilog="example: thirdhand demo",
+        epilog="thirdhand COMMAND --help tells more, with an example. Begin with: thirdhand demo",
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    abouts: dict[str, str] = {}
 
     def described(among: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:
         added: argparse.ArgumentParser = among.add_parser(
@@ -58,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
         return added
 
     def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
-        sub = described(commands_of, name, about, example)
+        sub, abouts[name] = described(commands_of, name, about, example), about
         sub.set_defaults(run=f"{RUN_BY.get(name, f'cli.{name}')}.{name.replace('-', '_')}")
         return sub
 
@@ -67,21 +76,21 @@ def parser() -> argparse.ArgumentParser:
         "The soldering scenario, closed loop and headless: bench, service and scribe.",
         "thirdhand demo --scene my-scene.toml",
     )
-    option(c, "--out", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
+    option(c, "--output", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
     option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
-    option(c, "--seconds", "S", "to measure for", 24.0)
+    option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
     option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
     other = c.add_mutually_exclusive_group()
     other.add_argument(
-        "--loads", action="store_true", help="what happens beside the loop instead, each for so many seconds"
+        "--loads", action="store_true", help="what happens beside the loop instead, each for these seconds"
     )
-    other.add_argument("--soak", metavar="MIN", type=float, help="memory and open files over so many minutes instead")
+    other.add_argument("--soak", action="store_true", help="memory and open files instead, a sample each 5 s at most")
 
     c = command(
         "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
@@ -228,7 +237,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--days", "N", "that they are valid", 3650, type=int)
 
     # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
-    c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
+    c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
     c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
 
@@ -238,12 +247,19 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
     )
     _reach(c)
-    c.add_argument("file", metavar="FILE|live", help="an .rrd or .mcap file, or `live`")
+    option(c, "file", "FILE|live", "an .rrd or .mcap file, or `live`")
     option(c, "--screenshot", "PNG", "write a picture instead of opening a window")
     option(c, "--time", "S", "of the picture, from the recording's start (default: its end)")
     web = "with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)"
     option(c, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     option(c, "--tab", None, "of the picture", "task", choices=("task", "timing", "learning"))
+
+    about, example = "Prints what lets a shell complete these commands and their options.", "thirdhand completion bash"
+    c = command("completion", about, f"{example} > ~/.local/share/bash-completion/completions/thirdhand")
+    c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    top.groups = {
+        title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
+    }
     return top
 
 

@@ -8,7 +8,7 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,7 +27,24 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest choice for an unknown one."""
+    """A parser that suggests the nearest choice for an unknown one. `groups` are its commands by
+    what they are for, each with what it does, as its help lists them.
+    """
+
+    groups: Mapping[str, Mapping[str, str]] = {}
+
+    def format_help(self) -> str:
+        """Usage, and the commands in their groups."""
+        if not self.groups:
+            return super().format_help()
+        shown = argparse.HelpFormatter(self.prog, max_help_position=15)
+        shown.add_text(self.description)
+        for title, commands in self.groups.items():
+            shown.start_section(title)
+            shown.add_arguments(argparse.Action([], name, help=about) for name, about in commands.items())
+            shown.end_section()
+        shown.add_text(self.epilog)
+        return f"{self.format_usage()}\n{shown.format_help()}"
 
     def error(self, message: str) -> NoReturn:
         """Prints usage and message, and exits with code 2."""
@@ -63,6 +80,12 @@ KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for
     "EP": endpoint,
 }
 
+FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
+COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
+    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live"), FILES),
+    "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
+}
+
 
 def option(
     c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
@@ -70,7 +93,10 @@ def option(
     """Adds an option or argument that takes a value; its help tells its default."""
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
-    c.add_argument(name, metavar=metavar, help=about, default=default, **{"type": KINDS.get(metavar, str), **more})
+    more = {"type": KINDS.get(metavar, str), **more}
+    added = c.add_argument(name, metavar=metavar, help=about, default=default, **more)
+    if metavar in COMPLETED:
+        added.complete = COMPLETED[metavar]  # type: ignore[attr-defined]  # as shtab reads it
 
 
 def check_writable(path: Path, suffix: str = "") -> None:

@@ -135,8 +135,10 @@ def lacking(endpoint: str) -> str:
     """What a Zenoh endpoint lacks to be one, in words; empty: nothing."""
     if _ENDPOINT.fullmatch(endpoint):
         return ""
-    address = re.sub(r"^[a-z]*:?/+", "", endpoint)
-    meant = f"tcp/{address}{'' if ':' in address else ':7447'}"
+    host, _, port = re.sub(r"^[a-z]*:?/+", "", endpoint).rpartition(":")
+    if not host and not port.isdecimal():
+        host, port = port, "7447"
+    meant = f"tcp/{host or '127.0.0.1'}:{port}"
     return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
 
 

@@ -174,8 +174,9 @@ def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytes
         other.listen()
         assert main(["doctor", "--connect", f"tcp/127.0.0.1:{other.getsockname()[1]}"]) == 1
     assert "opens no Zenoh session" in capsys.readouterr().out
-    assert main(["doctor", "--connect", "7447"]) == 1
-    assert "an endpoint like tcp/127.0.0.1:7447" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["doctor", "--connect", "7447"])
+    assert "needed: tcp/127.0.0.1:7447 ?" in capsys.readouterr().err
 
 
 def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
