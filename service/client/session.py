@@ -47,8 +47,8 @@ def open_session(
     `zenoh_config`, a file of Zenoh's own, overrides that; all else set here overrides the file. A
     client without `connect` takes the file's endpoints, or else those in `otherwise`.
 
-    It is tried for `timeout_s` [s]; None: until Ctrl-C, and that it waits is said once on standard
-    error, so that it does not matter who is started first.
+    It is tried for `timeout_s` [s]. None, where it only connects: until Ctrl-C, and that it waits
+    is said once on standard error, so that it does not matter who is started first.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
     begin with `tls/`. Where one of the two is None, $THIRDHAND_CERTIFICATE or
@@ -78,12 +78,16 @@ def open_session(
         **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
         **(more or {}),
     }
-    try:
-        for name, value in settings.items():
-            config.insert_json5(name, json.dumps(value))
-    except zenoh.ZError as error:
-        raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
-    return tried(lambda: _opened(config, connect, listen), None if timeout_s is None else 0.0)
+
+    def opened() -> zenoh.Session:
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
+
+    return tried(opened, None if timeout_s is None and not listen else 0.0)
 
 
 def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
@@ -104,21 +108,13 @@ def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
             time.sleep(RETRY_S)
 
 
-def _opened(config: zenoh.Config, connect: Sequence[str], listen: Sequence[str]) -> zenoh.Session:
-    """An open session. Raises UnreachableError."""
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
-
-
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     """The reason why there is no session between these endpoints, in words."""
     if connect and "connect" in reason:
         secured = any(endpoint.startswith("tls/") for endpoint in connect)
         return (
             f"nobody answers at {', '.join(connect)}: "
-            "is a daemon running and listening there, or a router, and not overrun?"
+            "is a daemon running and listening there, `thirdhand record --listen` or a router, and not overrun?"
             + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
             "not expired?" * secured
         )

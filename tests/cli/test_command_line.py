@@ -64,7 +64,8 @@ def test_the_bench_goes_by_its_own_name() -> None:
         ("127.0.0.1:1", "tcp/127.0.0.1:1"),
         ("localhost", "tcp/localhost:7447"),
         ("tcp://127.0.0.1:1", "tcp/127.0.0.1:1"),
-        ("tcp/bench", "tcp/bench:7447"),
+        ("tls/bench", "tls/bench:7447"),
+        ("7447", "tcp/127.0.0.1:7447"),
     ],
 )
 @pytest.mark.parametrize("command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")])
