@@ -24,7 +24,7 @@ from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
-from service.described_arm import SettingsError
+from service.described_arm import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
@@ -299,7 +299,7 @@ def main(arguments: list[str] | None = None) -> int:
             return int(run(args))
     except (UsageError, SettingsError) as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
-        return 2
+        return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1

@@ -15,7 +15,7 @@ from service.client.session import open_session
 from service.config import Cell
 from service.contract.channels import ENDPOINT, lacking
 from service.contract.explain import InvalidError, validated
-from service.described_arm import SettingsError
+from service.described_arm import SettingsError, UnreadableError
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
 
@@ -55,21 +55,22 @@ def client_settings(
     certificate: str | Path | None = None,
     zenoh_config: str | Path | None = None,
 ) -> ClientSettings:
-    """The settings of a client. What is None or empty is taken from $THIRDHAND_CONNECT (endpoints
-    with commas between), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE and $THIRDHAND_ZENOH_CONFIG, else
-    from the file, else it is the default.
+    """The settings of a client. What is None is taken from $THIRDHAND_CONNECT (endpoints with
+    commas between), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE and $THIRDHAND_ZENOH_CONFIG, else from
+    the file, else it is the default.
 
     Raises SettingsError, which names the file, variable or option that is wrong.
     """
     path = _file()
     found = {} if path is None else _checked(str(path), _read(path))
-    for name in ClientSettings.__struct_fields__:
-        if value := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
-            listed = [part.strip() for part in value.split(",")] if name == "connect" else value
-            found |= _checked(f"${variable}", {name: listed})
     given = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
-    options = {name: value if name == "connect" else str(value) for name, value in given.items() if value}
-    return msgspec.convert(found | _checked("as given", options), ClientSettings)
+    for name, option in given.items():
+        if told := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
+            listed = [part.strip() for part in told.split(",")] if name == "connect" else told
+            found |= _checked(f"${variable}", {name: listed})
+        if option or option == "":
+            found |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
+    return msgspec.convert(found, ClientSettings)
 
 
 def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -95,8 +96,10 @@ def _read(path: Path) -> dict[str, Any]:
     """What a client's file holds; paths in it are relative to its folder. Raises SettingsError."""
     try:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise SettingsError(f"cannot read client settings {path}: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadableError(f"cannot read client settings {path}: {error}") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise SettingsError(f"{path}: {error}") from None
     if isinstance(given.get("connect"), str):
         given["connect"] = [given["connect"]]
     for name in ("certificate", "zenoh_config"):

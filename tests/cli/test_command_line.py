@@ -85,7 +85,9 @@ def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path, capsys: py
 # --- exit codes, as docs/incidents.md promises them -----------------------------------------------
 
 
-def test_a_configuration_that_cannot_be_meant_is_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config, demonstration = tmp_path / "cell.toml", str(RECORDINGS / "demonstration-1.mcap")
     config.write_text("rate_hz = 3\n")
     missing = str(tmp_path / "none.toml")
@@ -94,9 +96,9 @@ def test_a_configuration_that_cannot_be_meant_is_2(tmp_path: Path, capsys: pytes
         ("record", "--list"),
         ("learn", demonstration, "--output", str(tmp_path / "skill.npz")),
     ):
-        for path in (str(config), missing):
+        for path, expected in ((str(config), 2), (missing, 1)):
             code, text = told(*command, "--config", path, capsys=capsys)
-            assert (code, path in text) == (2, True), text
+            assert (code, path in text) == (expected, True), text
 
 
 @pytest.mark.parametrize(
@@ -117,6 +119,7 @@ def test_a_configuration_that_cannot_be_meant_is_2(tmp_path: Path, capsys: pytes
         (2, ()),
         (2, ("status", "--cell", "*")),
         (2, ("serve", "--cell", "*")),
+        (2, ("hold", "--cell", "")),
         (2, ("record",)),
         (2, ("bench", "--seconds", "-1")),
         (2, ("demo", "--rate", "3")),
