@@ -5,9 +5,11 @@ joints, and brakes where commands end. Try: python examples/follower.py --second
 from __future__ import annotations
 
 import argparse
+import contextlib
+import math
 import time
 
-from service.client import Follower, open_session
+from service.client import Follower, client_settings
 from service.config import Settings
 
 PERIOD_S = 0.005
@@ -16,11 +18,11 @@ PERIOD_S = 0.005
 def main(arguments: list[str] | None = None) -> list[float]:
     """The joints [rad] after so many seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--connect", action="append", help="of the daemon or a router")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
-    names, joints = Settings().joints.names, list(Settings().arm.posture)
-    with open_session(connect=[args.connect]) as session, Follower(session, names) as follower:
+    client, names, joints = client_settings(connect=args.connect), Settings().joints.names, list(Settings().arm.posture)
+    with client.session(timeout_s=None) as session, Follower(session, names, client.cell) as follower:
         begin, braking = time.monotonic(), True
         while time.monotonic() - begin < args.seconds:
             command = follower.command()  # waits for one, 20 ms at most
@@ -41,4 +43,5 @@ def main(arguments: list[str] | None = None) -> list[float]:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

@@ -7,13 +7,14 @@ Frame `camera`: x to the right in the picture, y down, z away from the camera, i
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.client import open_session
+from service.client import client_settings
 from service.contract.cdr import encode_pose
 from service.contract.messages import PoseStamped
 
@@ -53,15 +54,16 @@ def main() -> None:
     p.add_argument("--camera", type=int, default=0)
     p.add_argument("--focal", type=float, default=900.0, help="length in pixels, by the camera's calibration")
     p.add_argument("--swap", action="store_true", help="left and right: some versions take pictures for mirrored")
-    p.add_argument("--connect", default="tcp/127.0.0.1:7447")
+    p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
     args = p.parse_args()
-    vision = mp.tasks.vision
+    client, vision = client_settings(connect=args.connect), mp.tasks.vision
     options = vision.HandLandmarkerOptions(
         mp.tasks.BaseOptions(model_asset_path=args.model), running_mode=vision.RunningMode.VIDEO, num_hands=2
     )
     camera, names = cv2.VideoCapture(args.camera), ("right", "left") if args.swap else ("left", "right")
-    with vision.HandLandmarker.create_from_options(options) as landmarker, open_session(connect=[args.connect]) as cell:
-        hands = {side: cell.declare_publisher(f"thirdhand/hands/{side}") for side in names}
+    seeing = vision.HandLandmarker.create_from_options(options)
+    with seeing as landmarker, client.session(timeout_s=None) as session:
+        hands = {side: session.declare_publisher(f"{client.cell}/hands/{side}") for side in names}
         while (read := camera.read())[0]:
             stamp_ns, (height, width) = time.time_ns(), read[1].shape[:2]
             image = mp.Image(image_format=mp.ImageFormat.SRGB, data=cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB))
@@ -73,4 +75,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

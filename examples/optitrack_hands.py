@@ -8,11 +8,12 @@ it is. A third body may be the tool, for demonstrations: `--tool 3`.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from service.client import open_session
+from service.client import client_settings
 from service.contract.cdr import encode_pose
 from service.contract.messages import PoseStamped
 
@@ -39,12 +40,13 @@ def main() -> None:
     p.add_argument("--local", default="127.0.0.1", help="address of this machine on that network")
     for name in ("left", "right", "tool"):
         p.add_argument(f"--{name}", type=int, required=name != "tool", help="number of its rigid body")
-    p.add_argument("--connect", default="tcp/127.0.0.1:7447")
-    p.add_argument("--cell", default="thirdhand")
+    p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    p.add_argument("--cell")
     args = p.parse_args()
+    settings = client_settings(connect=args.connect, cell=args.cell)
     keys = {args.left: "hands/left", args.right: "hands/right", args.tool: "tool/pose"}
-    with open_session(connect=[args.connect]) as session:
-        publishers = {key: session.declare_publisher(f"{args.cell}/{key}") for key in keys.values()}
+    with settings.session(timeout_s=None) as session:
+        publishers = {key: session.declare_publisher(f"{settings.cell}/{key}") for key in keys.values()}
 
         def publish(frame: DataFrame) -> None:
             for key, pose in poses(frame.rigid_bodies, keys, time.time_ns()):
@@ -59,4 +61,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

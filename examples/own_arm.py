@@ -1,21 +1,23 @@
 """One's own arm on thirdhand's wire: a driver to begin from. Put the arm's library in `FakeArm`'s
-place; what else a driver owes is in docs/hardware.md.
+place; what else a driver owes is in docs/hardware.md. Give it the daemon's settings:
 
-    python examples/own_arm.py tcp/127.0.0.1:7447 thirdhand
+    python examples/own_arm.py --config cell.toml
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import math
-import sys
 import threading
 import time
+from pathlib import Path
 
 import zenoh
 from zenoh.handlers import RingChannel
 
-from service.client import Client, open_session
+from service.client import client_settings
+from service.config import Settings, load
 from service.contract.cdr import decode_joints, encode_joints
 from service.contract.messages import JointState, WireError, finite, in_order
 
@@ -74,14 +76,19 @@ def command_in(sample: zenoh.Sample | None, names: tuple[str, ...]) -> tuple[Joi
 
 def main() -> None:
     """Drives a fake arm until Ctrl-C."""
-    endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
-    cell = sys.argv[2] if len(sys.argv) > 2 else "thirdhand"
-    with contextlib.suppress(KeyboardInterrupt), open_session(connect=[endpoint]) as session:
-        names = tuple(Client(session, cell).ask("status")["joints"])
-        arm = FakeArm(names, (0.0, 0.8, 0.0, 2.2, 0.0, -1.0, 0.0)[: len(names)])
-        print(f"{', '.join(names)} of cell {cell} are driven; Ctrl-C ends it")
-        drive(arm, session, cell, threading.Event())
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", type=Path, help="settings of the cell: joints, and where they begin, [arm] posture")
+    parser.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    parser.add_argument("--cell", help="prefix of all keys, else as configured")
+    args = parser.parse_args()
+    settings = load(args.config) if args.config else Settings()
+    client = client_settings(connect=args.connect, cell=args.cell or (settings.cell if args.config else None))
+    arm = FakeArm(settings.joints.names, settings.arm.posture)
+    with client.session(timeout_s=None) as session:
+        print(f"{', '.join(arm.names)} of cell {client.cell} are driven; Ctrl-C ends it", flush=True)
+        drive(arm, session, client.cell, threading.Event())
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

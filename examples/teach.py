@@ -5,8 +5,9 @@ Try: python examples/teach.py
 from __future__ import annotations
 
 import argparse
+import contextlib
 
-from service.client import Client, RefusedError, open_session
+from service.client import Client, RefusedError, client_settings
 from service.contract.requests import ViaPoint
 
 HANDOVER = ViaPoint(
@@ -23,10 +24,12 @@ HANDOVER = ViaPoint(
 def main(arguments: list[str] | None = None) -> None:
     """Prints what the daemon answers."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
+    parser.add_argument("--connect", action="append", help="of the daemon or a router")
     args = parser.parse_args(arguments)
-    with open_session(connect=[args.connect]) as session:
-        client = Client(session)
+    settings = client_settings(connect=args.connect)
+    with settings.session(timeout_s=None) as session:
+        client = Client(session, settings.cell)
+        client.wait_until_ready(timeout_s=None)
         reply = client.add([HANDOVER])
         print(f"in force since tick {reply.tick}")
         for point in client.places():
@@ -39,4 +42,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

@@ -5,10 +5,11 @@ camera's poses in their place. Try: python examples/tracker.py --seconds 20
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import time
 
-from service.client import Tracker, open_session
+from service.client import Tracker, client_settings
 
 RATE_HZ = 100
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # frame base [m]: x forward from the arm, y to its left, z up
@@ -17,10 +18,14 @@ LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # frame base [m]: x forwa
 def main(arguments: list[str] | None = None) -> None:
     """Publishes for so many seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
-    with open_session(connect=[args.connect]) as session, Tracker(session) as tracker:
+    client = client_settings(connect=args.connect)
+    with (
+        client.session(timeout_s=None) as session,  # None: it waits for who listens, whoever is started first
+        Tracker(session, client.cell, timeout_s=None) as tracker,
+    ):
         begin = time.monotonic()
         while (t := time.monotonic() - begin) < args.seconds:
             sway = 0.02 * math.sin(2 * math.pi * 0.3 * t)
@@ -31,4 +36,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

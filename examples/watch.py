@@ -5,19 +5,21 @@ Try: python examples/watch.py --seconds 60
 from __future__ import annotations
 
 import argparse
+import contextlib
+import math
 import time
 
-from service.client import cells, open_session
+from service.client import cells, client_settings
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Watches for so many seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="of the daemon or a router")
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--connect", action="append", help="of the daemon or a router")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
     said: dict[str, str] = {}
-    with open_session(connect=[args.connect]) as session:
+    with client_settings(connect=args.connect).session(timeout_s=None) as session:
         end = time.monotonic() + args.seconds
         while time.monotonic() < end:
             now = {
@@ -32,4 +34,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

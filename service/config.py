@@ -15,7 +15,7 @@ import msgspec
 
 from service.contract import ros2
 from service.contract.explain import InvalidError, validated
-from service.described_arm import SettingsError, check, completed
+from service.described_arm import SettingsError, UnreadableError, check, completed
 from service.network_settings import Network
 from service.urdf import Urdf, UrdfError
 
@@ -353,9 +353,9 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
 
 
 def load(path: Path) -> Settings:
-    """Settings from a TOML file. Raises SettingsError."""
+    """Settings from a TOML file. Raises SettingsError, UnreadableError."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"cannot read configuration {path}: {error}") from None
+        raise UnreadableError(f"cannot read configuration {path}: {error}") from None
     return parse(text, origin=str(path), folder=path.parent)

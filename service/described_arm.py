@@ -16,6 +16,10 @@ class SettingsError(ExplainedError, ValueError):
     """A configuration that cannot be used: names the field, what was given and what is accepted."""
 
 
+class UnreadableError(SettingsError):
+    """A file of settings that cannot be read."""
+
+
 class Limits(Protocol):
     """The joints' settings, as far as a URDF says them."""
 

@@ -119,7 +119,8 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
     """The report of one run of the bench (`python -m sim` with the arguments) as JSON; `say` is
     called with its progress. Raises LaunchError.
     """
-    command, environment = python("-m", "sim", "--connect", endpoint, "--once", "--json", "-", *arguments)
+    at = ("--connect", endpoint, "--cell", "thirdhand")
+    command, environment = python("-m", "sim", *at, "--once", "--output", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
     clock.start()

@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 
 from service.contract import ros2
-from service.contract.channels import ENDPOINT
+from service.contract.channels import ENDPOINT, lacking
 from service.contract.roles import DAEMON, ROLES, names
 
 Domain = Annotated[
@@ -45,6 +45,8 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def __post_init__(self) -> None:
         given = {"listen": self.listen, "connect": self.connect}
         for name, endpoint in ((f"{key}[{i}]", one) for key, some in given.items() for i, one in enumerate(some)):
+            if lacks := lacking(endpoint):
+                raise ValueError(f"$.network.{name}: {lacks}")
             if self.certificate and not endpoint.startswith("tls/"):
                 raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
             if not self.certificate and endpoint.startswith("tls/"):

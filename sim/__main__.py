@@ -1,4 +1,4 @@
-"""`python -m sim`: the bench as a process, on Zenoh, in real time."""
+"""`thirdhand sim`: the bench as a process, on Zenoh, in real time."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from pathlib import Path
 
 import msgspec
 
-from service.client import endpoints, open_session
+from service import interrupt
+from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.described_arm import SettingsError
 from service.launch import LaunchError, check_bench
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 
 EXAMPLE = """example:
   thirdhand serve &
-  python -m sim --once --json report.json
+  thirdhand sim --once --output report.json
 """
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
-        prog="python -m sim",
+        prog="thirdhand sim",
         description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the "
-        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --json.",
+        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -40,12 +42,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="EP",
         action="append",
         default=[],
-        help=f"Zenoh endpoint of the service; may be repeated (default: {ENDPOINT})",
+        help=f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})",
     )
     p.add_argument(
         "--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated"
     )
-    p.add_argument("--cell", default="thirdhand", help="prefix of all keys (default: %(default)s)")
+    p.add_argument("--cell", help="prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument(
         "--scene",
         metavar="FILE",
@@ -61,10 +63,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--once",
         action="store_true",
-        help="end after one run; its report goes to standard output unless --json says otherwise",
+        help="end after one run; its report goes to standard output unless --output says otherwise",
     )
-    p.add_argument("--json", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
-    p.add_argument("--duration", metavar="S", type=float, default=float("inf"), help="end after so many seconds")
+    p.add_argument("--output", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
+    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
+    p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after so long")
+    p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
     p.add_argument(
         "--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)"
@@ -124,8 +128,6 @@ def main(arguments: list[str] | None = None) -> int:
     """The exit code: 0, 1 on failure, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
-    if not (args.connect or args.listen):
-        args.connect = [ENDPOINT]
     if not 30 <= args.hands_rate <= 500:
         p.error(f"--hands-rate {args.hands_rate}: 30 to 500 accepted")
     if not 0.05 <= args.speed <= 20:
@@ -138,15 +140,23 @@ def main(arguments: list[str] | None = None) -> int:
             print(requests.encode_json(requests.Add(scene.via_points())).decode())
             return 0
         check_bench()
+        reach = client_settings(connect=args.connect, cell=args.cell)
+    except SettingsError as error:
+        p.error(str(error))
     except (SceneError, LaunchError) as error:
-        print(f"python -m sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
     from sim.bench import Bench  # PyBullet, which may not be there
     from sim.network import BenchError, Dropout, Live, RunReport, run
 
-    stop = threading.Event()
+    stop, came = threading.Event(), list[int]()
+
+    def end(number: int, _: object) -> None:
+        came.append(number)
+        stop.set()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, end)
     try:
         Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
@@ -155,14 +165,14 @@ def main(arguments: list[str] | None = None) -> int:
         Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
     )
     live = Live(
-        cell=args.cell,
+        cell=reach.cell,
         hands_hz=args.hands_rate,
         once=args.once,
-        duration_s=args.duration,
+        duration_s=args.seconds,
         wait_s=args.wait,
         dropout=dropout,
     )
-    target = args.json or ("-" if args.once else None)
+    target = args.output or ("-" if args.once else None)
 
     def report(result: RunReport) -> None:
         line = msgspec.json.encode(result).decode() + "\n"
@@ -188,14 +198,15 @@ def main(arguments: list[str] | None = None) -> int:
         )
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
-        with Bench(script) as bench, open_session(connect=args.connect, listen=args.listen) as session:
+        session = open_session(connect=args.connect, listen=args.listen) if args.listen else reach.session()
+        with session, Bench(script) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
     except (BenchError, OSError) as error:
-        print(f"python -m sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
-    return 0
+    return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 
 if __name__ == "__main__":

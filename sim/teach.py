@@ -11,18 +11,20 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import zenoh
 
-from service.client import open_session
+from service.client import ClientSettings, client_settings
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
 from service.demonstrations.demonstration_reader import write_demonstration
+from service.described_arm import SettingsError
 from service.learning.demonstration import Demonstration
 from sim import sessions
 from sim.people import Places
@@ -114,7 +116,7 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 
 
 def perform(
-    scene: Scene, *, seed: int, connect: list[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
+    scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
 ) -> bool:
     """Publishes one demonstration in real time, as a tracker of hands and tool would, from when
     somebody listens to the hands until nobody does: they rest for BEFORE_S first, and AFTER_S at
@@ -123,7 +125,7 @@ def perform(
     Whether somebody listened to its end. Raises UnreachableError.
     """
     script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
-    with open_session(connect=connect, timeout_s=wait_s) as session:
+    with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
         publishers = [session.declare_publisher(key(cell, name)) for name in names]
         until, of_hands = time.monotonic() + wait_s, publishers[:2]
@@ -169,7 +171,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--live", action="store_true", help="publish them instead, each from when somebody listens to the hands"
     )
     p.add_argument(
-        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint to publish at (default: {ENDPOINT})"
+        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
     )
     p.add_argument("--speed", metavar="X", type=float, default=1.0, help="times as fast (default: %(default)s)")
     p.add_argument(
@@ -188,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
         action="store_true",
         help="by modelled people, two of each, with things moved and named: what is learned between places",
     )
-    p.add_argument("--cell", default="thirdhand", help="prefix of topics and keys (default: %(default)s)")
+    p.add_argument("--cell", help="prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument("--gripper", action="store_true", help="tell what the gripper does, too")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
@@ -203,8 +205,9 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
+        reach = client_settings(connect=args.connect, cell=args.cell)
         if args.live:
-            return _perform_all(scene, args)
+            return _perform_all(scene, args, reach)
         args.output.mkdir(parents=True, exist_ok=True)
         seed = scene.seed if args.seed is None else args.seed
         made = (
@@ -214,20 +217,22 @@ def main(arguments: list[str] | None = None) -> int:
         )
         for number, taught in enumerate(made, start=1):
             path = args.output / f"demonstration-{number}.mcap"
-            write_demonstration(path, taught, cell=args.cell)
+            write_demonstration(path, taught, cell=reach.cell)
             print(path)
+    except SettingsError as error:
+        p.error(str(error))
     except (SceneError, OSError) as error:
         print(f"python -m sim.teach: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _perform_all(scene: Scene, args: argparse.Namespace) -> int:
+def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) -> int:
     """The exit code: 1 where nobody listened to the end of each."""
-    connect, seed = args.connect or [ENDPOINT], scene.seed if args.seed is None else args.seed
+    seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
         heard = perform(
-            scene, seed=1000 * seed + number, connect=connect, cell=args.cell, speed=args.speed, wait_s=args.wait
+            scene, seed=1000 * seed + number, connect=reach.connect, cell=reach.cell, speed=args.speed, wait_s=args.wait
         )
         if not heard:
             print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)

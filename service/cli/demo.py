@@ -34,7 +34,7 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Exit code 0 only if the task succeeded and the recording lacks nothing."""
-    report = run(args.out, scene=args.scene, rate_hz=args.rate, say=say)
+    report = run(args.output, scene=args.scene, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
 

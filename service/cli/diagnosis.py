@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
@@ -24,6 +25,12 @@ MOST_OTHERS = 4  # keys that are named
 ROOM_MB = 2000.0
 MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
 OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
+STALLED_US = 20_000.0  # late by more a loop leaves an arm without commands, and reads none of its joints
+TOLD_RAD, STUCK = 0.03, 0.1  # what a joint is told to travel before it can be stuck, and the share that it did
+OFF_M, LONG_S = 0.05, 1.5  # a tool farther off its target, and for longer, does not only lag
+LEVEL_M, RAISED_M = 0.03, 0.10  # of hands: the span of z, and of y, by which y looks to be the height
+Y_UP = (0.0, 0.0, 0.0, 0.7071, 0.0, 0.0, 0.7071)  # base_from_tracker of a tracker whose y points up
+LEVELS = ("wrong", "note", "ok")
 OWN_CLOCK_S = 0.5  # a status is up to 0.1 s old
 
 
@@ -54,22 +61,44 @@ def judged(fine: bool, what: str, found: str, wanted: str, remedy: str) -> Findi
 
 
 def findings(
-    before: Status, now: Status, *, own_ns: int, own_version: str, published: Sequence[str] = ()
-) -> Iterator[Finding]:
-    """What is to be said of a cell; `own_ns` and `own_version` are time and version here, and
-    `published` the keys on which hands and joints were heard, in whatever cell.
+    *seen: Status,
+    own_ns: int,
+    own_version: str,
+    published: Sequence[str] = (),
+    travels: Mapping[str, tuple[float, float]] | None = None,
+) -> list[Finding]:
+    """What is to be said of a cell by its statuses: what is wrong first, causes before what follows
+    from them.
+
+    `own_ns` and `own_version` are time and version here, `published` the keys on which hands and
+    joints were heard, in whatever cell, and `travels` how far each joint was told to go, and went,
+    since the first status [rad].
     """
+    found = _in_order_of_cause(seen, own_ns, own_version, published, travels or {})
+    return sorted(found, key=lambda finding: LEVELS.index(finding.level))
+
+
+def _in_order_of_cause(
+    seen: Sequence[Status],
+    own_ns: int,
+    own_version: str,
+    published: Sequence[str],
+    travels: Mapping[str, tuple[float, float]],
+) -> Iterator[Finding]:
+    before, now = seen[0], seen[-1]
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
     yield judged(now.version == own_version, "daemon", found, wanted, "update the older one")
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", "wait: the first start on a machine compiles for half a minute")
         return
-    yield _mode(now)
     for name in now.sources:
         yield from _source(before, now, name, published)
-    yield _driver(now)
-    yield from _hands_and_skill(now)
+    yield _driver(before, now)
+    yield from _drives(travels)
+    yield from _hands_and_skill(seen)
+    yield _mode(before, now)
+    yield from _tool(seen)
     yield from _machine(before, now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
@@ -77,10 +106,48 @@ def findings(
         yield Finding("note", "clock here", told, f"within {OWN_CLOCK_S:g} s", "synchronise the clocks (chrony, PTP)")
 
 
-def _mode(now: Status) -> Finding:
+def _mode(before: Status, now: Status) -> Finding:
     told = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
+    told += f": {now.because}" if now.because else ""
+    advice = now.remedy
+    if now.reason in ("arm_silent", "arm_error") and not _keeps_time(before, now):
+        told += f"; {now.missed} deadlines are missed: this machine or the bench could not keep time"
+        advice = "see what else runs there, `thirdhand bench` measures it; a lower --rate; then `thirdhand reset`"
+    elif now.reason == "arm_error":
+        advice += "; if it has not moved since commands began: are the drives on?"
     level = "ok" if now.mode == "follow" else "note" if now.reason == "operator" else "wrong"
-    return Finding(level, "mode", told + (f": {now.because}" if now.because else ""), "follow", now.remedy)
+    return Finding(level, "mode", told, "follow", advice)
+
+
+def _keeps_time(before: Status, now: Status) -> bool:
+    """Whether the loop ran on time, lately and since the daemon began."""
+    lately = now.missed - before.missed <= MISSED * max(now.tick - before.tick, 1)
+    return lately and now.missed <= MISSED * max(now.tick, 1) and now.lateness_us.max < STALLED_US
+
+
+def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+    """The joint that was told to go farthest of those that did not."""
+    stuck = {name: told for name, (told, went) in travels.items() if told > TOLD_RAD and went < STUCK * told}
+    if stuck:
+        name = max(stuck, key=lambda joint: stuck[joint])
+        found = f"{name} was told to go {stuck[name]:.2f} rad and it has not moved since commands began"
+        advice = "are the drives on? Look at their power, brakes and emergency stop; then `thirdhand reset`"
+        yield wrong("arm's drives", found, "joints that go where they are told", advice)
+
+
+def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
+    """Whether the tool is off its target for long."""
+    offs = [
+        math.dist(one.tool_measured_m or one.tool_m, one.target_m)
+        for one in seen
+        if one.mode == "follow" and one.tool_m is not None and one.target_m is not None
+    ]
+    lasts_s, flags = (seen[-1].time_ns - seen[0].time_ns) / 1e9, seen[-1].flags
+    if len(offs) == len(seen) and lasts_s > LONG_S and min(offs) > OFF_M:
+        found = f"off its target by {100 * min(offs):.0f} cm or more for {lasts_s:.1f} s"
+        advice = "; ".join(map(remedy, flags)) or "see that the arm's driver follows commands, and as fast"
+        level = "note" if flags else "wrong"
+        yield Finding(level, "tool", found, f"within {100 * OFF_M:.0f} cm once the hands rest", advice)
 
 
 def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
@@ -104,9 +171,9 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     told = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
     told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     fine = source.fresh and source.rate_hz >= SLACK * least
-    advice = "" if source.fresh else remedy(source.cause)
-    yield judged(fine, what, told, wanted, advice or "let it publish as often, and without pauses")
+    advice = "" if source.fresh else _of_unit(source) or remedy(source.cause)
     yield from _rejected(before, now, name)
+    yield judged(fine, what, told, wanted, advice or "let it publish as often, and without pauses")
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
         way = "before it comes" if source.clock_ms > 0 else "after it comes: its clock is ahead"
         told = f"a sample is stamped {abs(source.clock_ms) / 1000:.3g} s {way}"
@@ -124,7 +191,8 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         if rate and not (share > OFTEN and cause in ("older", "jumped")):  # said below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > OFTEN * came else "note"
-            yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", remedy(cause))
+            advice = (_of_unit(source) if cause == source.cause else "") or remedy(cause)
+            yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
     noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM
     if share > OFTEN or noisy:
         seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, OFTEN, NOISY_MM)
@@ -133,16 +201,26 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         yield wrong(what, found.why, wanted, found.what_to_do)
 
 
-def _driver(now: Status) -> Finding:
+def _of_unit(source: Source) -> str:
+    """What to write or publish where what was refused looks to be in another unit."""
+    looks = re.search(r"looks like (\w+)", source.refused)
+    if looks is None or source.cause != "out_of_range":
+        return ""
+    if looks[1] == "degrees":
+        return "publish joints in radians"
+    return f'write unit = "{looks[1]}" under [hands] in the cell\'s settings, and start the daemon anew'
+
+
+def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
         return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --arm state")
-    commands = key(now.cell, "joints/command")
-    told = f"{'somebody' if now.command_heard else 'nobody'} listens to {commands}"
-    return judged(now.command_heard, "arm's driver", told, "a driver", f"let the arm's driver subscribe to {commands}")
+    commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
+    told = f"{'somebody' if heard else 'nobody'} listens to {commands}"
+    return judged(heard, "arm's driver", told, "a driver", f"let the arm's driver subscribe to {commands}")
 
 
-def _hands_and_skill(now: Status) -> Iterator[Finding]:
-    boxes = now.demonstrated_m
+def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
+    now, boxes = seen[-1], seen[-1].demonstrated_m
     there = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
     off = {side: _outside(at, boxes[side]) for side, at in there.items()}
     crossed = [_outside(at, boxes[SIDES[1 - SIDES.index(side)]]) for side, at in there.items()]
@@ -152,6 +230,15 @@ def _hands_and_skill(now: Status) -> Iterator[Finding]:
         if swapped
         else "bring it there, or demonstrate this too; see that [hands] unit and base_from_tracker are right"
     )
+    if off and max(off.values()) > OUTSIDE_M and _is_y_up(seen):
+        written = "[{}]".format(", ".join(f"{v:g}" for v in Y_UP))
+        yield wrong(
+            "tracker's axes",
+            "z of the hands stays as it is while y moves like a height",
+            "z up, as in frame base",
+            f"if y is up, write base_from_tracker = {written} under [hands]; its first three are where the tracker's "
+            "origin is in base [m]",
+        )
     for side, at in there.items():
         told = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
         wanted = " to ".join(map(_point, boxes[side])) + " m"
@@ -160,6 +247,19 @@ def _hands_and_skill(now: Status) -> Iterator[Finding]:
         told = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
         wanted = f"up to {100 * now.threshold_m:.1f} cm"
         yield judged(now.deviation_m <= now.threshold_m, "skill", told, wanted, remedy("far_from_demonstrations"))
+
+
+def _is_y_up(seen: Sequence[Status]) -> bool:
+    """Whether y looks to be the hands' height: alike for both, and changing while z does not."""
+    at = [one.hands_m for one in seen if all(side in one.hands_m for side in SIDES)]
+    heights = [[hands[side][1] for hands in at] for side in SIDES]
+    levels = [[hands[side][2] for hands in at] for side in SIDES]
+    return (
+        bool(at)
+        and all(max(level) - min(level) < LEVEL_M for level in levels)
+        and any(max(height) - min(height) > RAISED_M for height in heights)
+        and abs(heights[0][0] - heights[1][0]) < 3 * RAISED_M
+    )
 
 
 def _machine(before: Status, now: Status) -> Iterator[Finding]:

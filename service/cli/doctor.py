@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import re
 import socket
 import time
@@ -13,12 +14,15 @@ from collections.abc import Iterator
 from importlib.metadata import version
 
 import msgspec
+import zenoh
 
 from service.cli.diagnosis import Finding, findings, wrong
 from service.cli.status import heard
-from service.cli.usage import CONNECT_TIMEOUT_S
-from service.client import Overheard, UnreachableError, open_session
-from service.contract.channels import ENDPOINT
+from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
+from service.client import Overheard, UnreachableError
+from service.contract import cdr
+from service.contract.channels import ENDPOINT, key
+from service.contract.messages import WireError
 
 PROBE_S = 1.0
 PUBLISHED = ("**/hands/*", "**/joints/state")  # of whatever cell: a name may be wrong
@@ -35,24 +39,27 @@ def doctor(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
     else:
-        print("nothing is wrong" if not count else f"{count} thing{' is' if count == 1 else 's are'} wrong")
+        many = f"{count} things are wrong, the first may be the cause of the rest"
+        print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
     return 1 if count else 0
 
 
 def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
-    connect = args.connect or [ENDPOINT]
     try:
-        session = open_session(connect=connect, timeout_s=CONNECT_TIMEOUT_S, certificate=args.certificate)
+        session = reached(args)
     except UnreachableError as error:
-        yield from (unreachable(endpoint, str(error)) for endpoint in connect)
+        yield from (unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT])
         return
-    with session, Overheard(session, *PUBLISHED) as published:
+    with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
         try:
             with contextlib.closing(heard(session, args.cell)) as told:
-                before = now = next(told)
+                seen = [next(told)]
+                travel = Travel()
+                if seen[0].command_heard:  # else who is looked for would be ourselves
+                    closing.enter_context(travel.watching(session, args.cell))
                 end = time.monotonic() + args.seconds
                 while time.monotonic() < end:
-                    now = next(told)
+                    seen.append(next(told))
         except UnreachableError as error:
             cells = {
                 str(reply.ok.key_expr).split("/daemon/")[0]
@@ -67,7 +74,48 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
         except msgspec.ValidationError as error:
             yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")
             return
-    yield from findings(before, now, own_ns=time.time_ns(), own_version=version("thirdhand"), published=published.keys)
+    yield from findings(
+        *seen,
+        own_ns=time.time_ns(),
+        own_version=version("thirdhand"),
+        published=published.keys,
+        travels=travel.of_joints(),
+    )
+
+
+class Travel:
+    """How far the joints of an arm are told to go, and go, while it watches."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, tuple[float, float]] = {}  # lowest and highest of each joint [rad]
+        self._went: dict[str, tuple[float, float]] = {}
+
+    @contextlib.contextmanager
+    def watching(self, session: zenoh.Session, cell: str) -> Iterator[None]:
+        """Watches a cell's arm as long as the context lasts."""
+        commands = functools.partial(self._take, self._told)
+        states = functools.partial(self._take, self._went)
+        with (
+            session.declare_subscriber(key(cell, "joints/command"), commands),
+            session.declare_subscriber(key(cell, "joints/state"), states),
+        ):
+            yield
+
+    def of_joints(self) -> dict[str, tuple[float, float]]:
+        """How far each joint was told to go, and went [rad]."""
+        return {
+            name: (told[1] - told[0], went[1] - went[0])
+            for name, told in self._told.copy().items()
+            if (went := self._went.get(name)) is not None
+        }
+
+    @staticmethod
+    def _take(spans: dict[str, tuple[float, float]], sample: zenoh.Sample) -> None:
+        with contextlib.suppress(WireError):
+            message = cdr.decode_joints(sample.payload.to_bytes())
+            for name, at in zip(message.names, message.position, strict=False):
+                low, high = spans.get(name, (at, at))
+                spans[name] = min(low, at), max(high, at)
 
 
 def unreachable(endpoint: str, said: str) -> Finding:

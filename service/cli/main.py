@@ -17,12 +17,14 @@ from typing import Any
 
 from service import interrupt
 from service.cli import record_options
-from service.cli.usage import Parser, UsageError, check_cell, option, within
+from service.cli.usage import Parser, UsageError, option, reaching, within
+from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
+from service.described_arm import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
@@ -30,8 +32,16 @@ RUN_BY = {  # the modules that are not named as their command
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
-SIM = "The PyBullet bench: publishes hands and joint states, and follows commands; `thirdhand sim --help` tells more."
-ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself (default: $THIRDHAND_ZENOH_CONFIG)"
+SIM = "The PyBullet bench: publishes hands and joint states, and follows commands."
+ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
+GROUPS = {
+    "run": ("demo", "serve", "sim", "play"),
+    "stop and go on": ("hold", "resume", "reset"),
+    "teach": ("record", "learn", "via-points"),
+    "look": ("status", "view", "report"),
+    "check": ("doctor", "cells", "replay", "bench"),
+    "set up": ("certificates", "completion"),
+}
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 
 
@@ -40,10 +50,11 @@ def parser() -> argparse.ArgumentParser:
     top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
-        epilog="example: thirdhand demo",
+        epilog="thirdhand COMMAND --help tells more, with an example. Begin with: thirdhand demo",
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    abouts: dict[str, str] = {}
 
     def described(among: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:
         added: argparse.ArgumentParser = among.add_parser(
@@ -56,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
         return added
 
     def command(name: str, about: str, example: str) -> argparse.ArgumentParser:
-        sub = described(commands_of, name, about, example)
+        sub, abouts[name] = described(commands_of, name, about, example), about
         sub.set_defaults(run=f"{RUN_BY.get(name, f'cli.{name}')}.{name.replace('-', '_')}")
         return sub
 
@@ -65,21 +76,21 @@ def parser() -> argparse.ArgumentParser:
         "The soldering scenario, closed loop and headless: bench, service and scribe.",
         "thirdhand demo --scene my-scene.toml",
     )
-    option(c, "--out", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
+    option(c, "--output", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
     option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
-    option(c, "--seconds", "S", "to measure for", 24.0)
+    option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
     option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
     other = c.add_mutually_exclusive_group()
     other.add_argument(
-        "--loads", action="store_true", help="what happens beside the loop instead, each for so many seconds"
+        "--loads", action="store_true", help="what happens beside the loop instead, each for these seconds"
     )
-    other.add_argument("--soak", metavar="MIN", type=float, help="memory and open files over so many minutes instead")
+    other.add_argument("--soak", action="store_true", help="memory and open files instead, a sample each 5 s at most")
 
     c = command(
         "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
@@ -121,7 +132,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command("record", record_options.ABOUT, record_options.EXAMPLE)
     record_options.add_options(c)
-    _reach(c, cell=None)
+    _reach(c)
 
     c = command(
         "report",
@@ -226,7 +237,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--days", "N", "that they are valid", 3650, type=int)
 
     # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
-    c = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False)
+    c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
     c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
 
@@ -236,12 +247,19 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
     )
     _reach(c)
-    c.add_argument("file", metavar="FILE|live", help="an .rrd or .mcap file, or `live`")
+    option(c, "file", "FILE|live", "an .rrd or .mcap file, or `live`")
     option(c, "--screenshot", "PNG", "write a picture instead of opening a window")
     option(c, "--time", "S", "of the picture, from the recording's start (default: its end)")
     web = "with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)"
     option(c, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     option(c, "--tab", None, "of the picture", "task", choices=("task", "timing", "learning"))
+
+    about, example = "Prints what lets a shell complete these commands and their options.", "thirdhand completion bash"
+    c = command("completion", about, f"{example} > ~/.local/share/bash-completion/completions/thirdhand")
+    c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    top.groups = {
+        title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
+    }
     return top
 
 
@@ -253,17 +271,19 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _reach(
-    sub: argparse.ArgumentParser, cell: str | None = "thirdhand", *, one: bool = True
-) -> argparse.ArgumentParser:
+def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.ArgumentParser:
     """The same parser, with the options by which a daemon is reached; `one`: and named."""
+    group = sub.add_argument_group(
+        "how it is reached", f"What is not given is taken from these variables, else from the file\n{CLIENT_FILE}."
+    )
     endpoint = "Zenoh endpoint of the daemon or of a router; of several the first that answers"
-    option(sub, "--connect", "EP", f"{endpoint} (default: {channels.ENDPOINT})", action="append")
+    option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
-        option(sub, "--cell", "NAME", "prefix of all keys" + " (default: as configured)" * (cell is None), cell)
-    role = "of one's role, made by `thirdhand certificates` (default: $THIRDHAND_CERTIFICATE)"
-    option(sub, "--certificate", "DIR", role)
-    option(sub, "--zenoh-config", "FILE", ZENOH_CONFIG)
+        option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
+    role = "of one's role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
+    option(group, "--certificate", "DIR", role)
+    option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
+    sub.set_defaults(reaches=True)
     return sub
 
 
@@ -272,14 +292,14 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     module, function = args.run.rsplit(".", 1)
     try:
-        if "cell" in args and args.cell is not None:  # also rejects a wildcard, which would reach every cell
-            check_cell(args.cell)
+        if "reaches" in args and not vars(args).get("config"):
+            args.cell = reaching(args).cell
         run = getattr(importlib.import_module(f"service.{module}"), function)
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
-    except UsageError as error:
+    except (UsageError, SettingsError) as error:
         print(f"thirdhand {args.command}: {error}", file=sys.stderr)
-        return 2
+        return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from service.cli.progress import say
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in, reaching
 from service.client import UnreachableError, open_session
 from service.config import Settings, load
 from service.contract.channels import ENDPOINT
@@ -89,13 +89,15 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     check_writable(path)
     places = places_in(args.places) if args.places else ()
     cell, ended = args.cell or settings.cell, _Ended()
-    listen = [args.listen] if args.listen else []
+    listen, reach = [args.listen] if args.listen else [], reaching(args)
     try:
         session = open_session(
-            connect=args.connect or ([] if listen else [ENDPOINT]),
+            connect=args.connect or () if listen else reach.connect,
+            otherwise=[ENDPOINT],
             listen=listen,
             timeout_s=CONNECT_TIMEOUT_S,
-            certificate=args.certificate,
+            certificate=reach.certificate,
+            zenoh_config=reach.zenoh_config,
             more={} if listen else {"mode": "client"},  # to clients a daemon passes on what others publish
         )
     except UnreachableError as error:

@@ -44,7 +44,7 @@ def play(args: argparse.Namespace) -> int:
         client = Client(session, args.cell)
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
         while True:
-            before = client.status()
+            before = client.wait_until_ready()
             begin = time.monotonic()
             for time_ns, side, pose in hands:
                 early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()

@@ -8,17 +8,16 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import zenoh
 
-from service.client import open_session
-from service.config import RATES_HZ, converted
-from service.contract.channels import ENDPOINT
+from service.client import ClientSettings, client_settings
+from service.config import RATES_HZ
+from service.contract.channels import lacking
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
-from service.described_arm import SettingsError
 
 CONNECT_TIMEOUT_S = 3.0
 
@@ -28,7 +27,24 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest choice for an unknown one."""
+    """A parser that suggests the nearest choice for an unknown one. `groups` are its commands by
+    what they are for, each with what it does, as its help lists them.
+    """
+
+    groups: Mapping[str, Mapping[str, str]] = {}
+
+    def format_help(self) -> str:
+        """Usage, and the commands in their groups."""
+        if not self.groups:
+            return super().format_help()
+        shown = argparse.HelpFormatter(self.prog, max_help_position=15)
+        shown.add_text(self.description)
+        for title, commands in self.groups.items():
+            shown.start_section(title)
+            shown.add_arguments(argparse.Action([], name, help=about) for name, about in commands.items())
+            shown.end_section()
+        shown.add_text(self.epilog)
+        return f"{self.format_usage()}\n{shown.format_help()}"
 
     def error(self, message: str) -> NoReturn:
         """Prints usage and message, and exits with code 2."""
@@ -50,28 +66,37 @@ def within(kind: type[float], low: float, high: float, unit: str = "") -> Callab
     return read
 
 
+def endpoint(given: str) -> str:
+    """Reads a Zenoh endpoint from the command line."""
+    if lacks := lacking(given):
+        raise argparse.ArgumentTypeError(lacks)
+    return given
+
+
 KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     **dict.fromkeys(("M", "S"), float),
     "HZ": within(int, *RATES_HZ, " Hz"),
+    "EP": endpoint,
+}
+
+FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
+COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
+    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live"), FILES),
+    "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
 }
 
 
 def option(
-    c: argparse.ArgumentParser, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
+    c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
 ) -> None:
     """Adds an option or argument that takes a value; its help tells its default."""
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
-    c.add_argument(name, metavar=metavar, help=about, default=default, **{"type": KINDS.get(metavar, str), **more})
-
-
-def check_cell(name: str) -> None:
-    """Raises UsageError where a cell cannot have this name."""
-    try:
-        converted({"cell": name}, origin="--cell")
-    except SettingsError as error:
-        raise UsageError(str(error)) from None
+    more = {"type": KINDS.get(metavar, str), **more}
+    added = c.add_argument(name, metavar=metavar, help=about, default=default, **more)
+    if metavar in COMPLETED:
+        added.complete = COMPLETED[metavar]  # type: ignore[attr-defined]  # as shtab reads it
 
 
 def check_writable(path: Path, suffix: str = "") -> None:
@@ -89,15 +114,19 @@ def check_writable(path: Path, suffix: str = "") -> None:
         raise UsageError(f"{path} cannot be written: no permission")
 
 
-def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router that the command line names. Raises UnreachableError."""
-    return open_session(
-        connect=args.connect or (),
-        otherwise=[ENDPOINT],
-        timeout_s=timeout_s,
+def reaching(args: argparse.Namespace) -> ClientSettings:
+    """How the daemon or router is reached. Raises SettingsError."""
+    return client_settings(
+        connect=args.connect,
+        cell=vars(args).get("cell"),
         certificate=args.certificate,
         zenoh_config=args.zenoh_config,
     )
+
+
+def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A session to the daemon or router. Raises UnreachableError."""
+    return reaching(args).session(timeout_s=timeout_s)
 
 
 def added_in(path: Path) -> Add:

@@ -3,6 +3,7 @@ on a network.
 """
 
 from service.client.calls import Client
+from service.client.client_settings import CLIENT_FILE, ClientSettings, client_settings
 from service.client.presence import Cell, Overheard, cells, living
 from service.client.session import (
     AUTHORITY,
@@ -19,10 +20,12 @@ __all__ = [
     "AUTHORITY",
     "BRAKE_AFTER_S",
     "CERTIFICATE",
+    "CLIENT_FILE",
     "ENCODINGS",
     "KEY",
     "Cell",
     "Client",
+    "ClientSettings",
     "Command",
     "Follower",
     "Overheard",
@@ -30,6 +33,7 @@ __all__ = [
     "Tracker",
     "UnreachableError",
     "cells",
+    "client_settings",
     "endpoints",
     "living",
     "open_session",

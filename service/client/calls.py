@@ -11,11 +11,11 @@ import msgspec
 import zenoh
 
 from service.client.presence import living
-from service.client.session import RefusedError, UnreachableError
+from service.client.session import RETRY_S, RefusedError, UnreachableError, tried
 from service.contract import channels, requests
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
-RETRY_S, RETRIES = 0.05, 5
+RETRIES = 5
 Answer = TypeVar("Answer")
 
 
@@ -75,16 +75,9 @@ class Client:
         answer: dict[str, Any] = json.loads(self._answer(suffix, request))
         return answer
 
-    def wait_until_ready(self, *, timeout_s: float = 15.0) -> Status:
-        """The status, once a daemon answers on this cell."""
-        end = time.monotonic() + timeout_s
-        while True:
-            try:
-                return self.status()
-            except UnreachableError:
-                if time.monotonic() > end:
-                    raise
-                time.sleep(RETRY_S)
+    def wait_until_ready(self, *, timeout_s: float | None = 15.0) -> Status:
+        """The status, once a daemon answers on this cell; None: it waits until Ctrl-C."""
+        return tried(self.status, timeout_s)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
         try:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import datetime
 import json
 import os
-import re
-from collections.abc import Mapping, Sequence
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import zenoh
 
+from service.contract.channels import lacking
 from service.contract.explain import ExplainedError
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
+ATTEMPT_S, RETRY_S = 1.0, 0.05  # of an attempt that is one of many
+T = TypeVar("T")
 
 
 class UnreachableError(ExplainedError, OSError):
@@ -31,7 +35,7 @@ def open_session(
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     otherwise: Sequence[str] = (),
-    timeout_s: float = 10.0,
+    timeout_s: float | None = 10.0,
     certificate: str | Path | None = None,
     zenoh_config: str | Path | None = None,
     more: Mapping[str, Any] | None = None,
@@ -43,10 +47,16 @@ def open_session(
     `zenoh_config`, a file of Zenoh's own, overrides that; all else set here overrides the file. A
     client without `connect` takes the file's endpoints, or else those in `otherwise`.
 
+    It is tried for `timeout_s` [s]. None, where it only connects: until Ctrl-C, and that it waits
+    is said once on standard error, so that it does not matter who is started first.
+
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
     begin with `tls/`. Where one of the two is None, $THIRDHAND_CERTIFICATE or
     $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError.
     """
+    for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
+        if lacks := lacking(endpoint):
+            raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
     if otherwise and not connect and not listen:
         connect = _endpoints_in(config) or otherwise
@@ -57,7 +67,7 @@ def open_session(
         "scouting/gossip/enabled": False,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": int(timeout_s * 1000),
+        "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
         "connect/exit_on_failure": True,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
@@ -68,26 +78,43 @@ def open_session(
         **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
         **(more or {}),
     }
-    try:
-        for name, value in settings.items():
-            config.insert_json5(name, json.dumps(value))
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
+
+    def opened() -> zenoh.Session:
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
+
+    return tried(opened, None if timeout_s is None and not listen else 0.0)
+
+
+def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
+    """What an attempt returns once it raises no UnreachableError, which is raised after `timeout_s`
+    [s]. None: it is tried until Ctrl-C, and that it waits is said once on standard error.
+    """
+    begun_s, silent = time.monotonic(), timeout_s is not None
+    while True:
+        try:
+            return attempt()
+        except UnreachableError as error:
+            waited_s = time.monotonic() - begun_s
+            if timeout_s is not None and waited_s >= timeout_s:
+                raise
+            if not silent and waited_s > ATTEMPT_S / 2:
+                print(f"waiting, until Ctrl-C: {error}", file=sys.stderr, flush=True)
+                silent = True
+            time.sleep(RETRY_S)
 
 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     """The reason why there is no session between these endpoints, in words."""
-    form = r"[a-z]+/.+:.+|unixsock-stream/.+"
-    wrong = next((endpoint for endpoint in (*connect, *listen) if not re.match(form, endpoint)), None)
-    if wrong is not None:
-        how = f"connect to {wrong}" if wrong in connect else f"listen on {wrong}"
-        return f"cannot {how}: an endpoint of the form <protocol>/<address>, like tcp/127.0.0.1:7447, needed"
     if connect and "connect" in reason:
         secured = any(endpoint.startswith("tls/") for endpoint in connect)
         return (
             f"nobody answers at {', '.join(connect)}: "
-            "is a daemon running and listening there, or a router, and not overrun?"
+            "is a daemon running and listening there, `thirdhand record --listen` or a router, and not overrun?"
             + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
             "not expired?" * secured
         )

@@ -10,15 +10,13 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from service.client.presence import living
-from service.client.session import UnreachableError
+from service.client.session import UnreachableError, tried
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from service.contract.records import SIDES
 
 BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
-POLL_S = 0.02
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -35,20 +33,18 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
 class Tracker(AbstractContextManager["Tracker"]):
     """Publishes hand poses of a cell; a context.
 
-    It waits up to `timeout_s` [s] for a live daemon. Raises UnreachableError where there is none.
+    It waits up to `timeout_s` [s] until somebody listens to both hands, a daemon or `thirdhand
+    record`; None: until Ctrl-C. Raises UnreachableError where nobody does.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 5.0) -> None:
-        self._session, self._cell = session, cell
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
+        self._cell = cell
         self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
-        until = time.monotonic() + timeout_s
-        while not self.heard():
-            if time.monotonic() > until:
-                self.close()
-                raise UnreachableError(
-                    f"no daemon listens to {channels.key(cell, 'hands/left')}: is one running in this cell?"
-                )
-            time.sleep(POLL_S)
+        try:
+            tried(self._check_heard, timeout_s)
+        except BaseException:
+            self.close()
+            raise
 
     def publish(
         self,
@@ -70,12 +66,18 @@ class Tracker(AbstractContextManager["Tracker"]):
         self._publishers[side].put(cdr.encode_pose(pose))
 
     def heard(self) -> bool:
-        """Whether a daemon of the cell is alive, and both hands have a subscriber."""
-        subscribed = all(
+        """Whether somebody listens to both hands."""
+        return all(
             publisher.matching_status.matching  # type: ignore[attr-defined]
             for publisher in self._publishers.values()
         )
-        return subscribed and bool(living(self._session, self._cell))
+
+    def _check_heard(self) -> None:
+        if not self.heard():
+            raise UnreachableError(
+                f"nobody listens to {channels.key(self._cell, 'hands/left')}: is a daemon or `thirdhand record` "
+                "running in this cell?"
+            )
 
     def close(self) -> None:
         """Ends the publishers."""

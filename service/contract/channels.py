@@ -10,6 +10,7 @@ only recorded, a hash in `ros2`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -18,6 +19,8 @@ from service.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
 LARGEST_REQUEST = 256 * 1024  # bytes
+_ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
+_ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
 PRESENCE = "daemon"  # below it each daemon's liveliness token, named by its Zenoh session
 PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
@@ -130,6 +133,18 @@ CHANNELS = (
 BY_KEY = {channel.key: channel for channel in CHANNELS}
 EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if channel.event is not None}
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
+
+
+def lacking(endpoint: str) -> str:
+    """What a Zenoh endpoint lacks to be one, in words; empty: nothing."""
+    protocol, slashes, address = _ENDPOINT.findall(endpoint)[0]
+    if slashes == "/" and address and (protocol not in _ON_IP or re.fullmatch(".+:.+", address)):
+        return ""
+    host, _, port = address.rpartition(":")
+    if not host and not port.isdecimal():
+        host, port = port, "7447"
+    meant = f"{protocol if protocol in _ON_IP else 'tcp'}/{host or '127.0.0.1'}:{port}"
+    return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
 
 
 def key(cell: str, suffix: str) -> str:

@@ -1,4 +1,4 @@
-"""Via-points that survive a restart: a file for each skill that was taught."""
+"""Via-points that survive a restart: a file for each skill that was taught to each arm."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 import msgspec
 
-from service.config import Settings
+from service.config import Settings, robot_description
 from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError
+from service.urdf import Urdf
 
 
 def state_folder(settings: Settings) -> Path:
@@ -27,19 +28,29 @@ def _checksum(saved: dict[str, Any]) -> str:
     return hashlib.blake2b(json.dumps(saved, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
+def _identity(settings: Settings) -> str:
+    """What tells an arm from others: its joints, and where they sit to a centimetre, so that it
+    stays the same when it is calibrated.
+    """
+    chain = Urdf(robot_description(settings)).chain(settings.arm.plate)
+    return "; ".join(" ".join([one.name, *(f"{round(v, 2) + 0.0:.2f}" for v in one.translation)]) for one in chain)
+
+
 class SavedViaPoints:
-    """The via-points taught to each skill, on disk; written atomically."""
+    """The via-points taught to each skill of an arm, on disk; written atomically."""
 
     def __init__(self, settings: Settings) -> None:
         self._folder = state_folder(settings)
+        self._arm, self._shipped_arm = _identity(settings), _identity(Settings())
 
     def path(self, skill: Skill) -> Path:
-        """The file for this skill, named by the hash of what it was learned from."""
-        digest = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
+        """The file for this skill and arm, named by the hash of what the skill was learned from."""
+        arm = "" if self._arm == self._shipped_arm else self._arm  # as before there were others
+        digest = hashlib.blake2b((skill.learned_from + arm).encode(), digest_size=6).hexdigest()
         return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
-        """Via-points and tolerance taught to this skill, or None.
+        """Via-points and tolerance taught to this skill of this arm, or None.
 
         Raises SkillError where the file is damaged.
         """
@@ -55,7 +66,7 @@ class SavedViaPoints:
             if saved.pop("checksum") != _checksum(saved):
                 raise ValueError("its checksum is wrong: it was changed since; remove it, and teach them again")
             request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
-            if saved["learned_from"] != skill.learned_from:
+            if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
                 return None
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise SkillError(f"{path} does not hold via-points ({error})") from None
@@ -68,7 +79,7 @@ class SavedViaPoints:
         request = None
         if skill.via_points:
             request = {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
-        saved = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
+        saved = {"skill": skill.name, "learned_from": skill.learned_from, "arm": self._arm, "request": request}
         content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -25,6 +25,7 @@ from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import BenchError, echo, family, probe
 
 PROGRAM = ("-m", "service")
+SECONDS, SOAK_S = 24.0, 1800.0
 PARTS = 6  # of the duration: two each for the empty loop, the core and the whole
 MISSED_MORE = 0.0005  # share of deadlines that the whole may miss more than the empty loop
 KERNEL = (
@@ -43,12 +44,13 @@ def bench(args: argparse.Namespace) -> int:
         args.output.mkdir(parents=True, exist_ok=True)
     report: Any
     read: Callable[[Any], str]
-    if args.soak is not None:
-        report, read = soak.run(args.soak, args.rate, say=say), soak.text
+    seconds = args.seconds or (SOAK_S if args.soak else SECONDS)
+    if args.soak:
+        report, read = soak.run(seconds / 60, args.rate, say=say), soak.text
     elif args.loads:
-        report, read = loads.run(args.rate, args.seconds, say=say), loads.text
+        report, read = loads.run(args.rate, seconds, say=say), loads.text
     else:
-        report, read = run(args.rate, args.seconds, say=say, keep=args.output), text
+        report, read = run(args.rate, seconds, say=say, keep=args.output), text
     if args.output is not None:
         (args.output / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
         if read is text:

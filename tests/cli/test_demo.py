@@ -31,7 +31,7 @@ seed = 7
 
 def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
-    arguments = ["demo", "--json", "--out", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")]
+    arguments = ["demo", "--json", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")]
     done = thirdhand(*arguments, timeout=110)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)
@@ -60,14 +60,14 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
 
 def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")
-    done = thirdhand("demo", "--out", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
+    done = thirdhand("demo", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
     assert done.returncode == 1
     assert "handover" in done.stderr
 
 
 def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) -> None:
     """Its scribe is killed while the nominal scene is played; another takes its place."""
-    command = [sys.executable, "-m", "service", "demo", "--json", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "service", "demo", "--json", "--output", str(tmp_path)]
     with (tmp_path / "said").open("w") as errors:
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT)
     end = time.monotonic() + 60

@@ -7,11 +7,14 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
-from service.cli.diagnosis import Finding, findings
+from service.cli.diagnosis import Y_UP, Finding, findings
 from service.cli.status import line, rows
+from service.config import converted
 from service.contract.requests import Percentiles, Source, Status
+from service.core.geometry import rotation
 
 NONE = Percentiles()
 GOOD = Source(rate_hz=100.0, age_ms=4.0, fresh=True, clock_ms=1.5, frame="base")
@@ -46,17 +49,21 @@ HEALTHY = Status(
     demonstrated_m=BOXES,
     tool_m=(0.5, 0.0, 0.3),
     setpoint_m=(0.5, 0.0, 0.3),
-    target_m=(0.5, 0.1, 0.3),
+    target_m=(0.5, 0.01, 0.3),
     deviation_m=0.02,
     threshold_m=0.7,
 )
 
 
-def diagnosed(**changed: Any) -> list[Finding]:
+def diagnosed(travels: dict[str, tuple[float, float]] | None = None, **changed: Any) -> list[Finding]:
     """The findings of a healthy cell of which something has become otherwise, two seconds later."""
     now = msgspec.structs.replace(HEALTHY, tick=2000, time_ns=HEALTHY.time_ns + 2 * 10**9)
     now = msgspec.structs.replace(now, **changed)
-    return list(findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0"))
+    return findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0", travels=travels)
+
+
+def wrongs(found: list[Finding]) -> list[str]:
+    return [finding.line() for finding in found if finding.level == "wrong"]
 
 
 def source(name: str, **changed: Any) -> dict[str, Source]:
@@ -180,3 +187,92 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert "±" in line(HEALTHY)
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
+
+
+def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
+    silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
+    found = diagnosed(mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False)
+    told = [(finding.level, finding.what) for finding in found]
+    assert [what for level, what in told if level == "wrong"] == ["arm", "arm's driver", "mode", "real time"]
+    assert [level for level, _ in told] == sorted((level for level, _ in told), reverse=True)
+
+
+def test_a_unit_that_is_wrong_is_told_with_the_setting_to_write() -> None:
+    refused = "at (812, -203, 95), which looks like mm; [hands] unit is 'm', at most 5 m from the base plate accepted"
+    left = source(
+        "left", fresh=False, age_ms=None, rejected={"out_of_range": 200}, cause="out_of_range", refused=refused
+    )
+    first = wrongs(diagnosed(mode="hold", reason="no_hands", sources=left))[0]
+    assert "left hand" in first
+    assert "looks like mm" in first
+    assert 'what to do: write unit = "mm" under [hands]' in first
+
+
+def test_joints_in_degrees_are_told_with_the_joints_name() -> None:
+    refused = "wam/elbow_pitch_joint at 145.6 rad, which looks like degrees; -0.9 to 3.1 accepted"
+    arm = source("arm", fresh=False, age_ms=None, rejected={"out_of_range": 900}, cause="out_of_range", refused=refused)
+    first = wrongs(diagnosed(mode="hold", reason="arm_not_ready", sources=arm))[0]
+    assert "wam/elbow_pitch_joint at 145.6 rad" in first
+    assert "what to do: publish joints in radians" in first
+
+
+def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> None:
+    travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
+    told = wrongs(diagnosed(travels, mode="fault", reason="arm_error", because="a joint was 0.102 rad off"))
+    assert "b was told to go 0.31 rad and it has not moved since commands began" in told[0]
+    assert "are the drives on?" in told[0]
+    assert [line.split()[1] for line in told] == ["arm's", "mode"]
+    alone = wrongs(diagnosed(mode="fault", reason="arm_error", because="now b is off by 0.1 rad", remedy="see what"))
+    assert "now b is off" in alone[0]
+    assert "what to do: see what; if it has not moved since commands began: are the drives on?" in alone[0]
+
+
+@pytest.mark.parametrize("reason", ["arm_silent", "arm_error"])
+@pytest.mark.parametrize("late", [{"missed": 90}, {"lateness_us": Percentiles(1, 90, 60_000)}])
+def test_a_fault_of_the_arm_while_ticks_are_missed_is_told_as_the_machines(reason: str, late: dict[str, Any]) -> None:
+    told = [line for line in wrongs(diagnosed(mode="fault", reason=reason, **late)) if "mode" in line]
+    assert "this machine or the bench could not keep time" in told[0]
+    assert "thirdhand bench" in told[0]
+    other = wrongs(diagnosed(mode="fault", reason=reason))
+    assert not any("keep time" in line for line in other)
+
+
+def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:
+    """The findings of statuses in which left and right hand are there, over two seconds."""
+    seen = [
+        msgspec.structs.replace(
+            HEALTHY,
+            tick=1000 * (i + 1),
+            time_ns=HEALTHY.time_ns + round(2e9 * i / (len(hands) - 1)),
+            hands_m={"left": left, "right": right},
+        )
+        for i, (left, right) in enumerate(hands)
+    ]
+    return findings(*seen, own_ns=seen[-1].time_ns, own_version="0.1.0")
+
+
+def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
+    raised = [((-0.2, 0.9 + up, 0.5), (0.2, 0.95 + up / 2, 0.51)) for up in (0.0, 0.1, 0.2)]
+    told = [line for line in wrongs(paths(*raised)) if "tracker's axes" in line]
+    assert "write base_from_tracker = [0, 0, 0, 0.7071, 0, 0, 0.7071] under [hands]" in told[0]
+    settings = converted({"hands": {"base_from_tracker": list(Y_UP)}}, origin="here")
+    turned = rotation(settings.hands.base_from_tracker[3:]) @ np.array([0.0, 1.0, 0.0])
+    assert np.allclose(turned, [0, 0, 1], atol=1e-4)
+
+
+def test_hands_that_slide_over_the_table_are_of_no_tracker_whose_y_points_up() -> None:
+    known = [((0.8, -0.3 + off, 0.1), (0.9, 0.3, 0.1)) for off in (0.0, 0.1, 0.2)]
+    beside = [((1.4, -0.3 + off, 0.1), (1.4, 0.3, 0.1)) for off in (0.0, 0.1, 0.2)]
+    assert not any(finding.what == "tracker's axes" for hands in (known, beside) for finding in paths(*hands))
+
+
+def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
+    first = msgspec.structs.replace(HEALTHY, target_m=(0.5, 0.2, 0.3))
+    now = msgspec.structs.replace(first, tick=2000, time_ns=first.time_ns + 2 * 10**9, target_m=(0.5, 0.15, 0.3))
+    told = wrongs(findings(first, now, own_ns=now.time_ns, own_version="0.1.0"))
+    assert "tool               off its target by 15 cm or more for 2.0 s" in told[0]
+    held_back = msgspec.structs.replace(now, flags=("separation",))
+    found = findings(first, held_back, own_ns=now.time_ns, own_version="0.1.0")
+    assert [(one.level, "give it room" in one.remedy) for one in found if one.what == "tool"] == [("note", True)]
+    lagging = msgspec.structs.replace(now, target_m=HEALTHY.target_m)
+    assert not any(one.what == "tool" for one in findings(first, lagging, own_ns=now.time_ns, own_version="0.1.0"))

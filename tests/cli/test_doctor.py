@@ -174,8 +174,9 @@ def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytes
         other.listen()
         assert main(["doctor", "--connect", f"tcp/127.0.0.1:{other.getsockname()[1]}"]) == 1
     assert "opens no Zenoh session" in capsys.readouterr().out
-    assert main(["doctor", "--connect", "7447"]) == 1
-    assert "an endpoint like tcp/127.0.0.1:7447" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["doctor", "--connect", "7447"])
+    assert "needed: tcp/127.0.0.1:7447 ?" in capsys.readouterr().err
 
 
 def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,3 +197,28 @@ def test_words_that_are_not_known_are_answered_with_the_nearest(capsys: pytest.C
     with pytest.raises(SystemExit, match="2"):
         main(["xyzzy"])
     assert "did you mean" not in capsys.readouterr().err
+
+
+def test_an_arm_whose_drives_are_off_is_told_with_a_joints_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own_arm = template()
+    with (
+        launched(tmp_path, network=PATIENT) as service,
+        open_session(connect=[service.endpoint]) as session,
+        driven(own_arm, service.endpoint) as arm,
+        Tracker(session) as tracker,
+    ):
+        daemon = Daemon(service, session)
+        arm.move = lambda position, velocity: None  # type: ignore[attr-defined]
+        daemon.until(lambda status: status["mode"] == "follow")
+        mover = threading.Timer(0.7, setattr, (tracker, "left", NEAR_LEFT))
+        mover.start()
+        code, found = findings(daemon, capsys, "--seconds", "3")
+        mover.join()
+    told = [finding for finding in found if finding["what"] == "arm's drives"]
+    assert (code, len(told)) == (1, 1), found
+    assert told[0] == found[0]
+    assert told[0]["found"].split()[0] in Settings().joints.names
+    assert "it has not moved since commands began" in told[0]["found"]
+    assert "are the drives on?" in told[0]["remedy"]

@@ -122,7 +122,7 @@ def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_
     assert "--hands-rate HZ" in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [["sim", "--once"], ["demo", "--out", "nowhere"]])
+@pytest.mark.parametrize("arguments", [["sim", "--once"], ["demo", "--output", "nowhere"]])
 def test_without_its_library_the_bench_says_so_in_one_line(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

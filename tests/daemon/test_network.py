@@ -114,7 +114,7 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: 
     client = Client(lab.session, NAMES[1])
     assert client.status().received["hands/left"] > 3
     stuck = requests.encode_json(client.status())
-    with pytest.raises(UnreachableError, match="no daemon listens to nowhere/hands/left"):
+    with pytest.raises(UnreachableError, match="nobody listens to nowhere/hands/left"):
         Tracker(lab.session, "nowhere", timeout_s=0.1)
     with (
         _answering(lab, "stuck/status", stuck),

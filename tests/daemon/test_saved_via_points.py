@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from random import Random
 
 import pytest
 
-from service.config import Files, Settings
+from service.config import WAM, Files, Settings, converted
 from service.core.skill.skill import Skill
 from service.daemon.saved_via_points import SavedViaPoints
 from service.learning.skill_file import SkillError
@@ -114,3 +115,57 @@ def test_a_file_that_somebody_edited_is_told(saved: SavedViaPoints, skill: Skill
             saved.read(skill)
     saved.path(skill).write_text(json.dumps(json.loads(whole)))  # laid out in another way
     assert saved.read(skill) == (POINTS, 0.03)
+
+
+def another_arm(folder: Path, change: tuple[str, str]) -> Settings:
+    """A cell's settings whose arm is the shipped one with something changed in its description."""
+    urdf = folder / "own.urdf"
+    text = WAM.read_text()
+    assert change[0] in text
+    urdf.write_text(text.replace(*change))
+    own = Settings()
+    joints = {name: list(getattr(own.joints, name)) for name in ("lower", "upper", "acceleration", "jerk")}
+    given = {
+        "cell": "lab/bench2",
+        "files": {"state": str(folder)},
+        "arm": {"urdf": str(urdf), "plate": own.arm.plate, "posture": list(own.arm.posture)},
+        "joints": joints,
+    }
+    return converted(given, origin="another arm")
+
+
+def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
+    saved: SavedViaPoints, skill: Skill, tmp_path: Path
+) -> None:
+    other = SavedViaPoints(another_arm(tmp_path, ("0.55", "0.65")))
+    saved.draft(adapted(skill, POINTS[:2], tolerance=0.03)).replace(saved.path(skill))
+    assert other.read(skill) is None
+    other.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(other.path(skill))
+    assert (saved.read(skill), other.read(skill)) == ((POINTS[:2], 0.03), (POINTS[:1], 0.03))
+    other.path(skill).replace(saved.path(skill))  # nor by the file's name
+    assert saved.read(skill) is None
+
+
+def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: Skill, tmp_path: Path) -> None:
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)
+
+
+def test_a_file_of_before_arms_were_told_apart_is_the_shipped_arms(
+    saved: SavedViaPoints, skill: Skill, tmp_path: Path
+) -> None:
+    """As earlier versions named and wrote it."""
+    points = [{"name": "there", "left": [0.6, -0.2, 0.1], "right": [0.9, 0.3, 0.1], "tool": [0.5, 0.0, 0.3]}]
+    request = {"points": points, "tolerance": 0.04}
+    content = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
+    checksum = hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+    name = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
+    path = tmp_path / "lab" / "bench2" / f"places-{name}.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(content | {"checksum": checksum}))
+    read = saved.read(skill)
+    assert read is not None
+    assert ([point.name for point in read[0]], read[1]) == (["there"], 0.04)
+    other = SavedViaPoints(another_arm(tmp_path, ("0.55", "0.65")))
+    path.rename(other.path(skill))
+    assert other.read(skill) is None

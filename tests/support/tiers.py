@@ -35,6 +35,8 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_view_live.py",
     "daemon/test_network.py",
     "core/test_fuzzed_session.py",
+    "cli/test_command_line.py",
+    "test_client_settings.py",
     "cli/test_learn_command.py",
     "daemon/test_skill_worker.py",
     "cli/test_report_command.py",

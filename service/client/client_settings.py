@@ -1,0 +1,108 @@
+"""How a client reaches its cell: by what it is given, else the environment, else a file."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import zenoh
+
+from service.client.session import open_session
+from service.config import Cell
+from service.contract.channels import ENDPOINT, lacking
+from service.contract.explain import InvalidError, validated
+from service.described_arm import SettingsError, UnreadableError
+
+CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
+
+Endpoints = Annotated[tuple[str, ...], msgspec.Meta(extra={"accepted": "an endpoint, or a list of them,"})]
+
+
+class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a client reaches its cell."""
+
+    connect: Endpoints = ()  # the first that answers; none: those of `zenoh_config`, else ENDPOINT
+    cell: Cell = "thirdhand"  # prefix of all keys
+    certificate: str = ""  # the folder of one's role; empty: none
+    zenoh_config: str = ""  # a file of Zenoh's own; empty: none
+
+    def __post_init__(self) -> None:
+        for i, endpoint in enumerate(self.connect):
+            if lacks := lacking(endpoint):
+                raise ValueError(f"$.connect[{i}]: {lacks}")
+        if {".", ".."} & set(self.cell.split("/")):
+            raise ValueError(f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted")
+
+    def session(self, *, timeout_s: float | None = 10.0) -> zenoh.Session:
+        """A session to the daemon, recorder or router, as `open_session` opens it."""
+        return open_session(
+            connect=self.connect,
+            otherwise=[ENDPOINT],
+            timeout_s=timeout_s,
+            certificate=self.certificate,
+            zenoh_config=self.zenoh_config,
+        )
+
+
+def client_settings(
+    *,
+    connect: Sequence[str] | None = None,
+    cell: str | None = None,
+    certificate: str | Path | None = None,
+    zenoh_config: str | Path | None = None,
+) -> ClientSettings:
+    """The settings of a client. What is None is taken from $THIRDHAND_CONNECT (endpoints with
+    commas between), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE and $THIRDHAND_ZENOH_CONFIG, else from
+    the file, else it is the default.
+
+    Raises SettingsError, which names the file, variable or option that is wrong.
+    """
+    path = _file()
+    found = {} if path is None else _checked(str(path), _read(path))
+    given = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
+    for name, option in given.items():
+        if told := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
+            listed = [part.strip() for part in told.split(",")] if name == "connect" else told
+            found |= _checked(f"${variable}", {name: listed})
+        if option or option == "":
+            found |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
+    return msgspec.convert(found, ClientSettings)
+
+
+def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
+    """What was given, once it is valid. Raises SettingsError."""
+    try:
+        validated(given, ClientSettings)
+    except InvalidError as error:
+        raise SettingsError(f"{origin}: {error}") from None
+    return given
+
+
+def _file() -> Path | None:
+    """The client's file, if there is one."""
+    try:
+        folder = Path(os.environ.get("XDG_CONFIG_HOME") or "").expanduser()
+        path = (folder if folder.is_absolute() else Path.home() / ".config") / "thirdhand" / "client.toml"
+    except RuntimeError:  # no home
+        return None
+    return path if path.exists() else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a client's file holds; paths in it are relative to its folder. Raises SettingsError."""
+    try:
+        given = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadableError(f"cannot read client settings {path}: {error}") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise SettingsError(f"{path}: {error}") from None
+    if isinstance(given.get("connect"), str):
+        given["connect"] = [given["connect"]]
+    for name in ("certificate", "zenoh_config"):
+        if isinstance(value := given.get(name), str) and value and not value.startswith("~"):
+            given[name] = str(path.parent / value)
+    return given
