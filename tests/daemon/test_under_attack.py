@@ -7,6 +7,7 @@ from tight: this runs on machines that are busy.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import subprocess
@@ -28,7 +29,7 @@ from support.paths import ROOT
 
 pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
-SOON_S, USUAL_S, AT_ONCE_S = 1.0, 0.050, 0.010
+SOON_S, USUAL_S, LONGEST_GAP_S, AT_ONCE_S = 1.0, 0.050, 0.020, 0.010
 
 IDLE_CONNECTIONS = """
 import resource, socket
@@ -58,6 +59,20 @@ with open_session(connect=[endpoint]) as session:
     large = bytes(10 * 2**20)
     asked = [session.get("thirdhand/hold", payload=large, timeout=2.0) for _ in range(200)]
     print(sum(reply.ok is not None for replies in asked for reply in replies))
+"""
+ONE_LARGE_MESSAGE = """
+times = []
+for mib in (0, 400) * 4:
+    with open_session(connect=[endpoint]) as session:
+        hand, payload = session.declare_publisher("thirdhand/hands/left"), bytes(mib * 2**20)
+        time.sleep(0.5)
+        begin = time.monotonic()
+        if mib:
+            hand.put(payload)
+        time.sleep(0.5)
+        times += [begin, time.monotonic()]
+        del payload
+print(*times)
 """
 FLOOD = """
 from service.contract.requests import Add, ViaPoint, encode_json
@@ -299,6 +314,20 @@ def test_large_messages_are_not_taken_in(daemon: Daemon) -> None:
         assert holds_s(daemon)[-1] < SOON_S
     assert peak_mib(daemon.process.pid) - before < 32
     assert daemon.client.status().rejected.get("malformed hands/left") is None
+
+
+def test_commands_come_on_while_a_large_message_is_sent(daemon: Daemon) -> None:
+    """As another process hears them, with and without such a message in turn."""
+    heard: list[float] = []
+    daemon.until(lambda status: status["tick"] > 0)
+    listening = daemon.session.declare_subscriber("thirdhand/joints/command", lambda _: heard.append(time.monotonic()))
+    with attack(ONE_LARGE_MESSAGE, daemon) as said:
+        times = [float(at) for at in said.split()]
+    listening.undeclare()  # type: ignore[no-untyped-call]
+    pairs = list(itertools.pairwise(heard))
+    spans = zip(times[::2], times[1::2], strict=True)
+    gaps = [max(b - a for a, b in pairs if begin <= b < end) for begin, end in spans]
+    assert min(gaps[1::2]) < max(LONGEST_GAP_S, 2.0 * min(gaps[::2])), gaps
 
 
 def test_a_client_is_told_that_its_request_is_too_large(daemon: Daemon) -> None:
