@@ -13,9 +13,9 @@ contradicts it. One rule for both hands and the arm:
 * A hand that comes to where the other one was, which is not seen there any more, has not moved: its
   tracker takes one for the other. That is believed after `hands.swapped_s`, as it may have put
   itself right.
-* A source is contested from when a quarter of what it told within about a second had jumped, until
-  that is less than a tenth; and while a hand's samples scatter more than any tracker's, as those of
-  two that are some centimetres apart do.
+* A source is contested from when a quarter of what it told within about a second had jumped, or of
+  a hand went to and fro between two places, until that is less than a tenth; and while a hand's
+  samples scatter more than any tracker's, as those of two that are some centimetres apart do.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SIDES, SOURCES, Cause, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
-from service.core.intake.hand_estimator import HandEstimator, has_jumped, take
+from service.core.intake.hand_estimator import HandEstimator, has_jumped, is_to_and_fro, take
 
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 CONFIRMED = 3  # samples in a row that agree
@@ -344,7 +344,8 @@ def _take_hand(
         cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
         if cause != REPEATED:
             jumped = fresh and has_jumped(states, parameters, side, in_base, since * period_s)
-            note(states, side, jumped, period_s)
+            twofold = fresh and is_to_and_fro(states, side, in_base, since * period_s)
+            note(states, side, jumped or twofold, period_s)
             jumped = jumped or is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and not is_confirmed(states, parameters, side, in_base):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
