@@ -72,12 +72,16 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 @compiled
 def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
-    """Remembers how much a source is contradicted."""
+    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
+    after the other, the samples count alike.
+    """
     state = states[0]
     ticks, share = state.sample_ticks[source], state.contested[source]
-    if ticks[1] < state.tick:  # two in one tick count alike
+    passed = float(state.tick - ticks[0])
+    if ticks[1] < state.tick:
+        passed *= 0.5  # since the sample before the last
         ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min((state.tick - ticks[0]) * period_s, MOST_S)
+    passed_s = min(passed * period_s, MOST_S)
     share += (1.0 - math.exp(-passed_s / MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
     state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
