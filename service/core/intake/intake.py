@@ -42,6 +42,7 @@ SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
 AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
 AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
 CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
+MOST_SHARE = 0.5  # to which samples that went to and fro raise it
 SETTLED = 0.1  # share below which it is no more
 SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
 GATHERED_M = 0.010  # below which it is no more
@@ -348,7 +349,8 @@ def _take_hand(
         cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
         if cause != REPEATED:
             jumped = fresh and has_jumped(states, parameters, side, in_base, since * period_s)
-            twofold = fresh and is_to_and_fro(states, side, in_base, since * period_s)
+            doubtful = state.contested[side] < MOST_SHARE  # no more is needed, and it would settle late
+            twofold = fresh and doubtful and is_to_and_fro(states, side, in_base, since * period_s)
             note(states, side, jumped or twofold, period_s)
             jumped = jumped or is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and not is_confirmed(states, parameters, side, in_base):
