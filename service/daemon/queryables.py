@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import queue
 import threading
 import time
@@ -43,11 +44,15 @@ from service.learning.via_points import in_force, points_made_of, warnings_of
 ADOPTION_TIMEOUT_S = 2.0
 POLL_S = 0.001  # while waiting for the tick that took a request
 MOST_POINTS = 400  # of all via-points, with the points of their neighbourhoods
-MOST_WAITING = 16  # requests in a queue
+MOST_WAITING = 16  # requests in a queue ...
+MOST_ORDERS = 1024  # ... of orders, of which one tick takes all
 LONGEST_LIST = 100  # bytes
 TEXT = zenoh.Encoding.TEXT_PLAIN
 ORDERS = ("hold", "resume", "reset")
 COMPUTED = "teaching"  # the queue of requests for which the skill worker computes
+
+
+Order = Callable[[str], Reply | RequestError]  # carries out hold, resume or reset
 
 
 class PendingEvent:
@@ -78,11 +83,17 @@ class PendingEvent:
 
 
 class RequestQueue:
-    """Requests that wait for a thread of their own; one beyond MOST_WAITING is refused."""
+    """Requests that wait for a thread of their own; one beyond `most` is refused.
 
-    def __init__(self, name: str, answer: Callable[[str, zenoh.Query], None], failed: Callable[[str], None]) -> None:
+    `answer` takes orders together, as many as wait, and other requests one by one.
+    """
+
+    def __init__(
+        self, name: str, answer: Callable[[list[tuple[str, zenoh.Query]]], None], failed: Callable[[str], None]
+    ) -> None:
         self._name, self._answer = name, answer
-        self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(MOST_WAITING)
+        self._most, self._together = (MOST_ORDERS, MOST_ORDERS) if name in ORDERS else (MOST_WAITING, 1)
+        self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(self._most)
         self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
 
     def enqueue(self, suffix: str, query: zenoh.Query) -> None:
@@ -91,7 +102,7 @@ class RequestQueue:
             self._waiting.put_nowait((suffix, query))
         except queue.Full:
             with query:
-                refusal = f"busy: {MOST_WAITING} {self._name} requests wait already; try again later"
+                refusal = f"busy: {self._most} {self._name} requests wait already; try again later"
                 query.reply_err(refusal.encode(), encoding=TEXT)
 
     def close(self) -> None:
@@ -101,9 +112,14 @@ class RequestQueue:
 
     def _serve(self) -> None:
         run_beside_real_time()
-        while (item := self._waiting.get()) is not None:
-            self._answer(*item)
-            item = None  # the client's query ends once its last reference is gone
+        ended = False
+        while not ended:
+            taken = [self._waiting.get()]
+            while len(taken) < self._together and not self._waiting.empty():
+                taken.append(self._waiting.get())
+            ended = taken[-1] is None
+            self._answer([item for item in taken if item is not None])
+            taken.clear()  # a client's query ends once its last reference is gone
 
 
 class Queryables:
@@ -138,7 +154,7 @@ class Queryables:
         self._keep = keep
         self._failed = failed
         self._saved = SavedViaPoints(settings)
-        self._queues = {name: RequestQueue(name, self._reply, failed) for name in (*ORDERS, COMPUTED)}
+        self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*ORDERS, COMPUTED)}
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
@@ -150,7 +166,7 @@ class Queryables:
                     local.is_prioritised = True
                     run_beside_real_time()
                 if suffix == "status" or self._is_list(suffix, query):
-                    self._reply(suffix, query, noted=False)
+                    self._reply(suffix, query)
                 else:
                     self._queues[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
             except Exception as error:
@@ -174,7 +190,13 @@ class Queryables:
         except RequestError:
             return False
 
-    def _reply(self, suffix: str, query: zenoh.Query, *, noted: bool = True) -> None:
+    def _reply_together(self, asked: Sequence[tuple[str, zenoh.Query]]) -> None:
+        """Replies to requests, of which equal orders go through the loop once."""
+        order_once = functools.cache(self._order)
+        for suffix, query in asked:
+            self._reply(suffix, query, order_once)
+
+    def _reply(self, suffix: str, query: zenoh.Query, order: Order | None = None) -> None:
         key = channels.key(self._settings.cell, suffix)
         with query:  # its end tells the client that no more replies come
             try:
@@ -183,7 +205,11 @@ class Queryables:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 if (size := len(payload)) > channels.LARGEST_REQUEST:
                     raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
-                answer = self._status() if suffix == "status" else encode_json(self._answer(suffix, payload))
+                answer = (
+                    self._status()
+                    if suffix == "status"
+                    else encode_json(self._answer(suffix, payload, order or self._order))
+                )
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")
                 query.reply_err(str(error).encode(), encoding=TEXT)
@@ -191,11 +217,11 @@ class Queryables:
                 self._note(f"{suffix} failed: {error!r}")
                 query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
             else:
-                if noted:
+                if order is not None:  # else it only asks what is known
                     self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
                 query.reply(key, answer, encoding=ENCODINGS["json"])
 
-    def _answer(self, suffix: str, payload: bytes) -> Reply:
+    def _answer(self, suffix: str, payload: bytes, order: Order) -> Reply:
         request = channels.BY_KEY[suffix].codec.decode(payload)
         match request:
             case SkillRequest(name):
@@ -205,13 +231,19 @@ class Queryables:
             case Add() | Remove() | Clear():
                 return self._teach(request)
             case Nothing():
-                return self._order(suffix)
+                if isinstance(reply := order(suffix), RequestError):
+                    raise reply
+                return reply
         raise RequestError(f"nothing is done with a request on {suffix}")
 
-    def _order(self, suffix: str) -> Reply:
-        """The reply to hold, resume or reset, with the mode that resulted."""
+    def _order(self, suffix: str) -> Reply | RequestError:
+        """The reply to hold, resume or reset, with the mode that resulted, or why there is none."""
         before, _ = outcome(self._frame())
-        tick, end = self._through_the_loop(order(suffix)), time.monotonic() + ADOPTION_TIMEOUT_S
+        try:
+            tick = self._through_the_loop(order(suffix))
+        except RequestError as error:
+            return error
+        end = time.monotonic() + ADOPTION_TIMEOUT_S
         while int(self._frame()["tick"]) < tick and time.monotonic() < end:
             time.sleep(POLL_S)
         mode, reason = outcome(self._frame())

@@ -32,6 +32,15 @@ BOUNDS: dict[str, Any] = {
     "transport/unicast/accept_pending": MOST_HANDSHAKES,
     "transport/unicast/accept_timeout": HANDSHAKE_TIMEOUT_MS,
     "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE,
+    # an answer takes this from its query: to a client that does not read, it is dropped
+    "qos/network": [
+        {
+            "messages": ["query"],
+            "key_exprs": ["**"],
+            "flows": ["ingress"],
+            "overwrite": {"congestion_control": "drop"},
+        }
+    ],
 }
 MOST_READ = 4096  # bytes of what a lock's holder wrote
 log = logging.getLogger("thirdhand")

@@ -82,6 +82,12 @@ START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is 
 START_ACCELERATION = 1.0  # [m/s²] likewise
 LEAST_PROBABILITY = 1e-4  # of a mode
 MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
+PLACES_M = 0.012  # so far apart at least are the places of which two sources tell ...
+PLACE_SHARE = 0.4  # ... and so much of that is what each tells of one
+LEAST_S = 1e-3  # between two samples, also of one tick
+BETWEEN_S = 0.08  # the time over which a hand that was told of three times may go to and fro ...
+BETWEEN_MPS2 = 50.0  # [m/s²] ... unless that takes more than a hand can
+TO_AND_FRO = (0b0010, 0b0100, 0b0110, 0b0101)  # which of four samples are of one place, the rest of the other
 ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
 
 
@@ -296,6 +302,37 @@ def has_jumped(states: Records, parameters: Records, side: int, position: Vector
     for axis in range(3):
         off += (position[axis] - state.hands[side, 0, axis]) ** 2
     return bool(off > gate * gate)
+
+
+@compiled
+def is_to_and_fro(states: Records, side: int, position: Vector, interval_s: float) -> bool:
+    """Whether a sample (3,) [m], `interval_s` after the one before, and the three before it go to
+    and fro between two places as no hand does, however uneven their intervals.
+    """
+    state, samples, wanted = states[0], np.empty((4, 3)), 0.0
+    if interval_s + state.sample_interval_s[side] > BETWEEN_S:
+        return False
+    samples[0], samples[1:] = position, state.past_samples[side]
+    after_s, before_s = max(interval_s, LEAST_S), max(state.sample_interval_s[side], LEAST_S)
+    for axis in range(3):
+        turned = (samples[0, axis] - samples[1, axis]) / after_s - (samples[1, axis] - samples[2, axis]) / before_s
+        wanted += (2.0 * turned / (after_s + before_s)) ** 2
+    if wanted < BETWEEN_MPS2**2:
+        return False
+    for places in TO_AND_FRO:
+        within, apart = 0.0, np.inf
+        for i in range(4):
+            for j in range(i):
+                square = 0.0
+                for axis in range(3):
+                    square += (samples[i, axis] - samples[j, axis]) ** 2
+                if (places >> i) & 1 == (places >> j) & 1:
+                    within = max(within, square)
+                else:
+                    apart = min(apart, square)
+        if apart >= PLACES_M**2 and within <= PLACE_SHARE**2 * apart:
+            return True
+    return False
 
 
 @compiled

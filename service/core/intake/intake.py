@@ -13,9 +13,9 @@ contradicts it. One rule for both hands and the arm:
 * A hand that comes to where the other one was, which is not seen there any more, has not moved: its
   tracker takes one for the other. That is believed after `hands.swapped_s`, as it may have put
   itself right.
-* A source is contested from when a quarter of what it told within about a second had jumped, until
-  that is less than a tenth; and while a hand's samples scatter more than any tracker's, as those of
-  two that are some centimetres apart do.
+* A source is contested from when a quarter of what it told within about a second had jumped, or of
+  a hand went to and fro between two places, until that is less than a tenth; and while a hand's
+  samples scatter more than any tracker's, as those of two that are some centimetres apart do.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SIDES, SOURCES, Cause, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
-from service.core.intake.hand_estimator import HandEstimator, has_jumped, take
+from service.core.intake.hand_estimator import HandEstimator, has_jumped, is_to_and_fro, take
 
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 CONFIRMED = 3  # samples in a row that agree
@@ -42,6 +42,7 @@ SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
 AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
 AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
 CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
+MOST_SHARE = 0.5  # to which samples that went to and fro raise it
 SETTLED = 0.1  # share below which it is no more
 SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
 GATHERED_M = 0.010  # below which it is no more
@@ -72,12 +73,16 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 @compiled
 def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
-    """Remembers how much a source is contradicted."""
+    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
+    after the other, the samples count alike.
+    """
     state = states[0]
     ticks, share = state.sample_ticks[source], state.contested[source]
-    if ticks[1] < state.tick:  # two in one tick count alike
+    passed = float(state.tick - ticks[0])
+    if ticks[1] < state.tick:
+        passed *= 0.5  # since the sample before the last
         ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min((state.tick - ticks[0]) * period_s, MOST_S)
+    passed_s = min(passed * period_s, MOST_S)
     share += (1.0 - math.exp(-passed_s / MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
     state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
@@ -344,7 +349,9 @@ def _take_hand(
         cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
         if cause != REPEATED:
             jumped = fresh and has_jumped(states, parameters, side, in_base, since * period_s)
-            note(states, side, jumped, period_s)
+            doubtful = state.contested[side] < MOST_SHARE  # no more is needed, and it would settle late
+            twofold = fresh and doubtful and is_to_and_fro(states, side, in_base, since * period_s)
+            note(states, side, jumped or twofold, period_s)
             jumped = jumped or is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and not is_confirmed(states, parameters, side, in_base):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
