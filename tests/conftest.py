@@ -6,6 +6,7 @@ from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import importlib.util
+import os
 import subprocess
 import sys
 import time
@@ -38,6 +39,9 @@ if importlib.util.find_spec("pybullet") is None:
 
 
 BEGAN_S = time.monotonic()
+for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
+    os.environ.pop(f"THIRDHAND_{name}", None)
+os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
