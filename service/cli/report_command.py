@@ -61,7 +61,7 @@ def report(args: argparse.Namespace) -> int:
 
 def _print(console: Console, one: Report) -> None:
     verdict, *lines = summary(one)
-    console.print(Text(verdict, style="bold"))
+    console.print(Text(verdict, style="bold"), soft_wrap=True)
     for line in (str(one.path), *lines):
         console.print(Text(line))
     console.print(_bar(one))

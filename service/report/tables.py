@@ -128,7 +128,9 @@ def verdict(report: Report) -> str:
     """The report in one sentence: how much it followed, how often it did not, and the worst."""
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
-    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW]
+    first_s = next((span.start_s for span in report.spans if span.mode is Mode.FOLLOW), -1.0)
+    waited = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s < first_s]
+    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in waited]
     faults = len(report.faults)
     counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
     if stops:
@@ -136,8 +138,9 @@ def verdict(report: Report) -> str:
         most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
     else:
         most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+    since = f", from {first_s:.1f} s on" if waited else ""
     followed = 100 * report.seconds(Mode.FOLLOW) / report.lasts_s
-    return f"It followed {followed:.0f} % of {report.lasts_s:.1f} s, with {counts}; the worst was {most}."
+    return f"It followed {followed:.0f} % of {report.lasts_s:.1f} s{since}, with {counts}; the worst was {most}."
 
 
 def _times_of(count: int, what: str) -> str:

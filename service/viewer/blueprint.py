@@ -132,7 +132,7 @@ def blueprint(
     task = rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
     timing = rrb.Horizontal(
         rrb.Vertical(*(plot(origin) for origin in ("/latency", "/timing/lateness", "/age")), _log()),
-        rrb.Vertical(*(plot(origin) for origin in ("/timing/work", "/timing/stages")), modes()),
+        rrb.Vertical(*(plot(origin) for origin in ("/timing/work", "/timing/stages")), modes(), row_shares=[4, 4, 2]),
         name="Timing",
     )
     learning = rrb.Horizontal(
