@@ -223,6 +223,13 @@ class World:
         pybullet.disconnect(physicsClientId=self._id)
 
 
+def pixels(points: Any, matrix: Any, size: tuple[int, int]) -> Any:
+    """Where points (N, 3) [m] are in a picture of a size, by its matrix (4, 4): (N, 2)."""
+    seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    flat = seen[:, :2] / seen[:, 3:]
+    return (flat * (1, -1) + 1) / 2 * size
+
+
 def seen_from(holder: Pose, thing: Pose) -> Pose:
     """The thing's pose in its holder's frame."""
     return Pose(*pybullet.multiplyTransforms(*pybullet.invertTransform(*holder), *thing))

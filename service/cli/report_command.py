@@ -60,8 +60,9 @@ def report(args: argparse.Namespace) -> int:
 
 
 def _print(console: Console, one: Report) -> None:
-    console.print(Text(str(one.path), style="bold"))
-    for line in summary(one):
+    verdict, *lines = summary(one)
+    console.print(Text(verdict, style="bold"), soft_wrap=True)
+    for line in (str(one.path), *lines):
         console.print(Text(line))
     console.print(_bar(one))
     for table in tables(one):

@@ -20,15 +20,19 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import rerun as rr
 from mcap.writer import MCAP0_MAGIC
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
+from service import palette
 from service.cli.clients import ask
 from service.cli.live_page import Address, Latest, LivePage, web_viewer
 from service.cli.progress import progress, say
 from service.cli.usage import UsageError, check_writable, reached
 from service.client import Client
 from service.contract.explain import ExplainedError
+from service.contract.incidents import word
+from service.contract.records import Mode
 from service.launch import free_port
 from service.network_settings import is_local
 from service.recording.recording import OBJECTS, Recording
@@ -38,6 +42,7 @@ from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
 TITLE_BAR = 30  # pixels that a window's bar has at least
+MARGIN, LETTERS = 14, 15  # of what is said of a picture at its top [pixels]
 TINT = 40  # difference of colour channels in a grey bar
 FRESH_S = 1.0  # age of a live view's picture above which the age is printed
 FRESH_TIMEOUT_S = 10.0
@@ -184,8 +189,8 @@ def convert(
 def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
     """The age of the newest data in a picture of a live view [s]; None for a Rerun file.
 
-    The picture shows one tab, `time` [s] after the start or at the end. Raises ViewerError, and
-    UsageError for a time behind the end.
+    The picture shows one tab, `time` [s] after the start or when the arm last followed, and says
+    which time or how old it is. Raises ViewerError, and UsageError for a time behind the end.
     """
     from rerun.experimental import ViewerClient
 
@@ -204,15 +209,14 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             if extent is None:
                 raise ViewerError(f"no picture of {source}: it holds nothing yet")
             _select_tab(client, tab)
-            at = moment(extent, time)
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
-            else:
-                client.set_time(TIMELINE, duration=np.timedelta64(at, "ns"), play_state="paused")
-            if not live:
-                _settled(client, Path(png).absolute())
-                return None
-            return _fresh(client, Path(png).absolute())
+                return _fresh(client, Path(png).absolute())
+            at = moment(extent, time) if time is not None or live else last_followed(Path(source), extent[1])
+            client.set_time(TIMELINE, duration=np.timedelta64(at, "ns"), play_state="paused")
+            said = f"{(at - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
+            _settled(client, Path(png).absolute(), said)
+            return None
     except ViewerError:
         raise
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
@@ -227,6 +231,18 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
     if at > end:
         raise UsageError(f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed")
     return at
+
+
+def last_followed(rrd: Path, end: int) -> int:
+    """The last time [ns] in mode `follow` in a drawing that ends at `end` [ns], or `end`."""
+    times, modes = [], []
+    for chunk in rr.chunk.RrdReader(rrd).stream():
+        if chunk.entity_path == "/mode" and not chunk.is_static:
+            rows = chunk.to_record_batch()
+            times += rows[TIMELINE].cast("int64").to_pylist()
+            modes += [mode for (mode,) in rows["StateChange:state"].to_pylist()]
+    until = zip(modes, [*times[1:], end + 1], strict=True)
+    return max((time - 1 for mode, time in until if mode == word(Mode.FOLLOW)), default=end)
 
 
 def _select_tab(client: Any, tab: str) -> None:
@@ -247,22 +263,29 @@ def _select_tab(client: Any, tab: str) -> None:
         _wait(is_selected)
 
 
-def _picture(client: Any, png: Path) -> None:
-    """Saves a picture of the viewer, without the empty bar at its top."""
+def _picture(client: Any) -> Image.Image:
+    """A picture of the viewer, without the empty bar at its top."""
     with Image.open(io.BytesIO(client.take_screenshot())) as image:
         pixels = np.asarray(image.convert("RGB"))
-        bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
-        Image.fromarray(pixels[bar if bar < 2 * TITLE_BAR else 0 :]).save(png)
+    bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
+    return Image.fromarray(pixels[bar if bar < 2 * TITLE_BAR else 0 :])
+
+
+def _save(picture: Image.Image, png: Path, said: str) -> None:
+    """Saves a picture, with what is said of it at its top."""
+    at, font = (picture.width - MARGIN, MARGIN), ImageFont.load_default(LETTERS)
+    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM, anchor="rm", font=font)
+    picture.save(png)
 
 
 def _fresh(client: Any, png: Path) -> float:
     """The age of the data [s] in a picture of a live view, taken again until it is recent."""
-    until, age_s = clock.monotonic() + FRESH_TIMEOUT_S, 0.0
+    until = clock.monotonic() + FRESH_TIMEOUT_S
     while True:
-        newest = _extent(client, "time")
-        _picture(client, png)
+        newest, picture = _extent(client, "time"), _picture(client)
         age_s = clock.time() - (newest[1] if newest else 0) / 1e9
         if age_s <= FRESH_S or clock.monotonic() > until:
+            _save(picture, png, f"{age_s:.1f} s old")
             return age_s
         clock.sleep(0.3)
 
@@ -275,16 +298,16 @@ def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
     return next(((line.start, line.end) for line in lines if line.start is not None and line.end is not None), None)
 
 
-def _settled(client: Any, png: Path) -> None:
+def _settled(client: Any, png: Path, said: str) -> None:
     """Saves the picture once three in a row are the same: all is loaded, notifications are gone."""
-    seen: list[bytes] = []
+    seen: list[Image.Image] = []
 
     def same() -> bool:
-        _picture(client, png)
-        seen.append(png.read_bytes())
+        seen.append(_picture(client))
         return len(seen) >= 8 and seen[-1] == seen[-2] == seen[-3]
 
     _wait(same, timeout_s=10.0)
+    _save(seen[-1], png, said)
 
 
 def _wait(done: Callable[[], bool], timeout_s: float = 30.0) -> None:

@@ -23,6 +23,7 @@ from service.contract.requests import ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
+from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
 from service.recording.mcap_file import machine, whole_file
@@ -31,7 +32,7 @@ HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
 HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
 ELSEWHERE = ("**/hands/*", "**/tool/pose")  # what is published in other cells, or misspelt
 MOST_OTHERS = 8  # of ELSEWHERE that an error lists
-REST_M, REST_RAD = 0.015, 0.02  # motion at rest: trackers are noisy, and hands tremble
+REST_RAD = 0.02  # motion of a joint at rest
 COVERED = 0.7  # share of the rest's duration that samples have to cover
 MOVED = 5.0  # times the motion at rest, which has to be seen before rest ends a capture
 KEPT_S = 0.3  # of the rest before and after the motion

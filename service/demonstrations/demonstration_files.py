@@ -13,6 +13,7 @@ from service.config import Settings
 from service.contract.channels import JOINTS, POSE
 from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
+from service.demonstrations.dwells import remarks_on_places
 from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
 from service.learning.demonstration import LEAST_M, Demonstration
 from service.recording.mcap_file import RecordingError, whole_file
@@ -20,6 +21,7 @@ from service.recording.mcap_reader import Messages
 
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # without a sample, after which the daemon holds for a stale hand
+AWAY = 5.0  # times the usual gap: where it is longer than this and GAP_S, nothing was seen
 JUMP_M, MAX_HAND_SPEED = 0.02, 5.0  # [m, m/s]: a larger step from one sample to the next is a jump
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDTH = 60  # letters of the plot
@@ -34,8 +36,8 @@ class DemonstrationNameError(RecordingError):
 
 
 class Stream(NamedTuple):
-    """One stream of a take: number of poses, rate [Hz], the longest gap [s] and when it began [s],
-    and the poses' frame.
+    """One stream of a take: number of poses, rate while it is seen [Hz], the longest gap [s] and
+    when it began [s], and the poses' frame.
     """
 
     name: str
@@ -94,7 +96,7 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     recorded = Recorded(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
-    remarks += _still(demonstration)
+    remarks += [*_still(demonstration), *remarks_on_places(demonstration)]
     for side in SIDES:
         if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
             remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
@@ -120,8 +122,9 @@ def _jumps(at: Vector, seconds: Vector) -> int:
 def _stream(side: str, track: Track) -> Stream:
     logged = np.sort(track.logged_ns) / 1e9
     gaps = np.diff(logged, prepend=logged[:1])
-    lasts_s, worst = float(np.ptp(logged)), int(np.argmax(gaps))
-    rate = (len(logged) - 1) / lasts_s if lasts_s else 0.0
+    worst = int(np.argmax(gaps))
+    seen = gaps[1:][gaps[1:] <= max(GAP_S, AWAY * float(np.median(gaps[1:])))] if len(gaps) > 1 else gaps[1:]
+    rate = len(seen) / float(seen.sum()) if seen.any() else 0.0
     began = float(logged[max(0, worst - 1)] - logged[0])
     return Stream(side, len(logged), rate, float(gaps[worst]), began, track.frame)
 

@@ -4,7 +4,7 @@ and what makes it unsafe.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -63,6 +63,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     within_50: float  # [%] of the samples inside the region that should hold 50 %
     within_95: float
     held: float  # [%] of the time that the gate would hold
+    other_mm: dict[str, float] = {}  # root mean square error of other ways to predict it
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
@@ -71,6 +72,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     demonstrations: tuple[Row, ...]
     all: Row
     gate_mm: float
+    held_std: float = 0.0  # of `held`, from demonstration to demonstration
     swapped: float  # of planted nonsense that is held: hands swapped,
     beside: float  # both 30 cm beside,
     one_beside: float  # one of them
@@ -90,13 +92,18 @@ def figures(
     gate: Gate,
     posed: Posed,
     *,
+    beside: Mapping[str, Sequence[Vector]],
     reach: Reach,
     remarks: Sequence[str],
 ) -> Figures:
     """The figures of a skill: its demonstrations, their hands (T, 6) and tools (T, 3) [m] in phase,
-    what was predicted of each, its gate, and what it learned besides.
+    what was predicted of each, its gate, what it learned besides, and errors (T, 3) [m] of other
+    ways to predict each demonstration, `beside` it.
     """
-    rows = tuple(_row(name, one, gate.threshold) for name, one in zip(names, held_out, strict=True))
+    rows = tuple(
+        _row(name, one, gate.threshold, {way: errors[i] for way, errors in beside.items()})
+        for i, (name, one) in enumerate(zip(names, held_out, strict=True))
+    )
     total = HeldOut(*(np.concatenate(parts) for parts in zip(*held_out, strict=True)))
     hands, tools = zip(*paths, strict=True)
     ambiguous, contradiction = ambiguity(
@@ -105,7 +112,8 @@ def figures(
     out = np.array([not is_reachable(at, reach) for _, tool in paths for at in tool[:: max(1, len(tool) // COMPARED)]])
     found = Figures(
         demonstrations=rows,
-        all=_row("all", total, gate.threshold),
+        all=_row("all", total, gate.threshold, {way: np.concatenate(errors) for way, errors in beside.items()}),
+        held_std=float(np.std([row.held for row in rows])),
         gate_mm=1000 * gate.threshold,
         swapped=100 * gate.caught.swapped,
         beside=100 * gate.caught.beside,
@@ -172,7 +180,7 @@ def _lengths(points: Vector) -> Vector:
     return np.sqrt(np.maximum(_squares(points), 0.0))
 
 
-def _row(name: str, one: HeldOut, threshold: float) -> Row:
+def _row(name: str, one: HeldOut, threshold: float, beside: Mapping[str, Vector]) -> Row:
     distances = mahalanobis(one.errors, one.covariance)
     lengths = np.linalg.norm(one.errors, axis=1)
     return Row(
@@ -183,6 +191,7 @@ def _row(name: str, one: HeldOut, threshold: float) -> Row:
         within_50=100 * float((distances <= REGIONS[0]).mean()),
         within_95=100 * float((distances <= REGIONS[1]).mean()),
         held=100 * float((one.gate_m > threshold).mean()),
+        other_mm={way: 1000 * rms(errors) for way, errors in beside.items()},
     )
 
 
@@ -209,6 +218,9 @@ def _verdicts(
             f"where the tool is; up to {UNSAFE_MM:.0f} mm accepted",
             bad=overall.error_mm > UNSAFE_MM,
         )
+    for way, error_mm in overall.other_mm.items():
+        if error_mm < overall.error_mm:
+            say(f"{way}, held-out demonstrations are missed by less: {error_mm:.0f} mm, not {overall.error_mm:.0f}")
     usual = float(np.median([row.error_mm for row in found.demonstrations]))
     for row in found.demonstrations:
         if len(found.demonstrations) > 2 and row.error_mm > max(STANDS_OUT * usual, NOTED_MM / 2):
@@ -246,13 +258,18 @@ def table(found: Figures) -> str:
     """The figures as a short table for a terminal."""
     which = "held out" if len(found.demonstrations) > 1 else "learned from"
     width = max(len(text) for text in (which, *(row.name for row in (*found.demonstrations, found.all))))
-    lines = [f"{which:<{width}}   error  predicted   worst   in 50 %  in 95 %   held"]
+    ways = "".join(f"   {way}" for way in found.all.other_mm)
+    lines = [f"{which:<{width}}   error  predicted   worst   in 50 %  in 95 %   held{ways}"]
     for row in (*found.demonstrations, found.all):
         lines.append(
             f"{row.name:<{width}}  {row.error_mm:4.0f} mm    {row.predicted_mm:4.0f} mm {row.worst_mm:4.0f} mm"
             f"   {row.within_50:5.0f} %  {row.within_95:5.0f} %  {row.held:4.1f} %"
+            + "".join(f"   {f'{mm:.0f} mm':>{len(way)}}" for way, mm in row.other_mm.items())
         )
+    helds = [row.held for row in found.demonstrations]
     lines += [
+        f"the gate would hold {found.all.held:.1f} % of the time: {min(helds):.1f} to {max(helds):.1f} % of a "
+        f"demonstration, standard deviation {found.held_std:.1f} %",
         f"gate {found.gate_mm:.0f} mm: holds {found.swapped:.0f} % of hands swapped, {found.beside:.0f} % of both "
         f"30 cm beside, {found.one_beside:.0f} % of one hand 30 cm beside",
         f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "

@@ -19,6 +19,7 @@ from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
+from service.learning.baselines import left_out, linear, look_up
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
 from service.learning.gate import CEILING_M, gate_between, nonsense
@@ -43,6 +44,7 @@ class Evidence(NamedTuple):
 
 
 Looked = TypeVar("Looked")
+LINEAR, LOOK_UP, NO_PLACES = "linear", "look-up", "without places"
 Fit = Callable[[int | None], KMP]  # the primitive of all demonstrations but one, or of all
 
 
@@ -79,19 +81,23 @@ def learn(
     pairs = _of_each(names, in_phase, demonstrations)
     twins = repeated(pairs)
     remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
-    left_out = "".join(f"; {remark}" for remark in remarks)
+    repeats = "".join(f"; {remark}" for remark in remarks)
     kept = [i for i in range(len(pairs)) if i not in twins]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
     closures = _of_each(names, closure_in_phase, demonstrations)
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
+    beside = {way: left_out(paths, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
     task = task_of(demonstrations) if components is None and ell is None else ""
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
             progress(f"learning between the via-points {', '.join(task.names)}")
             found = learned(task, demonstrations, paths, progress)
+            progress("learning without the places, to set beside it")
+            fit = _from_demonstrations(paths, points, ell)
+            beside = {NO_PLACES: [one.errors for one in _held_out(paths, fit, progress)], **beside}
         else:
             remarks += [task] if task else []
             if components is None:
@@ -119,10 +125,18 @@ def learn(
         )
     except ValueError as error:
         if isinstance(error, SkillError):
-            raise SkillError(f"{error}{left_out}") from None
+            raise SkillError(f"{error}{repeats}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
     judged = figures(
-        demonstrations, paths, names, found.held_out, found.gate, posed, reach=reach or Reach(), remarks=remarks
+        demonstrations,
+        paths,
+        names,
+        found.held_out,
+        found.gate,
+        posed,
+        beside=beside if len(paths) > 1 else {},
+        reach=reach or Reach(),
+        remarks=remarks,
     )
     tools = np.concatenate([pairs[i][1] for i in kept])
     skill = StoredSkill(

@@ -122,7 +122,7 @@ def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration]
     """
     warned = []
     for named, follow in zip(task.names, task.follow.tolist(), strict=True):
-        off = [_nearest(one, next(_ordered(one.places, (named,))), follow) for one in demonstrations]
+        off = [float(off_via_point(one, next(_ordered(one.places, (named,))), follow).min()) for one in demonstrations]
         if min(off) > FAR_M:
             raise SkillError(
                 f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
@@ -135,14 +135,14 @@ def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration]
     return warned
 
 
-def _nearest(demonstration: Demonstration, point: ViaPoint, follow: int) -> float:
-    """The tool's least distance from a via-point [m], there or with the hand that it follows."""
+def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) -> Vector:
+    """The tool's distance (T,) from a via-point [m], there or with the hand that it follows."""
     off = demonstration.tool[:, :3] - point.tool
-    out = float(np.linalg.norm(off, axis=1).min())
+    out: Vector = np.linalg.norm(off, axis=1)
     if follow == NONE:
         return out
     hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (point.left, point.right)[follow]
-    return min(out, float(np.linalg.norm(off - hand, axis=1).min()))
+    return np.asarray(np.minimum(out, np.linalg.norm(off - hand, axis=1)))
 
 
 def merged(task: Task, encode: Callable[[Task], list[Encoded]]) -> tuple[Task, list[Encoded], list[Vector]]:

@@ -23,8 +23,9 @@ LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, p
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
 WIDE = 0.011  # of the width of a plot has a letter
 POINTS = 1500  # of a curve at most, the least and the greatest of each stretch
-LEAST_US = 10.0  # less is not shown
+LEAST_US, LEAST_MM = 10.0, 0.1  # less is not shown
 MOST = 99.5  # per cent of the values that an axis holds; the rest is cut off, and said
+TINT = 0.08  # of what a plot shows where the arm does not follow: palette.PAPER
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fff; max-width: 62rem;
        margin: 2rem auto; padding: 0 1rem }
@@ -47,7 +48,9 @@ def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda 
         parts += [_table(table) for table in comparison(reports)]
     for i, (name, report) in enumerate(zip(names, reports, strict=True)):
         parts.append(f"<h2>{escape(name)}</h2>")
-        parts += [f"<p>{escape(line)}</p>" for line in (str(report.path), *summary(report))]
+        verdict, *lines = summary(report)
+        parts.append(f"<p><strong>{escape(verdict)}</strong></p>")
+        parts += [f"<p>{escape(line)}</p>" for line in (str(report.path), *lines)]
         if len(report.columns.frames):
             parts += [_svg(_over_time(report), f"{name}-time-"), _svg(_from_above(report), f"{name}-above-")]
         parts += [_table(table) for table in tables(report)]
@@ -91,7 +94,7 @@ def _over_time(report: Report) -> Figure:
         modes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, lw=0)
         if span.mode is not Mode.FOLLOW:
             for axes in others:
-                axes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, alpha=0.15, lw=0)
+                axes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, alpha=TINT, lw=0)
         if span.lasts_s > WIDE * max(map(len, span.doing.split(": "))) * report.lasts_s:
             modes.text(span.start_s + span.lasts_s / 2, 0.5, span.doing.replace(": ", "\n"), ha="center", va="center",
                        color="white", fontsize=8)  # fmt: skip
@@ -101,7 +104,7 @@ def _over_time(report: Report) -> Figure:
 
     seen = (frames["hand_ages"] >= 0).any(axis=1)
     _curve(near, times, np.where(seen, 100 * frames["hand_distance"], np.nan), NEAREST, "nearest hand to the arm")
-    near.set(ylabel="[cm]", ylim=(0, None))
+    near.set(ylabel="distance [cm]", ylim=(0, None))
 
     following = frames["mode"] == Mode.FOLLOW
     lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
@@ -109,13 +112,14 @@ def _over_time(report: Report) -> Figure:
     measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
     gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
     _curve(errors, times, gate_m, OFF, " / ".join(measures))
-    errors.set(ylabel="[mm]", yscale="log")
+    errors.set(ylabel="error, deviation [mm]", yscale="log", ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)))
+    errors.yaxis.set_major_formatter("{x:g}")
 
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
         found = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
         _curve(speed, times, found, colour, f"{side} hand")
     _curve(speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint")
-    speed.set(ylabel="[m/s]")
+    speed.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
     for late in others[3:]:
@@ -127,8 +131,11 @@ def _over_time(report: Report) -> Figure:
         ):
             told = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
             late.plot(*thinned(at, told), ".", color=colour, ms=2, label=label)
-        late.set(yscale="log", ylabel="[µs]")
-    others[-1].set(xlabel="since the first tick [s]")
+        late.set(yscale="log", ylabel="time [µs]")
+        late.yaxis.set_major_formatter("{x:g}")
+    others[-1].set(xlabel="time since the first tick [s]")
+    modes.set_ylabel("mode", rotation=0, ha="right", va="center")
+    figure.align_ylabels()
     for axes in (modes, *others):
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -139,7 +139,10 @@ class Report:
         self.limits = tuple(_limits(columns))
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
-        self.hands_hz = {side: columns.samples[f"hands/{side}"] / lasts_s if lasts_s else 0.0 for side in SIDES}
+        stale_ticks = recording.settings.hands.stale_ms / 1000 / columns.period_s
+        seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] <= stale_ticks)
+        seen_s = np.maximum(seen.sum(axis=0), 1) * columns.period_s  # of each hand; a rate is of this time
+        self.hands_hz = {side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)}
 
     @property
     def faults(self) -> tuple[Span, ...]:

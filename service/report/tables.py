@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from service.contract.incidents import remedy, word
+from service.contract.records import Mode
 from service.report.report import Figure, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
@@ -123,15 +124,38 @@ def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]
     yield "tool from its target, following", report.lag_mm, "mm", 1
 
 
+def verdict(report: Report) -> str:
+    """The report in one sentence: how much it followed, how often it did not, and the worst."""
+    if not report.spans:
+        return "There is nothing to report: the recording holds no tick."
+    first_s = next((span.start_s for span in report.spans if span.mode is Mode.FOLLOW), -1.0)
+    waited = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s < first_s]
+    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in waited]
+    faults = len(report.faults)
+    counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
+    if stops:
+        worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
+        most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
+    else:
+        most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+    since = f", from {first_s:.1f} s on" if waited else ""
+    followed = 100 * report.seconds(Mode.FOLLOW) / report.lasts_s
+    return f"It followed {followed:.0f} % of {report.lasts_s:.1f} s{since}, with {counts}; the worst was {most}."
+
+
+def _times_of(count: int, what: str) -> str:
+    return f"{count or 'no'} {what}{'s' * (count != 1)}"
+
+
 def summary(report: Report) -> list[str]:
-    """What a report begins with, a line each."""
-    lacks, faults = len(report.lacks), len(report.faults)
+    """What a report begins with, a line each; the verdict first."""
+    lacks = len(report.lacks)
     hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
     return [
+        verdict(report),
         f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
         f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}." if lacks else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
-        f"{faults or 'No'} fault{'s' * (faults != 1)}.",
     ]
 
 

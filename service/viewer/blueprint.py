@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -21,7 +21,8 @@ from service.config import Settings
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
 WINDOW_S = 20.0  # of live curves
-LEGEND_SHARE = 0.28  # of the time axis, kept free for legends
+LEGEND_SHARE = 0.175  # of the time axis, kept free for legends
+NUMBERS_SHARE = 0.032  # of the time axis: as wide as the numbers left of a curve, which modes lack
 HEADROOM = 1.25  # an axis' range over the curves' usual range
 GATE_FAR = 4.0  # a gate this many times above the curves is not drawn: it would flatten them
 EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
@@ -85,13 +86,12 @@ def blueprint(
         tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
     left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
     relative = rrb.TimeRangeBoundary.cursor_relative
-    if end_s is None:
-        room_s = LEGEND_SHARE * WINDOW_S / (1 - LEGEND_SHARE)
-        shown = rr.TimeRange(start=relative(seconds=-WINDOW_S), end=relative(seconds=room_s))
-    else:
-        whole_s = max(1.0, end_s / (1 - LEGEND_SHARE))
-        absolute = rrb.TimeRangeBoundary.absolute
-        shown = rr.TimeRange(start=absolute(seconds=0.0), end=absolute(seconds=whole_s))
+    at, first_s, last_s = (relative, -WINDOW_S, 0.0) if end_s is None else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
+    whole_s = max(1.0, (last_s - first_s) / (1 - LEGEND_SHARE))
+    shown, beside_numbers = (
+        rr.TimeRange(start=at(seconds=first_s - share * whole_s), end=at(seconds=first_s + whole_s))
+        for share in (0.0, NUMBERS_SHARE)
+    )
     loaded = (
         rrb.VisibleTimeRanges(rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative()))
         if live
@@ -112,30 +112,27 @@ def blueprint(
             time_ranges=loaded,
         )
 
-    task = rrb.Vertical(
-        rrb.Horizontal(
-            _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
-            rrb.Vertical(
-                rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), active_tab=0),
-                plot("/deviation"),
-                rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
-                rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
-                row_shares=[3, 3, 3, 5],  # the joints have seven names
-            ),
-            column_shares=[3, 2],
-        ),
-        rrb.Horizontal(_modes(shown), _log(), column_shares=[3, 2]),
-        row_shares=[7, 2],
-        name="Task",
+    def modes() -> rrb.StateTimelineView:
+        axis = rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=beside_numbers)
+        return rrb.StateTimelineView(origin="/", contents=["/mode", "/reason"], name="Mode", time_view=axis)
+
+    bench = rrb.Vertical(
+        _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
+        _log(),
+        row_shares=[4, 1],
     )
-    timing = rrb.Vertical(
-        rrb.Grid(
-            *(plot(origin) for origin in ("/latency", "/timing/lateness", "/timing/work", "/timing/stages", "/age")),
-            _log(),
-            grid_columns=2,
-        ),
-        _modes(shown),
-        row_shares=[6, 1],
+    curves = rrb.Vertical(
+        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), active_tab=0),
+        plot("/deviation"),
+        rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
+        rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
+        modes(),  # below the curves: its time is theirs
+        row_shares=[3, 3, 3, 5, 2.6],  # the joints have seven names
+    )
+    task = rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
+    timing = rrb.Horizontal(
+        rrb.Vertical(*(plot(origin) for origin in ("/latency", "/timing/lateness", "/age")), _log()),
+        rrb.Vertical(*(plot(origin) for origin in ("/timing/work", "/timing/stages")), modes(), row_shares=[4, 4, 2]),
         name="Timing",
     )
     learning = rrb.Horizontal(
@@ -180,11 +177,6 @@ def _scene(name: str, *contents: str) -> rrb.Spatial3DView:
         ),
         eye_controls=rrb.EyeControls3D(position=EYE, look_target=LOOK_AT, eye_up=UP),
     )
-
-
-def _modes(shown: Any) -> rrb.StateTimelineView:
-    axis = rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=shown)
-    return rrb.StateTimelineView(origin="/mode", name="Mode", time_view=axis)
 
 
 def _log() -> rrb.TextLogView:

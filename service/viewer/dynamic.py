@@ -16,7 +16,6 @@ from service.contract.incidents import word
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
 from service.core.geometry import between_segments, off_target, place
-from service.core.separation.body import body_of
 from service.core.separation.clearance import FARTHEST
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
@@ -46,7 +45,7 @@ class DrawnFrame(NamedTuple):
 class DynamicScene:
     """Turns batches of frames into chunks; remembers what the next batch continues."""
 
-    def __init__(self, models: ArmModels, settings: Settings, urdf: str, *, live: bool) -> None:
+    def __init__(self, models: ArmModels, settings: Settings, *, live: bool) -> None:
         rate_hz, names = settings.rate_hz, settings.joints.names
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
@@ -59,7 +58,7 @@ class DynamicScene:
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
             name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
         }
-        self._body, people = body_of(settings, urdf), settings.people
+        self._body, people = models.body, settings.people
         toward = np.array(people.toward_elbow)
         self._forearm, self._hand_radius = people.length / np.linalg.norm(toward) * toward, people.radius
         self._gate: float | None = None
@@ -203,8 +202,8 @@ class DynamicScene:
         if not sent:
             return
         modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
-        yield columns("/mode/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
-        yield columns("/mode/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
+        yield columns("/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
+        yield columns("/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
         for i in sent:
             picture = banner(modes[i], reasons[i])
             layout = rr.components.ImageFormat(

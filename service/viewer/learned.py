@@ -115,7 +115,7 @@ def skill_chunks(skill: SkillContents, shown: list[Demonstration], at: Column) -
     for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
         trajectories = [getattr(one, name)[:, :3] for one in shown]
         lines = [one[:: 1 + len(one) // MOST_POINTS].astype(np.float32) for one in trajectories]
-        style = {"colors": [palette.faint(colour, 0.22)] * len(lines), "radii": [0.001] * len(lines)}
+        style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}
         yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
     count = len(skill.reference)
     style = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}

@@ -17,12 +17,15 @@ LABEL_OFFSET_M = (
 Column = Callable[..., rr.chunk.Chunk]
 
 
-def object_chunks(objects: Iterable[SceneObject], before: Iterable[str], at: Column) -> Iterator[rr.chunk.Chunk]:
+def object_chunks(
+    objects: Iterable[SceneObject], before: Iterable[str], labelled: Iterable[str], at: Column
+) -> Iterator[rr.chunk.Chunk]:
     """The chunks that show the objects, and clear those in `before` that are gone.
 
-    `at` makes a chunk of one row from a path and columns.
+    Names that are `labelled` already are not shown again. `at` makes a chunk of one row from a path
+    and columns.
     """
-    names = set()
+    names, labelled = set(), set(labelled)
     for found in objects:
         path = _path(found.name)
         names.add(found.name)
@@ -40,7 +43,7 @@ def object_chunks(objects: Iterable[SceneObject], before: Iterable[str], at: Col
             yield at(path, *row(kind, 1, half_sizes=half, **pose, **style))
         x, y, z = found.position
         label_at = (x, y, z + (LABEL_OFFSET_M if found.frame_id == BASE else -LABEL_OFFSET_M))
-        label = {"labels": [found.name], "show_labels": [True], "colors": [palette.light(colour)]}
+        label = {"labels": [found.name], "show_labels": [found.name not in labelled], "colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
         yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[label_at], radii=[0.0], **label))
     for name in set(before) - names:

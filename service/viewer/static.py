@@ -14,29 +14,52 @@ from typing import Any
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from service import palette
 from service.config import Reach, Settings
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
+from service.core.separation.body import Body, body_of
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
 
 GHOST = "measured/"  # before the names of its frames
 ARC_STEPS = 48
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 BANNER_AT = (0.55, 0.66, -0.44)  # right of, above and before the point that the camera looks at
 BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
+VISUAL = "/visual_geometries/"
+_DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 
 
 class ArmModels:
-    """The arm as commanded and as measured: one URDF, loaded twice under different names."""
+    """The arm as commanded and as measured: one URDF, loaded twice under different names.
 
-    def __init__(self, urdf: Path) -> None:
+    `body` are its capsules, which are drawn where meshes are not found: shapes `unfound`.
+    """
+
+    def __init__(self, urdf: Path, settings: Settings) -> None:
+        self.body = body_of(settings, urdf.read_text(encoding="utf-8"))
         self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
         self.measured = rr.urdf.UrdfTree.from_file_path(
             urdf, entity_path_prefix="measured", frame_prefix=GHOST, static_transform_entity_path="/measured/tf_static"
         )
+        drawn: dict[str, bool] = {}
+        for chunk in self.commanded.stream(include_joint_transforms=False):
+            _, visual, path = chunk.entity_path.partition(VISUAL)
+            if visual:
+                names = chunk.to_record_batch().schema.names
+                drawn[path] = drawn.get(path, False) or any(name.startswith(_DRAWN) for name in names)
+        self.unfound = tuple(path for path, is_drawn in drawn.items() if not is_drawn)
+
+    @property
+    def remark(self) -> str:
+        """What to say of meshes that are not found; empty where all are."""
+        links = ", ".join(dict.fromkeys(path.partition("/")[0] for path in self.unfound))
+        said = "the arm is drawn by its capsules: ROS_PACKAGE_PATH leads to no meshes of"
+        return f"{said} {links}" if links else ""
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
@@ -45,8 +68,10 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
     def fix(path: str, *archetypes: Any) -> None:
         stream.log(path, *archetypes, static=True)
 
-    _log_arm(stream, models.commanded, "/arm", ghost=False)
-    _log_arm(stream, models.measured, "/measured", ghost=True)
+    for tree, path, ghost in ((models.commanded, "/arm", False), (models.measured, "/measured", True)):
+        _log_arm(stream, tree, path, models.unfound, ghost=ghost)
+        if models.unfound:
+            _log_capsules(fix, tree, path, models.body, settings, ghost=ghost)
     fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name))
     fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + models.measured.root_link().name))
@@ -71,12 +96,14 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
     _log_names(fix, settings)
 
 
-def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, ghost: bool) -> None:
+def _log_arm(
+    stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, unfound: tuple[str, ...], *, ghost: bool
+) -> None:
     """Logs the shapes of the arm: solid, or transparent as a ghost."""
     fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
     colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
-        if "/collision_geometries/" in chunk.entity_path:
+        if "/collision_geometries/" in chunk.entity_path or chunk.entity_path.partition(VISUAL)[2] in unfound:
             continue
         stream.send_chunks(chunk)
         names = chunk.to_record_batch().schema.names
@@ -90,6 +117,28 @@ def _log_arm(stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, *, g
     for joint in tree.joints():
         if joint.joint_type == "fixed":
             stream.log(f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True)
+
+
+def _log_capsules(fix: Any, tree: rr.urdf.UrdfTree, path: str, body: Body, settings: Settings, *, ghost: bool) -> None:
+    """Logs the capsules of the arm, those of each joint in the frame of the link that it moves."""
+    moved = [joint.child_link for name in settings.joints.names if (joint := tree.get_joint_by_name(name)) is not None]
+    root = tree.root_link().name
+    for link in np.unique(body.capsules["link"]):
+        capsules = body.capsules[body.capsules["link"] == link]
+        along = capsules["ends"][:, 1] - capsules["ends"][:, 0]
+        turns = [Rotation.align_vectors([one], [UP])[0].as_quat() if one.any() else UPRIGHT for one in along]
+        fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
+        shapes = rr.Capsules3D(
+            lengths=np.linalg.norm(along, axis=1),
+            radii=capsules["radius"],
+            translations=capsules["ends"][:, 0],
+            quaternions=np.array(turns),
+            colors=[palette.faint(palette.MEASURED, 0.35) if ghost else palette.ARM],
+            line_radii=[0.0005],
+            fill_mode=fill,
+        )
+        frame = moved[link - 1] if link else root
+        fix(f"{path}/capsules/{link}", rr.CoordinateFrame(f"{GHOST if ghost else ''}{frame}"), shapes)
 
 
 def _log_surroundings(fix: Any, settings: Settings) -> None:
@@ -147,12 +196,12 @@ def _log_names(fix: Any, settings: Settings) -> None:
     ]
     single = (
         ("/error/target", "tool to target [mm]", palette.TOOL),
-        ("/turn/target", "tool rotated from the target [°]", palette.TOOL),
-        ("/turn/std", "target's standard deviation [°]", palette.TARGET),
+        ("/turn/target", "tool to target [°]", palette.TOOL),
+        ("/turn/std", "target, 1 σ [°]", palette.TARGET),
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
-        ("/deviation/target", "target's standard deviation [mm]", palette.TARGET),
-        ("/deviation/hands", "deviation of the hands [mm]", palette.OFF),
+        ("/deviation/target", "target, 1 σ [mm]", palette.TARGET),
+        ("/deviation/hands", "hands [mm]", palette.OFF),
         ("/deviation/gate", "holds above [mm]", palette.GATE),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),
@@ -173,8 +222,8 @@ def _log_names(fix: Any, settings: Settings) -> None:
         widths = [1.5] * len(names)
         fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
     for path, names, colours_packed in (
-        ("/mode/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
-        ("/mode/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
+        ("/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
+        ("/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
     ):
         labels = [name.replace("_", " ") for name in names]
         fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))

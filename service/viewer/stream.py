@@ -65,8 +65,8 @@ class _Destination:
         self._batch_ns = round(batch_s * 1e9)
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
-        self._models = ArmModels(urdf)
-        self._dynamic = DynamicScene(self._models, settings, urdf.read_text(encoding="utf-8"), live=live)
+        self._models = ArmModels(urdf, settings)
+        self._dynamic = DynamicScene(self._models, settings, live=live)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._skill = skill
         if skill is not None:
@@ -96,6 +96,8 @@ class _Destination:
         """Adds one frame."""
         if not self._repeated_ns:
             self._repeat(shown.time_ns)
+            if self._models.remark:
+                self.log(self._models.remark, "WARN", shown.time_ns)
         self._pending.append(shown)
         if shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
             self.send()
@@ -107,7 +109,7 @@ class _Destination:
         self._repeated_ns = time_ns
         if self._skill is not None:
             self.put(list(learned.skill_chunks(*self._skill, self._at(time_ns))))
-        self.put(list(scene_objects.object_chunks(self._objects, (), self._at(time_ns))))
+        self._put_objects(time_ns)
 
     def learn(self, skill: SkillContents, demonstrations: list[Demonstration]) -> None:
         """Shows the skill that is in force from now on."""
@@ -116,12 +118,19 @@ class _Destination:
         if self._repeated_ns:
             self.send()
             self.put(list(learned.skill_chunks(skill, demonstrations, self._at(self._repeated_ns))))
+            self._put_objects(self._repeated_ns)
 
     def show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
         """Shows the objects on the bench."""
         before, self._objects = self._objects, objects
         if self._repeated_ns and objects != before:
-            self.put(list(scene_objects.object_chunks(objects, (one.name for one in before), self._at(time_ns))))
+            self._put_objects(time_ns, before)
+
+    def _put_objects(self, time_ns: int, before: Iterable[SceneObject] = ()) -> None:
+        """Shows the objects; one that a place is named after has its name there."""
+        places = () if self._skill is None else (point.name for point in self._skill[0].via_points)
+        known = (one.name for one in before)
+        self.put(list(scene_objects.object_chunks(self._objects, known, places, self._at(time_ns))))
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Adds one line to the log."""

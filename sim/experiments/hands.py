@@ -22,6 +22,7 @@ from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, 
 from sim.experiments.scenes import Drawn
 from sim.network import RunReport
 from sim.scene import Scene
+from sim.world import pixels
 
 SEED = 7
 NOMINAL = Drawn(Scene(), 1.0, (), SEED)
@@ -204,7 +205,7 @@ def _draw_stages(results: Results) -> None:
         axes.imshow(colours)
         for line, colour in zip(traces, (LEFT, RIGHT, TOOL), strict=True):
             if np.ptp(line, axis=0).max() > 0.02:
-                at = _pixels(line, matrix)
+                at = pixels(line, matrix, SIZE)
                 axes.plot(*at.T, color=colour, lw=2)
                 axes.annotate(
                     "",
@@ -214,7 +215,7 @@ def _draw_stages(results: Results) -> None:
                 )
         axes.set_title(title, loc="left")
         axes.set_axis_off()
-    for at, name in zip(_pixels(np.array(things), shots[0][1]), THINGS.values(), strict=True):
+    for at, name in zip(pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True):
         grid[0, 0].annotate(name, at, at + np.array([25, -38]), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
     handles = [
         plt.Line2D([], [], color=c, label=n)
@@ -222,10 +223,3 @@ def _draw_stages(results: Results) -> None:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure, "stages")
-
-
-def _pixels(points: Array, matrix: Array) -> Array:
-    """Where points (N, 3) [m] are in the picture: (N, 2)."""
-    seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    flat = seen[:, :2] / seen[:, 3:]
-    return np.asarray((flat * (1, -1) + 1) / 2 * SIZE)

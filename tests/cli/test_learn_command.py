@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from service.demonstrations.demonstration_reader import write_demonstration
+from service.learning.judgement import Figures
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations
 from support.cell import thirdhand
+from support.paths import RECORDINGS
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +35,21 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
     assert plot.stat().st_size > 10_000
     skill = decoded(out.read_bytes(), origin="skill")
     assert f"the target's standard deviation is above {1000 * skill.threshold:.0f} mm" in done.stdout
+
+
+def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
+    people = sorted((RECORDINGS / "people").glob("*.mcap"))[:4]
+    out = tmp_path / "skill.npz"
+    done = thirdhand("learn", *map(str, people), "--output", str(out), "--points", "80")
+    assert done.returncode == 0, done.stderr
+    head, *lines = done.stdout.splitlines()
+    assert head.endswith("held   without places   linear   look-up")
+    figures = msgspec.json.decode(decoded(out.read_bytes(), origin="skill").figures, type=Figures)
+    for line, row in zip(lines, (*figures.demonstrations, figures.all), strict=False):
+        assert line.split()[-6::2] == [f"{row.other_mm[way]:.0f}" for way in ("without places", "linear", "look-up")]
+    helds = [row.held for row in figures.demonstrations]
+    assert figures.held_std == pytest.approx(np.std(helds))
+    assert f"{min(helds):.1f} to {max(helds):.1f} % of a demonstration, standard deviation" in done.stdout
 
 
 def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
 from service.report.report import Report, differing_settings, reported, why_missed
+from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.paths import RECORDINGS
@@ -198,6 +199,7 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
         assert why in fault.why
     else:
         assert fault.why.startswith(about)
+    assert re.search(rf"and {len(found.faults)} faults?; the worst was fault: \w+, for ", verdict(found))
     assert any(line.startswith("before it: it followed for 1.") for line in fault.before)
     assert fault.ended.startswith("ended by a `reset` after 0.")
     missed = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)

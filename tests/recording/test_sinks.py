@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 import socket
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,16 +31,8 @@ from service.viewer.banner import banner
 from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
 from service.viewer.stream import Viewer, ViewerError
-from support.recorded import at_ns, drawn, ticks, write
+from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
 from support.wam import JOINT_NAMES
-
-
-def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
-    """What of a column was logged, in order."""
-    return [row[column] for row in rows if row.get(column) is not None]
-
-
-TEXT = "TextLog:text"
 
 
 def viewer(**where: Any) -> Viewer:
@@ -82,7 +73,7 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
     )
     half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
     assert sorted(half) == pytest.approx(sorted(2 * np.sqrt([4e-4, 1e-4, 2e-4])), rel=1e-4)
-    assert [row["StateChange:state"] for row in rows["/mode/mode"] if row.get("tick") is not None] == [
+    assert [row["StateChange:state"] for row in rows["/mode"] if row.get("tick") is not None] == [
         ["hold"],
         ["follow"],
     ]
@@ -314,15 +305,6 @@ def test_where_it_holds_is_within_the_axis_or_far_off_and_left_out(curves_mm: fl
         assert low == 0
         assert high == pytest.approx(1.25 * max(curves_mm, 104.0 if is_shown else 0.0))
         assert ("- $origin/gate" in view.contents) != is_shown
-
-
-def views(container: Any) -> Iterator[Any]:
-    """The views in a part of an arrangement, and in the parts of that."""
-    for part in getattr(container, "contents", []):
-        if hasattr(part, "origin"):
-            yield part
-        else:
-            yield from views(part)
 
 
 def test_a_picture_is_of_a_moment_that_there_is() -> None:

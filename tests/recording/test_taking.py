@@ -28,7 +28,6 @@ from service.demonstrations.capture import (
     JOINT_STATES,
     KEPT_S,
     MOVED,
-    REST_M,
     REST_RAD,
     Capture,
     CaptureError,
@@ -37,6 +36,7 @@ from service.demonstrations.capture import (
 )
 from service.demonstrations.demonstration_files import demonstration_paths, summary, table, trim, uncut
 from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
+from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import PoseTopic, Recorded
 from service.launch import free_port
 from service.recording.mcap_file import RecordingError

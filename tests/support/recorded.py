@@ -20,6 +20,7 @@ from support.wam import FRAME, JOINT_NAMES, STATE
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 2_000_000
 SKILL = bytes(range(256)) * 40
+TEXT = "TextLog:text"
 CELL = Settings(cell="hall/bench-1")
 
 
@@ -111,3 +112,17 @@ def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
     for chunk in rr.chunk.RrdReader(path).stream():
         rows.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
     return rows
+
+
+def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
+    """What of a column was logged, in order."""
+    return [row[column] for row in rows if row.get(column) is not None]
+
+
+def views(container: Any) -> Iterator[Any]:
+    """The views in a part of an arrangement, and in the parts of that."""
+    for part in getattr(container, "contents", []):
+        if hasattr(part, "origin"):
+            yield part
+        else:
+            yield from views(part)
