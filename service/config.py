@@ -54,7 +54,7 @@ class HandSettings(Section, frozen=True):
     still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is on its way
     still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # in which a hand comes to be still
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] off where it is expected: a hand has jumped ...
-    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.0  # [m/s] ... farther after a pause; reaches have 1.5
+    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] ... after a pause farther: reaches are so fast
     swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # until hands that changed places are believed
 
 

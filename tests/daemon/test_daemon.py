@@ -27,7 +27,7 @@ from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill
-from service.daemon.status import MeasuredTool
+from service.daemon.status import MeasuredArm
 from service.recording.recording import Recording
 from service.recording.replay import replay
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand
@@ -237,7 +237,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
 def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
     settings, urdf = Settings(), robot_description(Settings())
     controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
-    tool, wanted = MeasuredTool(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
+    tool, wanted = MeasuredArm(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
     assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))

@@ -75,7 +75,8 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
             inbox.append(Event("joints/state", cdr.encode_joints(joints), None))
         if i % 100 == 50:
             inbox += [
-                Event(kind, cdr.encode_string("{}"), None) for kind in ("fault", "reset", "hold", "resume", "hold")
+                Event(kind, cdr.encode_string("{}"), None)
+                for kind in ("fault", "reset", "hold", "resume", "hold", "way")
             ]
             inbox.insert(1, Event("skill", random.bytes(2000), None))
         yield Tick(i, tuple(inbox)), frame, timing
