@@ -49,8 +49,9 @@ class WayOut:
         self._lever = float(self._arm.parameters["turn_lever"][0])
 
     def find(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> list[Vector]:
-        """Postures (J,) [rad] that lead from `joints` (J,) to one with the tool at a position (3,)
-        [m] in an orientation (4,), past hands (2, 3) [m] where they are; empty where none is found.
+        """Postures (J,) [rad], WAY at most, that lead from `joints` (J,) to one with the tool at a
+        position (3,) [m] in an orientation (4,), past hands (2, 3) [m] where they are; empty where
+        none is found.
         """
         random, here_m = np.random.default_rng(0), self._separation.clearance(joints, hands)[0]
         ways: list[list[Vector]] = []
@@ -64,7 +65,7 @@ class WayOut:
                     break
             if ways:
                 break
-        return min(ways, key=_length, default=[])[1 : WAY + 1]
+        return min((way for way in ways if len(way) <= WAY), key=_length, default=[])
 
     def _postures(
         self, joints: Vector, position: Vector, orientation: Vector | None, hands: Vector, random: np.random.Generator

@@ -16,7 +16,7 @@ from typing import Any
 
 from service.client import endpoints, open_session
 from service.config import Settings, robot_description
-from service.contract import cdr
+from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
@@ -49,6 +49,7 @@ from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import CellStatus, MeasuredArm
 from service.daemon.way_finder import WayFinder
 from service.learning.skill_file import SkillError, StoredSkill
+from service.recording.protocol import pack
 from service.recording.scribe import Scribe
 
 log = logging.getLogger("thirdhand")
@@ -241,9 +242,19 @@ class Daemon:
             yield Tick(index, tuple(inbox))
 
     def _warm_up(self) -> None:
-        """Steps a copy through a likely next tick, so that code and data are in the caches."""
+        """Takes a copy through a likely next tick, from samples in bytes to what comes of them in
+        bytes, so that code and data are in the caches.
+        """
+        newest = tuple(self._streams.newest.values())
+        for event in newest:
+            channels.BY_KEY[event.kind].codec.decode(event.payload)
         self._twin.copy_from(self._controller)
-        self._twin.step(Tick(self._newest + 1, tuple(self._streams.newest.values())))
+        tick = Tick(self._newest + 1, newest)
+        frame, stages = self._twin.step(tick), [0.0] * len(STAGES)
+        outputs = outgoing(frame, self._clock.stamp_ns, self._settings.joints.names)
+        cdr.encode_attachment(Attachment(tick.index, self._clock.stamp_ns, 0))
+        timing = timed(tick.index, self._clock.stamp_ns, 0, 0.0, 0.0, 0.0, stages)
+        pack(tick, frame, timing, state=None, lost=0, with_skill=False, outputs=outputs)
 
     def _lap(self, stage: str) -> None:
         self._laps.append((stage, time.perf_counter_ns()))

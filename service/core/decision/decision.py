@@ -31,6 +31,7 @@ WAY_RADPS = 1.2  # [rad/s] at most, of the busiest joint on a way out
 WAY_SHARE = 0.5  # at most, of a joint's greatest speed
 WAY_MPS = 0.4  # [m/s] at most, of the tool on it: nobody asked for this motion
 WAY_GAIN = 4.0  # [1/s] with which it comes to a posture of the way
+WAY_START = 0.3  # [rad] farther from where it begins, as the arm moved on meanwhile, a way is not gone
 WAY_NEAR = 0.02  # [rad] so near it goes on to the next
 WAY_S = 20.0  # that a way may take
 FREED_S = 1.0  # an arm that cannot get out of a thing stays as it is after so long
@@ -113,10 +114,11 @@ class Decision:
                 if state["mode"] == FAULT:
                     state["mode"], state["arm_ready"] = HOLD, 0
             case "way":
-                if state["stuck"]:
-                    postures = json.loads(cdr.decode_string(event.payload))
-                    count = state["way_count"] = len(postures)
-                    state["way"][:count] = np.reshape(postures, (count, len(self._lower)))
+                path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, len(self._lower)))
+                off = np.abs(path[:1] - state["joints"][0]).max(initial=0.0)
+                if state["stuck"] and state["mode"] != FAULT and off < WAY_START:
+                    count = state["way_count"] = len(path)
+                    state["way"][:count] = path
                     state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
             case "fault":
                 if state["mode"] != FAULT:
@@ -179,6 +181,9 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     for joint in range(state.joints.shape[1]):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
     if not state.arm_ready:
+        state.stuck = state.way_count = 0
+        if not known & ARM_STILL:
+            state.leaves = 0
         # what still moves comes to rest first; what was reported must have been one posture
         if not known & ARM_STILL or moving or (inside and not state.leaves):
             return 0, NONE, -1.0, -1.0
