@@ -114,12 +114,12 @@ class Decision:
                 if state["mode"] == FAULT:
                     state["mode"], state["arm_ready"] = HOLD, 0
             case "way":
-                path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, len(self._lower)))
-                off = np.abs(path[:1] - state["joints"][0]).max(initial=0.0)
-                if state["stuck"] and state["mode"] != FAULT and off < WAY_START:
-                    count = state["way_count"] = len(path)
-                    state["way"][:count] = path
-                    state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
+                if state["stuck"] and state["mode"] != FAULT:
+                    path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, len(self._lower)))
+                    if np.abs(path[:1] - state["joints"][0]).max(initial=0.0) < WAY_START:
+                        count = state["way_count"] = len(path)
+                        state["way"][:count] = path
+                        state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
             case "fault":
                 if state["mode"] != FAULT:
                     state["mode"], state["reason"] = FAULT, Reason.SERVICE
