@@ -73,7 +73,7 @@ class Controller:
         self._skill = SkillStage(settings, skill)
         self.decision = Decision(settings)
         self._separation = Separation(settings, urdf)
-        self._separation.set_contacts(skill.via_points)
+        self._adopt_places(skill)
         self._arm = Arm(settings, urdf)
         self._setpoint = SetpointStage(settings, self._arm)
         self._limiter = LimiterStage(settings, self._arm)
@@ -141,7 +141,11 @@ class Controller:
 
     def _adopt(self, skill: Skill) -> None:
         self._skill.adopt(self._state, skill)
+        self._adopt_places(skill)
+
+    def _adopt_places(self, skill: Skill) -> None:
         self._separation.set_contacts(skill.via_points)
+        self._separation.set_workspace(skill.workspace)
 
     def _decide(self, frame: Frame, known: int, gate_m: float) -> Kinematics:
         """Decides; the arm's kinematics, where it is or has just appeared."""

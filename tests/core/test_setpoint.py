@@ -258,6 +258,15 @@ def test_a_target_that_stops_at_once_is_overshot_by_millimetres() -> None:
 # --- quiet motion ------------------------------------------------------------
 
 
+@pytest.mark.parametrize("weight", [1e-7, 1e-6, 1e-5])
+@pytest.mark.parametrize("distance_m", [0.05, 0.25])
+def test_a_slow_tracker_comes_to_rest_too(weight: float, distance_m: float) -> None:
+    tool, there = msgspec.structs.replace(TOOL, jerk_weight=weight), MIDDLE + np.array([distance_m, 0.0, 0.0])
+    states, _ = driven([at_rest(there)] * 3000, start=at_rest(MIDDLE), tool=tool)
+    assert np.abs(states[-200:, 2]).max() < 1e-3
+    assert states[:, 0, 0].max() < there[0] + 0.005
+
+
 def test_a_target_that_moves_steadily_is_followed_close() -> None:
     velocity = np.array([0.1, -0.05, 0.03])
     targets = [np.array([MIDDLE + velocity * k * PERIOD_S, velocity, (0.0,) * 3]) for k in range(1200)]

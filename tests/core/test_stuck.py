@@ -21,7 +21,6 @@ from service.core.arm.arm import Arm
 from service.core.controller import Controller, start_state
 from service.core.decision import WAY
 from service.core.frame import Event, Frame, Tick, Vector, order
-from service.core.separation.clearance import NOBODY
 from service.core.separation.separation import Separation
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
@@ -31,6 +30,7 @@ from service.recording.replay import replay
 from sim.scene import Scene
 from support.arms import cell_of
 from support.in_process import ASSUMED, LEFT, RIGHT, arm, hand
+from support.starts import free_postures
 from support.wam import URDF
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "4"))
@@ -41,14 +41,6 @@ THERE_M = 0.02
 @pytest.fixture(scope="module")
 def taught(skill: Skill) -> Skill:
     return adapted(skill, Scene().via_points(), tolerance=0.05)
-
-
-def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:
-    """Postures within the limits in which the arm stands in nothing."""
-    random, separation = np.random.default_rng(seed), Separation(cell, robot_description(cell))
-    drawn = (random.uniform(cell.joints.lower, cell.joints.upper) for _ in iter(int, 1))
-    free = (q for q in drawn if separation.clearance(q, NOBODY)[0] > 0.0)
-    return [next(free) for _ in range(count)]
 
 
 class Run(NamedTuple):

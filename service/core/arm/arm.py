@@ -22,6 +22,9 @@ DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of
 SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
 SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the WAM's table
 
+# [1/s] of a small error's decay; at most so many times `acceleration_rate`, or joints swing
+POSITION_GAIN, POSITION_GAIN_SHARE = 50.0, 2.0
+TURN_GAIN, TURN_GAIN_SHARE = 10.0, 0.4
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
@@ -122,6 +125,7 @@ class Arm:
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
         scale = (acceleration / acceleration.max()) ** SPARING
         self._jerk = np.array(limits.jerk)
+        rate = acceleration_rate(limits)
         self.parameters = parameters(
             period_s=settings.period_s,
             closing_braking=closing.braking,
@@ -129,6 +133,8 @@ class Arm:
             far_damping=closing.far_damping,
             max_tool_speed=TOOL_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
+            position_gain=min(POSITION_GAIN, POSITION_GAIN_SHARE * rate),
+            turn_gain=min(TURN_GAIN, TURN_GAIN_SHARE * rate),
             turn_lever=TURN_LEVER * size,
             damping=DAMPING * size**2,
             singular_damping=SINGULAR_DAMPING * size**2,
@@ -242,6 +248,11 @@ def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
     """The model with the named joints only, the others locked at 0."""
     locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
     return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+
+
+def acceleration_rate(limits: JointSettings) -> float:
+    """Jerk by acceleration [1/s] of the joint that changes its acceleration most slowly."""
+    return float((np.array(limits.jerk) / np.array(limits.acceleration)).min())
 
 
 def approach_gain(limits: JointSettings) -> Vector:

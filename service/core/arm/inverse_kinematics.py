@@ -17,8 +17,6 @@ from service.core.frame import Records, Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
-POSITION_GAIN = 50.0  # [1/s] of a small error's decay
-TURN_GAIN = 10.0  # [1/s]
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
@@ -151,16 +149,16 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         distance += error[i] * error[i]
     distance = math.sqrt(distance)
     # in proportion to the error when near, braking evenly from afar
-    near = arm.closing_braking / POSITION_GAIN**2
-    rate = POSITION_GAIN
+    near = arm.closing_braking / arm.position_gain**2
+    rate = arm.position_gain
     if distance > near:
         rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
     excess = max(rate * distance - FAR_SPEED, 0.0)
     damping += arm.far_damping * excess * excess
     for i in range(3):  # the error decays as it will be, not as it is
-        error[i] *= rate / (1.0 + POSITION_GAIN * arm.period_s)
+        error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)
     _add_closing(linear, error, arm.max_tool_speed)
-    _turn(here.rotation, goal.orientation, goal.turning, arm.max_turn_speed, count_of_tasks == 6, turn)
+    _turn(arms, here.rotation, goal.orientation, goal.turning, count_of_tasks == 6, turn)
     wanted[:3], wanted[3:] = linear, 0.0
     for i in range(count_of_tasks - 3):
         for k in range(3):
@@ -244,18 +242,11 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
 
 
 @compiled
-def _turn(
-    rotation: Vector,
-    orientation: Vector,
-    turning: Vector,
-    max_speed: float,
-    about: bool,
-    out: Vector,
-) -> None:
+def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector) -> None:
     """Into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,) that
     turns itself (3,) [rad/s]: all of it, also `about` its +z, or that the shortest way.
     """
-    here, axis = np.empty(4), np.empty(3)
+    here, axis, max_speed = np.empty(4), np.empty(3), arms[0].max_turn_speed
     if about:
         quaternion_of(rotation, here)
         turn_between(here, orientation, out)
@@ -264,7 +255,7 @@ def _turn(
         swing(rotation[:, 2].copy(), axis, out)
     square = 0.0
     for i in range(3):
-        out[i] = TURN_GAIN * out[i] + turning[i]
+        out[i] = arms[0].turn_gain * out[i] + turning[i]
         square += out[i] * out[i]
     if not square < math.inf:
         out[:] = 0.0

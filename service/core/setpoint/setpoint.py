@@ -22,7 +22,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.core.arm.arm import Arm, Kinematics
+from service.core.arm.arm import Arm, Kinematics, acceleration_rate
 from service.core.arm.inverse_kinematics import joint_costs
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
@@ -43,6 +43,8 @@ ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
+STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
+TRACKER_SHARE = 1.1  # of the rate at which joints change their acceleration: a quicker tracker swings with them
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
 SHARE = 0.91  # of acceleration and jerk that is planned with
 SPEED_SHARE = 0.97  # of speed, likewise
@@ -61,9 +63,10 @@ class SetpointGenerator:
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
+        weight = max(tool.jerk_weight, (TRACKER_SHARE * acceleration_rate(settings.joints)) ** -6)
         self._parameters = parameters(
             period_s=settings.period_s,
-            gains=tracker_gains(tool.jerk_weight),
+            gains=tracker_gains(weight),
             max_speed=float(tool.max_speed),
             max_acceleration=float(tool.max_acceleration),
             max_jerk=float(tool.max_jerk),
@@ -175,6 +178,7 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
         a_target += along[i] * target[2, i]
     brake = SHARE * min(max_acceleration / steepest, 1.0 / max(_largest(costs[1], along), 1e-9))
     change = SHARE * min(max_jerk / steepest, 1.0 / max(_largest(costs[2], along), 1e-9))
+    change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
     way += ROOM + STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE)

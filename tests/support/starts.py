@@ -1,0 +1,18 @@
+"""Postures from which an arm may start."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.config import Settings, robot_description
+from service.core.frame import Vector
+from service.core.separation.clearance import NOBODY
+from service.core.separation.separation import Separation
+
+
+def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:
+    """Postures within the limits in which the arm stands in nothing."""
+    random, separation = np.random.default_rng(seed), Separation(cell, robot_description(cell))
+    drawn = (random.uniform(cell.joints.lower, cell.joints.upper) for _ in iter(int, 1))
+    free = (q for q in drawn if separation.clearance(q, NOBODY)[0] > 0.0)
+    return [next(free) for _ in range(count)]
