@@ -15,6 +15,7 @@ from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
+ALIKE = 0.25  # least correlation of speeds that tells of a lag: steady ones, of noise alone, reach 0.2
 CLOSURE_MARGIN = 0.05  # by which a gripper may be told to be more than open or closed
 
 
@@ -108,6 +109,8 @@ def lag(demonstration: Demonstration, longest_s: float = 1.0) -> int:
     speeds = [np.linalg.norm(np.gradient(x, axis=0), axis=1) for x in (hands, tool[:, :3])]
     a, b = (s - s.mean() for s in speeds)
     inner = a[reach : len(a) - reach]
-    score = [float(inner @ b[reach + shift : len(b) - reach + shift]) for shift in range(-reach, reach + 1)]
-    best = int(np.argmax(score)) - reach
-    return 0 if score[best + reach] < 1.02 * score[reach] else best
+    shifted = [b[reach + shift : len(b) - reach + shift] for shift in range(-reach, reach + 1)]
+    score = [float(inner @ speeds) for speeds in shifted]
+    best = int(np.argmax(score))
+    least = ALIKE * float(np.linalg.norm(inner) * np.linalg.norm(shifted[best]))
+    return 0 if score[best] < max(1.02 * score[reach], least) else best - reach

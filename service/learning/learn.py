@@ -186,8 +186,8 @@ def _learned(
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
     choice = Choice.of(paths, points)
-    parameters = choice.parameters(ell)
-    residuals = choice.residuals(parameters.ell, parameters.noise)
+    parameters = choice.parameters(ell, may_be_linear=True)
+    residuals = choice.residuals(parameters.ell, parameters.noise, is_linear=parameters.is_linear)
 
     return lambda left_out: choice.primitive(parameters, residuals, without=left_out)
 

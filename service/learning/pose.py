@@ -85,7 +85,7 @@ def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
 
 def is_flat(primitive: KMP) -> bool:
     """Whether it says the same everywhere, but for what it was taught."""
-    return bool((primitive.base.reference.mean == primitive.prior_mean).all())
+    return bool((primitive.base.reference.mean == primitive.solution.hyperparameters.prior_offset).all())
 
 
 def mean_orientation(quaternions: ArrayLike) -> Vector:

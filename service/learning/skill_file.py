@@ -24,6 +24,7 @@ from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
+from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import FARTHEST_M, Model
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
@@ -196,6 +197,9 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield from _beyond(part, RANGES.keys() & part.keys(), prefix)
             if len(part["base_inputs"]) > MOST_POINTS:
                 yield f"{len(part['base_inputs'])} points of {prefix}, at most {MOST_POINTS} accepted"
+    for prefix in ("", TURN, GRIPPER):
+        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (prefix or _model(arrays) is not HandsKMP):
+            yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
