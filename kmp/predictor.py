@@ -196,6 +196,11 @@ class Predictor(Immutable):
         return self.solution.hyperparameters.prior_mean
 
     @property
+    def prior_offset(self) -> Array:
+        """(O,) [unit of the outputs] the prior mean where the inputs are 0: all of a constant one."""
+        return self.solution.hyperparameters.prior_offset
+
+    @property
     def outputs(self) -> int:
         """O, the number of outputs."""
         return self.solution.hyperparameters.outputs

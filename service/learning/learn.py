@@ -19,6 +19,7 @@ from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
+from service.learning.ambiguity import same_hands_m
 from service.learning.baselines import left_out, linear, look_up
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
@@ -89,6 +90,7 @@ def learn(
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     beside = {way: left_out(paths, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
+    near_m = same_hands_m(demonstrations)
     task = task_of(demonstrations) if components is None and ell is None else ""
     try:
         if isinstance(task, Task):
@@ -122,6 +124,7 @@ def learn(
             names,
             points=points,
             gripper_ell=found.model.gripper_ell,
+            near_m=near_m,
         )
     except ValueError as error:
         if isinstance(error, SkillError):
@@ -135,6 +138,7 @@ def learn(
         found.gate,
         posed,
         beside=beside if len(paths) > 1 else {},
+        near_m=near_m,
         reach=reach or Reach(),
         remarks=remarks,
     )
