@@ -197,7 +197,7 @@ class Predictor(Immutable):
 
     @property
     def prior_offset(self) -> Array:
-        """(O,) [unit of the outputs] the prior mean where the inputs are 0: all of a constant one."""
+        """(O,) [unit of the outputs] the prior mean at inputs of 0: all of a constant one."""
         return self.solution.hyperparameters.prior_offset
 
     @property

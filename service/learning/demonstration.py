@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,15 @@ ALIKE = 0.25  # least correlation of speeds that tells of a lag: steady ones, of
 CLOSURE_MARGIN = 0.05  # by which a gripper may be told to be more than open or closed
 
 
+Conducts = Literal["both", "left", "right"]
+
+
 class Demonstration(NamedTuple):
     """Stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, each x y z [m] and
     quaternion x y z w, in one frame; where the named places of its task were, in the order in which
     the tool comes to them; and how far the gripper is closed (T,), 0 to 1, where that is told.
+
+    Where one hand `conducts`, the poses of the other are that one's again.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -32,6 +37,7 @@ class Demonstration(NamedTuple):
     frame: str = BASE
     places: tuple[ViaPoint, ...] = ()
     gripper: Vector | None = None
+    conducts: Conducts = "both"
 
     @property
     def hands(self) -> Vector:

@@ -91,7 +91,10 @@ def learn(
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     beside = {way: left_out(paths, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
     near_m = same_hands_m(demonstrations)
-    task = task_of(demonstrations) if components is None and ell is None else ""
+    alone = demonstrations[0].conducts
+    if len(who := sorted({one.conducts for one in demonstrations})) > 1:
+        raise SkillError(f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike")
+    task = task_of(demonstrations) if components is None and ell is None and alone == "both" else ""
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
@@ -154,6 +157,7 @@ def learn(
         learned_from=fingerprint(demonstrations),
         components=components or 0,
         figures=msgspec.json.encode(judged).decode(),
+        conductor=None if alone == "both" else ("left", "right").index(alone),
     )
     skill = with_file(skill)
     show(Evidence(skill, judged, paths, found.held_out))

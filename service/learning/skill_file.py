@@ -65,6 +65,7 @@ KNOWN = {
     "places",
     "replaced",
     "figures",
+    "conductor",
     "checksum",
     "names",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
@@ -107,6 +108,8 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         tolerance=np.array(skill.tolerance),
         **skill.model.primitive.to_arrays(),
     )
+    if skill.conductor is not None:
+        arrays["conductor"] = np.array(skill.conductor)
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
     arrays |= skill.model.own_arrays()
@@ -161,6 +164,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),
+            conductor=(0, 1)[int(arrays["conductor"])] if "conductor" in arrays else None,
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
