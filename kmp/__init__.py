@@ -11,6 +11,7 @@ kernel with parameter ell, K its matrix (N, N), lambda the weight of the penalty
 fitted weights.
 """
 
+from kmp.affine_mean import AffineMean
 from kmp.checks import RankReached, ViaPointMissed
 from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement, improve
@@ -28,6 +29,7 @@ from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 __all__ = [
     "KMP",
+    "AffineMean",
     "CoordinateFrame",
     "Correlation",
     "GaussianKernel",

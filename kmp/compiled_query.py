@@ -92,10 +92,11 @@ def _motion(
     """Equation (8), and its first and second derivatives along the motion, from one pass over the
     centres, of which some may stand for derivatives; whether all is finite.
 
-    `moving` (3, I) is the query, its velocity and its acceleration; the kernel row goes into
+    `moving` (3, I) is the query, its velocity and its acceleration; `prior` (O, 1), or (O, 1 + I)
+    where the prior mean goes with the input, is its offset and matrix; the kernel row goes into
     `values` (R,); mean, velocity, acceleration, curvature and Jacobian into `out` (4 + I, O).
     """
-    inputs, outputs, derivatives = len(stretch), len(prior), len(along) > 0
+    inputs, outputs, derivatives, affine = len(stretch), len(prior), len(along) > 0, prior.shape[1] > 1
     query, offset, direction = np.empty(inputs), np.empty(inputs), np.empty(inputs)
     mean, moved, pushed, curvature = out[0], out[1], out[2], out[3]
     jacobian = out[MEANS:].reshape(outputs, inputs)
@@ -104,7 +105,8 @@ def _motion(
         query[i] = moving[0, i] * stretch[i]
         direction[i] = moving[1, i] * stretch[i]
         square += direction[i] * direction[i]
-    mean[:] = prior
+    for o in range(outputs):
+        mean[o] = prior[o, 0]
     jacobian[:] = 0.0
     curvature[:] = 0.0
     for r in range(len(rows)):
@@ -140,6 +142,9 @@ def _motion(
         moved[o], pushed[o] = 0.0, curvature[o]
         for i in range(inputs):
             jacobian[o, i] *= stretch[i]
+            if affine:
+                jacobian[o, i] += prior[o, 1 + i]
+                mean[o] += prior[o, 1 + i] * moving[0, i]
             moved[o] += jacobian[o, i] * moving[1, i]
             pushed[o] += jacobian[o, i] * moving[2, i]
         total += mean[o] + moved[o] + pushed[o]

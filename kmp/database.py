@@ -51,12 +51,6 @@ class Database(Immutable):
         """(N, I) where the points are."""
         return self.functionals.inputs
 
-    def deviations(self, prior_mean: Array) -> Array:
-        """mu less the prior mean (O,), whose derivatives are 0: (N, O)."""
-        if self.functionals.directions is None:
-            return self.reference.mean - prior_mean
-        return self.reference.mean - self.functionals.values[:, None] * prior_mean
-
     def unchanged(self) -> Changes:
         """No changes at all."""
         nothing = frozen(np.empty(0, dtype=np.intp))

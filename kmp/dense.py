@@ -59,7 +59,8 @@ class Dense(Immutable):
     @cached_property
     def weights(self) -> Array:
         """alpha (N, O) = (K + lambda Sigma)^-1 (mu - prior mean). Equation (9)."""
-        return frozen(self.times_inverse(self.database.deviations(self.hyperparameters.prior_mean)))
+        prior = self.hyperparameters.prior_at(self.database.functionals)
+        return frozen(self.times_inverse(self.database.reference.mean - prior))
 
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""

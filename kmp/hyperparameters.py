@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, positive
-from kmp.immutable import Immutable
+from kmp.affine_mean import AffineMean
+from kmp.checks import Array, check_shape, numbers, positive
+from kmp.functionals import Functionals
+from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel
 
 
@@ -19,7 +22,8 @@ class Hyperparameters(Immutable):
     kernel: Kernel
     lambda_mean: float
     lambda_covariance: float
-    prior_mean: Array  # (O,) [unit of the outputs]
+    prior_offset: Array  # (O,) [unit of the outputs]
+    prior_matrix: Array | None = None  # (O, I) where the prior mean is affine
 
     @classmethod
     def checked(
@@ -27,7 +31,7 @@ class Hyperparameters(Immutable):
         kernel: Kernel,
         lambda_mean: float,
         lambda_covariance: float | None,
-        prior_mean: ArrayLike | None,
+        prior_mean: ArrayLike | AffineMean | None,
         *,
         inputs: int,
         outputs: int,
@@ -38,17 +42,48 @@ class Hyperparameters(Immutable):
         kernel.check(inputs, outputs)
         penalty = positive("lambda_mean", lambda_mean)
         other = penalty if lambda_covariance is None else positive("lambda_covariance", lambda_covariance)
-        prior = numbers("prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs)
-        if kernel.channels > 1 and (rates := prior[outputs // kernel.channels :]).any():
-            raise ValueError(f"prior_mean: rates of {rates} given; the rate of a constant is 0.")
-        return cls(kernel, penalty, other, prior)
+        if isinstance(prior_mean, AffineMean):
+            check_shape("prior_mean.matrix", prior_mean.matrix, outputs, inputs)
+            matrix, offset = prior_mean.matrix, prior_mean.offset
+            if kernel.period is not None and matrix.any():
+                raise ValueError("prior_mean: a slope given; what is the same again after each period has none.")
+        else:
+            matrix = None
+            offset = numbers("prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs)
+        if kernel.channels > 1:
+            values = outputs // kernel.channels
+            own, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
+            if not np.array_equal(rates := offset[values:], own) or np.any(of_rates):
+                raise ValueError(f"prior_mean: rates of {rates} given; the rate of the values' prior mean is {own}.")
+        return cls(kernel, penalty, other, offset, matrix)
+
+    @property
+    def prior_mean(self) -> Array | AffineMean:
+        """(O,) [unit of the outputs], or what goes with the input."""
+        return self.prior_offset if self.prior_matrix is None else AffineMean(self.prior_matrix, self.prior_offset)
+
+    @cached_property
+    def prior_columns(self) -> Array:
+        """The offset (O, 1), and beside it the matrix if there is one: (O, 1 + I)."""
+        offset = self.prior_offset[:, None]
+        return frozen(np.array(offset) if self.prior_matrix is None else np.hstack([offset, self.prior_matrix]))
+
+    def prior_at(self, points: Functionals) -> Array:
+        """The prior mean of N functionals, (N, O) or (O,) for all, derived where they are."""
+        offset = self.prior_offset if points.directions is None else points.values[:, None] * self.prior_offset
+        if self.prior_matrix is None:
+            return offset
+        moved = points.inputs
+        if points.directions is not None:
+            moved = np.where(points.values[:, None], moved, points.directions)
+        return np.asarray(moved @ self.prior_matrix.T + offset)
 
     @property
     def outputs(self) -> int:
         """O."""
-        return len(self.prior_mean)
+        return len(self.prior_offset)
 
     @property
     def channel_outputs(self) -> int:
         """D, the outputs of each of the kernel's C channels: O = C D."""
-        return len(self.prior_mean) // self.kernel.channels
+        return len(self.prior_offset) // self.kernel.channels

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kmp.affine_mean import AffineMean
 from kmp.checks import numbers
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database
@@ -46,7 +47,7 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
         "ell": np.array(parameters.kernel.ell),
         "lambda_mean": np.array(parameters.lambda_mean),
         "lambda_covariance": np.array(parameters.lambda_covariance),
-        "prior_mean": parameters.prior_mean,
+        "prior_mean": parameters.prior_offset if parameters.prior_matrix is None else parameters.prior_columns,
     }
     if parameters.kernel.period is not None:
         arrays["period"] = np.array(parameters.kernel.period)
@@ -90,11 +91,12 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
     reference = Gaussians(arrays["base_mean"], arrays["base_covariance"])
     check_pairs(inputs, reference, reference.outputs)
+    prior = np.asarray(arrays["prior_mean"])
     parameters = Hyperparameters.checked(
         _kernel(arrays),
         float(numbers("lambda_mean", arrays["lambda_mean"])),
         float(numbers("lambda_covariance", arrays["lambda_covariance"])),
-        arrays["prior_mean"],
+        AffineMean(prior[:, 1:], prior[:, 0]) if prior.ndim == 2 else prior,
         inputs=inputs.shape[1],
         outputs=reference.outputs,
     )

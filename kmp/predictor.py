@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kmp.affine_mean import AffineMean
 from kmp.checks import Array, check_finite, check_shape, real, whole
 from kmp.compiled_query import CompiledQuery
 from kmp.functionals import Functionals
@@ -142,12 +143,13 @@ class Predictor(Immutable):
         """
         s, i = self._checked_many(queries), self._dimensions
         weights = self.weights.reshape(-1, self.outputs // self.kernel.channels)
+        slope = self.solution.hyperparameters.prior_matrix
         found = np.empty((len(s), i, self.outputs))
         for a in range(0, len(s), _BATCH):
             each = np.repeat(s[a : a + _BATCH], i, axis=0)
             rows = self._rows(each, np.tile(np.eye(i), (len(each) // i, 1)))
             found[a : a + _BATCH] = (rows @ weights).reshape(-1, i, self.outputs)
-        return found.transpose(0, 2, 1)
+        return found.transpose(0, 2, 1) if slope is None else found.transpose(0, 2, 1) + slope
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
@@ -189,9 +191,14 @@ class Predictor(Immutable):
         return self.solution.hyperparameters.lambda_covariance
 
     @property
-    def prior_mean(self) -> Array:
-        """(O,) [unit of the outputs] what the mean returns to far from the inputs."""
+    def prior_mean(self) -> Array | AffineMean:
+        """(O,) [unit of the outputs] what the mean returns to off the inputs, or departs from."""
         return self.solution.hyperparameters.prior_mean
+
+    @property
+    def prior_offset(self) -> Array:
+        """(O,) [unit of the outputs] the prior mean at inputs of 0: all of a constant one."""
+        return self.solution.hyperparameters.prior_offset
 
     @property
     def outputs(self) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
+from kmp.affine_mean import AffineMean
 from kmp.checks import Array, check_kind, numbers, positive, real, whole
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
@@ -55,7 +56,7 @@ class KMP(Predictor):
         kernel: Kernel,
         lambda_mean: float,
         lambda_covariance: float | None = None,
-        prior_mean: ArrayLike | None = None,
+        prior_mean: ArrayLike | AffineMean | None = None,
         directions: ArrayLike | None = None,
         representation: Literal["auto", "dense", "low_rank"] = "auto",
         rank: int = RANK,
@@ -64,8 +65,9 @@ class KMP(Predictor):
         """The primitive of a reference database: inputs (N, I), N normals over O outputs.
 
         `prior_mean` (O,) [unit of the outputs] is what the mean returns to far from the inputs, the
-        origin by default. `lambda_covariance` None is `lambda_mean`; another value costs a second
-        factor.
+        origin by default; an `AffineMean` is what it departs from there and elsewhere. The
+        covariance heeds neither. `lambda_covariance` None is `lambda_mean`; another value costs a
+        second factor.
 
         Where a row of `directions` (N, I) [unit of the inputs] is not zero, that normal is of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction.

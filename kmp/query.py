@@ -39,6 +39,7 @@ class MotionPrediction(NamedTuple):
 class KernelRow(NamedTuple):
     """What R centres say of one query."""
 
+    query: Array  # (I,)
     offsets: Array  # (R, I) x - x_r, in the kernel's coordinates
     values: Array  # (R,) exp(-scale |x - x_r|^2)
     kernel: Array  # (R,) or (C, R C) k(s, s_r), derived where s_r stands for a derivative
@@ -56,7 +57,7 @@ class Query(Immutable):
     derivatives: Derivatives | None  # which of the R are derivatives
     weights: Array  # (R C, D)
     weight_rows: Array  # (D, R C), the same
-    prior_mean: Array  # (O,)
+    prior_mean: Array  # (O, 1) its offset, or (O, 1 + I) and its matrix
     covariance_scale: float  # N / lambda_c
 
     @classmethod
@@ -77,7 +78,7 @@ class Query(Immutable):
             solution.functionals.derivatives(stretch),
             weights,
             frozen(np.ascontiguousarray(weights.T)),
-            parameters.prior_mean,
+            parameters.prior_columns,
             count / parameters.lambda_covariance,
         )
 
@@ -85,11 +86,12 @@ class Query(Immutable):
         """The kernel row of a query (I,)."""
         offsets = query * self.stretch - self.centres
         values = self.kernel.values(offsets, self.scale)
-        return KernelRow(offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives))
+        return KernelRow(query, offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives))
 
     def mean(self, row: KernelRow) -> Array:
         """xi(s) (O,). Equation (8)."""
-        return np.asarray((row.kernel @ self.weights).ravel() + self.prior_mean)
+        found = (row.kernel @ self.weights).ravel() + self.prior_mean[:, 0]
+        return np.asarray(found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:] @ row.query)
 
     def covariance(self, kernel: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
@@ -99,7 +101,8 @@ class Query(Immutable):
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""
         found = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
-        return found * self.stretch
+        found = found * self.stretch
+        return found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:]
 
     def curvature(self, row: KernelRow, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""

@@ -80,6 +80,4 @@ def mean_of(solution: Solution, queries: Functionals) -> Array:
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
     expansion = (between(parameters.kernel, queries, solution.functionals) @ weights).reshape(-1, parameters.outputs)
-    if queries.directions is None:
-        return np.asarray(expansion + parameters.prior_mean)
-    return np.asarray(expansion + queries.values[:, None] * parameters.prior_mean)
+    return np.asarray(expansion + parameters.prior_at(queries))

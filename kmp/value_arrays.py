@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kmp.affine_mean import AffineMean
 from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement
 from kmp.gaussians import Gaussians
@@ -27,7 +28,7 @@ KIND = "kind"
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
-        *(KMP, OrientationKMP, LocalKMP, CoordinateFrame, LinearConstraints),
+        *(KMP, OrientationKMP, LocalKMP, CoordinateFrame, LinearConstraints, AffineMean),
         *(Gaussians, GaussianMixture, GaussianKernel, VelocityKernel, PeriodicKernel),
         *(Correlation, Improvement, Learned, Score, Uncertainty, MotionPrediction),
     )

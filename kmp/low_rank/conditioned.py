@@ -79,7 +79,8 @@ class Conditioned(Immutable):
         shared = penalty == self.hyperparameters.lambda_covariance
         system = self._covariance_system if shared else self._system(penalty, base.mean_factor)
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
-        pull = system.solve((self._points.deviations(self.hyperparameters.prior_mean) - mean).ravel())
+        wanted = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
+        pull = system.solve((wanted - mean).ravel())
         back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
         columns = self._added_columns
         w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]

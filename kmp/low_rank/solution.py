@@ -57,7 +57,7 @@ class LowRank(Immutable):
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
-        target = database.deviations(hyperparameters.prior_mean)
+        target = database.reference.mean - hyperparameters.prior_at(points)
         blocks = [slice(i, i + BLOCK) for i in range(0, len(points), BLOCK)]
 
         def lifted(start: int) -> Array:

@@ -112,6 +112,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             settings,
             until=args.until,
             rest_s=args.rest,
+            conducts=args.hands,
             is_ended=ended,
             wait_s=args.wait,
             longest_s=args.seconds,

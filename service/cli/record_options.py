@@ -13,6 +13,7 @@ ABOUT = (
     "joints/state by its URDF."
 )
 EXAMPLE = """thirdhand record take-1
+  thirdhand record take-1 --hands left
   thirdhand record take-1 --trim 0.3 9
   thirdhand record --list"""
 
@@ -22,6 +23,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "name", "NAME", "of the take", nargs="?")
     option(c, "--folder", "DIR", "where takes are, made if missing", Path("demonstrations"))
     option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
+    hands = "that conduct the tool: of one, only it is recorded, and what is learned heeds no other"
+    option(c, "--hands", None, hands, "both", choices=("both", "left", "right"))
     until = (
         "it ends with Enter or Ctrl-C, or also once hands and tool rest after they moved: all stay within 15 mm, "
         "joints within 0.02 rad (rest before and after is then left out but for 0.3 s)"

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import msgspec
 
+from kmp import AffineMean
 from service.cli.progress import progress, say, steps
 from service.cli.usage import check_writable, places_in, reached
 from service.client import Client, Tracker
@@ -124,8 +125,10 @@ def learn(args: argparse.Namespace) -> int:
     if figures.unsafe:
         raise ExplainedError(f"{args.output} is not written: {'; '.join(figures.unsafe)}")
     args.output.write_bytes(skill.file)
+    primitive = skill.model.primitive
+    over = " over a mean that is linear in the hands" * isinstance(primitive.prior_mean, AffineMean)
     print(
-        f"{args.output}: {len(skill.model.primitive.inputs)} reference points; it holds as far_from_demonstrations "
+        f"{args.output}: {len(primitive.inputs)} reference points{over}; it holds as far_from_demonstrations "
         f"where {skill.model.measure} is above {1000 * skill.threshold:.0f} mm"
     )
     return 0

@@ -26,6 +26,7 @@ from service.demonstrations.demonstration_reader import far_away, from_tracker, 
 from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
+from service.learning.demonstration import Conducts
 from service.recording.mcap_file import machine, whole_file
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
@@ -56,15 +57,18 @@ class Sample(NamedTuple):
 
 
 class Capture:
-    """The samples of one demonstration; subscribed until closed."""
+    """The samples of one demonstration, of the hands that conduct; subscribed until closed."""
 
-    def __init__(self, session: zenoh.Session, cell: str, settings: Settings) -> None:
-        self.cell, self.settings = cell, settings
-        self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD}
+    def __init__(self, session: zenoh.Session, cell: str, settings: Settings, conducts: Conducts = "both") -> None:
+        self.cell, self.settings, self.conducts = cell, settings, conducts
+        self.hands = HANDS if conducts == "both" else (ENDINGS[conducts],)
+        self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD if key not in HANDS or key in self.hands}
         self.malformed: dict[str, int] = {}
-        self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in HEARD}
+        self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in self.samples}
         self._heard_s, self._moved = time.monotonic(), False
-        self._subscribers = [session.declare_subscriber(channels.key(cell, key), self._listener(key)) for key in HEARD]
+        self._subscribers = [
+            session.declare_subscriber(channels.key(cell, key), self._listener(key)) for key in self.samples
+        ]
 
     def _listener(self, key: str) -> Callable[[zenoh.Sample], None]:
         waiting = self._waiting[key]
@@ -102,12 +106,12 @@ class Capture:
     def missing(self) -> list[str]:
         """The streams that a demonstration needs and that have not been received yet."""
         tool = [] if self.samples[TOOL] or self.samples[JOINT_STATES] else [f"{TOOL} or {JOINT_STATES}"]
-        return [key for key in HANDS if not self.samples[key]] + tool
+        return [key for key in self.hands if not self.samples[key]] + tool
 
     def check(self) -> None:
         """Raises CaptureError where a hand or the tool is too far away to be plausible."""
         hands = self.settings.hands
-        for key in (*HANDS, TOOL):
+        for key in (*self.hands, TOOL):
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
                 at = np.array(pose.position)
@@ -120,7 +124,7 @@ class Capture:
     @property
     def streams(self) -> dict[str, list[Sample]]:
         """The streams of both hands, and of the tool if it is tracked, else of the arm's joints."""
-        return {key: self.samples[key] for key in (*HANDS, TOOL if self.samples[TOOL] else JOINT_STATES)}
+        return {key: self.samples[key] for key in (*self.hands, TOOL if self.samples[TOOL] else JOINT_STATES)}
 
     @property
     def silent_s(self) -> float:
@@ -191,7 +195,7 @@ class Capture:
             messages.append((min(messages)[0], PLACES, text))
         with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
-            file.writer.add_metadata("thirdhand", {"cell": self.cell, **machine()})
+            file.writer.add_metadata("thirdhand", {"cell": self.cell, "hands": self.conducts, **machine()})
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
             file.attach("arm.urdf", urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
@@ -224,6 +228,7 @@ def capture(
     *,
     until: Until,
     rest_s: float,
+    conducts: Conducts = "both",
     is_ended: Callable[[], bool],
     wait_s: float,
     longest_s: float,
@@ -235,7 +240,7 @@ def capture(
 
     Raises CaptureError where they are not received within `wait_s` [s].
     """
-    captured, others = Capture(session, cell, settings), Overheard(session, *ELSEWHERE)
+    captured, others = Capture(session, cell, settings, conducts), Overheard(session, *ELSEWHERE)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()

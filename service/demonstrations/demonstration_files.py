@@ -95,7 +95,8 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     remarks = [line.removeprefix(f"{path}: ") for line in remarks]
     recorded = Recorded(path)
     tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
-    streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True))
+    shown = [side for side in SIDES if side == "tool" or recorded.conducts in ("both", side)]
+    streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True) if side in shown)
     remarks += [*_still(demonstration), *remarks_on_places(demonstration)]
     for side in SIDES:
         if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):

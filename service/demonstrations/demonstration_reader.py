@@ -38,15 +38,20 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     gripper, count = demonstration.gripper, len(stamps_ns)
     given: list[tuple[str, Vector, tuple[int, ...]]]
     given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    if demonstration.conducts != "both":
+        given = [one for one in given if one[0] in (ENDINGS[demonstration.conducts], ENDINGS["tool"])]
     given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
     for name, stream, shape in given:
         if stream.shape != shape or not np.isfinite(stream).all():
             raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
     with McapFile(Path(path), joints=0, attached=False) as file:
+        if demonstration.conducts != "both":
+            file.writer.add_metadata("thirdhand", {"hands": demonstration.conducts})
+        streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
         for i, (stamp, *rows) in enumerate(
-            zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for stream in poses), strict=True)
+            zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for _, stream in streams), strict=True)
         ):
-            for name, row in zip(_STREAMS, rows, strict=True):
+            for (name, _), row in zip(streams, rows, strict=True):
                 data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
                 file.put(topic(cell, name), POSE.type, data, stamp, i)
             if gripper is not None:
@@ -124,7 +129,14 @@ def read_demonstration(
     left, right, tool = (_resampled(stamps, *row) for row in rows)
     stamps.setflags(write=False)
     return Demonstration(
-        stamps, left, right, tool, BASE, recorded.places, recorded.closures(stamps, logged=bool(clocks))
+        stamps,
+        left,
+        right,
+        tool,
+        BASE,
+        recorded.places,
+        recorded.closures(stamps, logged=bool(clocks)),
+        recorded.conducts,
     )
 
 

@@ -9,7 +9,7 @@ import functools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from service.contract.messages import BASE, PoseStamped, WireError, in_order
 from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
+from service.learning.demonstration import Conducts
 from service.recording.mcap_file import RecordingError, existing
 from service.recording.mcap_reader import FileFault, Messages, full_name
 
@@ -85,6 +86,7 @@ class Recorded:
         self.settings: Settings | None = None  # those in force when it was recorded, if it is ours
         self.urdf = ""
         self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
+        self.conducts: Conducts = "both"  # which hands, in a take
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
         self._is_ros_1 = self.path.suffix == ".bag"
@@ -108,6 +110,8 @@ class Recorded:
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES}"):
                 self.places = self._decoded_places(message.data)
         self.faults = messages.faults
+        told = messages.metadata.get("thirdhand", {}).get("hands", "both")
+        self.conducts = next((who for who in get_args(Conducts) if who == told), "both")
         if "settings.json" in messages.attachments:
             try:
                 self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)
@@ -242,12 +246,15 @@ def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Setting
     """The tracks of left hand, right hand and tool; and in words those that were guessed.
 
     Topics are found by what is `given`, else by the ends of their names, the tool else by joint
-    states, all else by words in their names. Raises RecordingError.
+    states, all else by words in their names. A hand that conducts alone is both. Raises
+    RecordingError.
     """
     urdf = recorded.urdf or robot_description(settings)
     tracks: list[Track] = []
     guessed: list[str] = []
     for name in SIDES:
+        if name in ("left", "right") and recorded.conducts not in ("both", name):
+            continue
         source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
         joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
         if source is None and name == "tool":
@@ -260,6 +267,9 @@ def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Setting
             source = _by_words(recorded, name)
             guessed.append(f"{name} is {source}")
         tracks.append(recorded.track(ENDINGS[name], source))
+    if recorded.conducts != "both":
+        tracks.insert(0, tracks[0])
+        guessed.append(f"the {recorded.conducts} hand conducts alone")
     return tracks, guessed
 
 

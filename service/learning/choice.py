@@ -1,7 +1,9 @@
 """References straight from the demonstrations, and the hyper-parameters that predict best a
 demonstration which is left out.
 
-The mean is that of kernel ridge regression, whose residuals with one demonstration left out come
+The prior mean is constant, or linear in the hands where that predicts clearly better: people who
+work elsewhere on a table are then followed there, where a constant would hold the tool back. The
+mean is that of kernel ridge regression, whose residuals with one demonstration left out come
 from one inverse (Rasmussen and Williams 2006, section 5.4.2, for blocks). The covariance must hold
 what people do differently and what nobody showed: both are scaled to those residuals.
 """
@@ -16,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, AffineMean, GaussianKernel, Gaussians
+from service.config import ToolSettings
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
@@ -27,6 +30,9 @@ AS_LIKELY = 0.05  # [nat] less likely is as good: then what grows most off the d
 LOCAL_M = 0.08  # distance of hands over which demonstrations are alike in how much they differ
 SHARED = 0.15  # of the scatter that is everywhere the same, as few demonstrations tell little of one place
 REGIONS = (2.366, 7.815)  # chi-square of three degrees of freedom: the 50 and 95 % regions of a normal in space
+CLEARLY = 0.9  # a linear mean must have less than this share of a constant one's error: it extrapolates
+RIDGE_M = 0.005  # along which hands hardly moved, as trackers and fingers tremble, the tool is said to stay
+MAX_GAIN = ToolSettings().max_gain  # of a linear mean, as of the way between via-points
 DWELL = 0.25  # share of the reference points that goes by time, the rest by the hands' way
 
 
@@ -37,6 +43,7 @@ class Parameters(NamedTuple):
     noise: float  # a reference point's variance over the kernel's, for the mean
     spread: float  # the same, for the covariance
     deviation: float  # [m] standard deviation far from all data
+    is_linear: bool = False  # the prior mean
 
 
 def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
@@ -67,15 +74,19 @@ class Choice:
         return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner, alike)
 
     @cached_property
-    def _prior(self) -> Vector:
+    def _constant(self) -> Vector:
         return np.asarray(self.outputs.mean(axis=0))
+
+    def _kept(self, without: int | None) -> NDArray[np.bool_]:
+        return np.ones(len(self.owner), bool) if without is None else self.owner != without
 
     @cached_property
     def _squares(self) -> Vector:
         return np.asarray(((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2))
 
-    def parameters(self, ell: float | None = None) -> Parameters:
-        """Those that predict best a demonstration left out, with this ell or the best.
+    def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
+        """Those that predict best a demonstration left out, with this ell or the best; over a
+        linear mean, where it may be, only if they do so clearly better.
 
         Raises SkillError for fewer than two demonstrations.
         """
@@ -86,10 +97,16 @@ class Choice:
                 "each; record another"
             )
         ells = ELLS if ell is None else (ell,)
-        _, ell, noise = min((rms(self.residuals(one, noise)), one, noise) for one in ells for noise in NOISES)
-        residuals = self.residuals(ell, noise)
+        error, ell, noise = min((rms(self.residuals(one, noise)), one, noise) for one in ells for noise in NOISES)
+        residuals, is_linear = self.residuals(ell, noise), False
         spread = self._spread(ell, residuals)
-        unscaled = Parameters(ell, noise, spread, 1.0)
+        if may_be_linear:
+            # The kernel's length and the spread stay: off the data the covariance grows as fast,
+            # and the gate holds what it would hold over a constant, however straight the way was.
+            least, best = min((rms(self.residuals(ell, one, is_linear=True)), one) for one in NOISES)
+            if least < CLEARLY * error:
+                noise, residuals, is_linear = best, self.residuals(ell, best, is_linear=True), True
+        unscaled = Parameters(ell, noise, spread, 1.0, is_linear)
         squares = []
         for left_out in range(count):
             mine = self.owner == left_out
@@ -99,13 +116,25 @@ class Choice:
         few = (count + 1) / (count - 1)
         return unscaled._replace(deviation=float(np.sqrt(few * np.concatenate(squares).mean() / 3)))
 
-    def residuals(self, ell: float, noise: float) -> Vector:
+    def residuals(self, ell: float, noise: float, *, is_linear: bool = False) -> Vector:
         """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""
         inverse = np.linalg.inv(np.exp(-ell * self._squares) + noise * np.eye(len(self.inputs)))
-        weighted, out = inverse @ (self.outputs - self._prior), np.empty_like(self.outputs)
+        weighted, out = inverse @ (self.outputs - self._constant), np.empty_like(self.outputs)
         for h in np.unique(self.owner):
             mine = self.owner == h
+            if is_linear:
+                weighted = inverse @ self._departures[h]
             out[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], weighted[mine])
+        return out
+
+    @cached_property
+    def _departures(self) -> dict[int, Vector]:
+        """By how much outputs (N, 3) depart from the linear mean without each demonstration."""
+        out = {}
+        for h in np.unique(self.owner).tolist():
+            kept = self._kept(h)
+            mean = ridge(self.inputs[kept], self.outputs[kept])
+            out[h] = self.outputs - self.inputs @ mean.matrix.T - mean.offset
         return out
 
     def primitive(self, parameters: Parameters, residuals: Vector, *, without: int | None = None) -> KMP:
@@ -114,7 +143,7 @@ class Choice:
         The covariance of IJRR 2019 has two free scales: with N / lambda_c the square of `deviation`
         it comes to that far from the data, and Sigma is then what gives each point its `spread`.
         """
-        kept = np.ones(len(self.owner), bool) if without is None else self.owner != without
+        kept = self._kept(without)
         lambda_covariance = kept.sum() / parameters.deviation**2
         size = parameters.spread / lambda_covariance
         return KMP.fit(
@@ -123,7 +152,7 @@ class Choice:
             kernel=GaussianKernel(parameters.ell),
             lambda_mean=parameters.noise / size,
             lambda_covariance=lambda_covariance,
-            prior_mean=self._prior,
+            prior_mean=ridge(self.inputs[kept], self.outputs[kept]) if parameters.is_linear else self._constant,
         )
 
     def _scatter(self, residuals: Vector, kept: NDArray[np.bool_]) -> Vector:
@@ -166,6 +195,18 @@ class Choice:
             each = np.arange(len(mine))
             out[mine] = block[each, :, each, :] - noise[mine]
         return 0.5 * (out + out.transpose(0, 2, 1))
+
+
+def ridge(hands: Vector, tool: Vector) -> AffineMean:
+    """The linear mean of a tool (N, 3) [m] for hands (N, 6) [m], by ridge regression; its gain is
+    MAX_GAIN at most.
+    """
+    centre, middle = hands.mean(axis=0), tool.mean(axis=0)
+    off = hands - centre
+    square = off.T @ off + len(hands) * RIDGE_M**2 * np.eye(hands.shape[1])
+    u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (tool - middle)).T, full_matrices=False)
+    matrix = (u * np.minimum(gains, MAX_GAIN)) @ v
+    return AffineMean(matrix, middle - matrix @ centre)
 
 
 def rms(errors: Vector) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,19 @@ from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
+ALIKE = 0.25  # least correlation of speeds that tells of a lag: steady ones, of noise alone, reach 0.2
 CLOSURE_MARGIN = 0.05  # by which a gripper may be told to be more than open or closed
+
+
+Conducts = Literal["both", "left", "right"]
 
 
 class Demonstration(NamedTuple):
     """Stamps (T,) [ns], and poses (T, 7) of left hand, right hand and tool, each x y z [m] and
     quaternion x y z w, in one frame; where the named places of its task were, in the order in which
     the tool comes to them; and how far the gripper is closed (T,), 0 to 1, where that is told.
+
+    Where one hand `conducts`, the poses of the other are that one's again.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -31,6 +37,7 @@ class Demonstration(NamedTuple):
     frame: str = BASE
     places: tuple[ViaPoint, ...] = ()
     gripper: Vector | None = None
+    conducts: Conducts = "both"
 
     @property
     def hands(self) -> Vector:
@@ -108,6 +115,8 @@ def lag(demonstration: Demonstration, longest_s: float = 1.0) -> int:
     speeds = [np.linalg.norm(np.gradient(x, axis=0), axis=1) for x in (hands, tool[:, :3])]
     a, b = (s - s.mean() for s in speeds)
     inner = a[reach : len(a) - reach]
-    score = [float(inner @ b[reach + shift : len(b) - reach + shift]) for shift in range(-reach, reach + 1)]
-    best = int(np.argmax(score)) - reach
-    return 0 if score[best + reach] < 1.02 * score[reach] else best
+    shifted = [b[reach + shift : len(b) - reach + shift] for shift in range(-reach, reach + 1)]
+    score = [float(inner @ speeds) for speeds in shifted]
+    best = int(np.argmax(score))
+    least = ALIKE * float(np.linalg.norm(inner) * np.linalg.norm(shifted[best]))
+    return 0 if score[best] < max(1.02 * score[reach], least) else best - reach

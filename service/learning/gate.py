@@ -54,4 +54,7 @@ def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
     none = np.zeros_like(ways)
     both, one = np.hstack([ways, ways]), np.concatenate([np.hstack([ways, none]), np.hstack([none, ways])])
     moved = ((hands[:, None] + steps).reshape(-1, 6) for steps in (both, one))
-    return (np.roll(hands, 3, axis=1), *moved)  # type: ignore[return-value]
+    beside, one_beside = moved
+    if np.array_equal(hands[:, :3], hands[:, 3:]):  # one conducts alone: it has none to be swapped with or left by
+        return beside, beside, beside
+    return np.roll(hands, 3, axis=1), beside, one_beside

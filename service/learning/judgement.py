@@ -4,7 +4,7 @@ and what makes it unsafe.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -15,13 +15,13 @@ from service.contract.messages import BASE
 from service.core.frame import Vector
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import is_reachable
+from service.learning.ambiguity import COMPARED, ambiguity, lengths
 from service.learning.choice import REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
 
 SAME_M = 0.003  # demonstrations nearer to each other, root mean square, are one that was repeated
-NEAR_M, APART_M = 0.02, 0.10  # hands so near that go with tools so far apart contradict each other
-COMPARED = 100  # samples of a demonstration, of which each is compared with each
+APART_M = 0.10  # tools so far apart contradict each other where the hands are the same
 STANDS_OUT = 2.5  # times the median error of all demonstrations, and
 NOTED_MM, UNSAFE_MM = 50.0, 100.0  # errors that are noted, and that are no skill
 NOTED, UNSAFE = 1.0, 10.0  # [%] of the samples that contradict others
@@ -93,12 +93,13 @@ def figures(
     posed: Posed,
     *,
     beside: Mapping[str, Sequence[Vector]],
+    near_m: float,
     reach: Reach,
     remarks: Sequence[str],
 ) -> Figures:
     """The figures of a skill: its demonstrations, their hands (T, 6) and tools (T, 3) [m] in phase,
     what was predicted of each, its gate, what it learned besides, and errors (T, 3) [m] of other
-    ways to predict each demonstration, `beside` it.
+    ways to predict each demonstration, `beside` it. `near_m` is as in `ambiguity`.
     """
     rows = tuple(
         _row(name, one, gate.threshold, {way: errors[i] for way, errors in beside.items()})
@@ -107,7 +108,14 @@ def figures(
     total = HeldOut(*(np.concatenate(parts) for parts in zip(*held_out, strict=True)))
     hands, tools = zip(*paths, strict=True)
     ambiguous, contradiction = ambiguity(
-        hands, tools, names, _lengths, apart=APART_M, told=lambda apart_m: f"{1000 * apart_m:.0f} mm"
+        hands,
+        tools,
+        names,
+        lengths,
+        apart=APART_M,
+        near_m=near_m,
+        missed=[np.linalg.norm(one.errors, axis=1) for one in held_out],
+        told=lambda apart_m: f"{1000 * apart_m:.0f} mm",
     )
     out = np.array([not is_reachable(at, reach) for _, tool in paths for at in tool[:: max(1, len(tool) // COMPARED)]])
     found = Figures(
@@ -142,42 +150,6 @@ def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
                 out[i] = j
                 break
     return out
-
-
-def ambiguity(
-    hands: Sequence[Vector],
-    tools: Sequence[Vector],
-    names: Sequence[str],
-    distances: Callable[[Vector], Vector],
-    *,
-    apart: float,
-    told: Callable[[float], str],
-) -> tuple[float, str]:
-    """The share of samples that have another with the same hands and the tool `apart` from theirs,
-    and the worst such pair in words.
-
-    `distances` are those (M, M) from each to each of some tools, and `told` one of them in words.
-    """
-    at = [np.linspace(0, len(some) - 1, min(COMPARED, len(some))).round().astype(int) for some in hands]
-    known, shown = (np.concatenate([x[i] for x, i in zip(some, at, strict=True)]) for some in (hands, tools))
-    owner = [f"{name} (sample {i})" for name, some in zip(names, at, strict=True) for i in some]
-    found = distances(shown) * (_squares(known) < NEAR_M**2)
-    i, j = np.unravel_index(int(found.argmax()), found.shape)
-    worst = (
-        f"{owner[i]} and {owner[j]} have the hands {1000 * np.linalg.norm(known[i] - known[j]):.0f} mm from each other "
-        f"and the tools {told(found[i, j])}"
-    )
-    return float((found.max(axis=1) > apart).mean()), worst
-
-
-def _squares(points: Vector) -> Vector:
-    """Squared distances (M, M) of points (M, D) from each other."""
-    squares = (points**2).sum(axis=1)
-    return np.asarray(squares[:, None] + squares - 2 * points @ points.T)
-
-
-def _lengths(points: Vector) -> Vector:
-    return np.sqrt(np.maximum(_squares(points), 0.0))
 
 
 def _row(name: str, one: HeldOut, threshold: float, beside: Mapping[str, Vector]) -> Row:

@@ -19,6 +19,7 @@ from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
+from service.learning.ambiguity import same_hands_m
 from service.learning.baselines import left_out, linear, look_up
 from service.learning.choice import Choice
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
@@ -89,7 +90,11 @@ def learn(
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     beside = {way: left_out(paths, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
-    task = task_of(demonstrations) if components is None and ell is None else ""
+    near_m = same_hands_m(demonstrations)
+    alone = demonstrations[0].conducts
+    if len(who := sorted({one.conducts for one in demonstrations})) > 1:
+        raise SkillError(f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike")
+    task = task_of(demonstrations) if components is None and ell is None and alone == "both" else ""
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
@@ -122,6 +127,7 @@ def learn(
             names,
             points=points,
             gripper_ell=found.model.gripper_ell,
+            near_m=near_m,
         )
     except ValueError as error:
         if isinstance(error, SkillError):
@@ -135,6 +141,7 @@ def learn(
         found.gate,
         posed,
         beside=beside if len(paths) > 1 else {},
+        near_m=near_m,
         reach=reach or Reach(),
         remarks=remarks,
     )
@@ -150,6 +157,7 @@ def learn(
         learned_from=fingerprint(demonstrations),
         components=components or 0,
         figures=msgspec.json.encode(judged).decode(),
+        conductor=None if alone == "both" else ("left", "right").index(alone),
     )
     skill = with_file(skill)
     show(Evidence(skill, judged, paths, found.held_out))
@@ -186,8 +194,8 @@ def _learned(
 
 def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
     choice = Choice.of(paths, points)
-    parameters = choice.parameters(ell)
-    residuals = choice.residuals(parameters.ell, parameters.noise)
+    parameters = choice.parameters(ell, may_be_linear=True)
+    residuals = choice.residuals(parameters.ell, parameters.noise, is_linear=parameters.is_linear)
 
     return lambda left_out: choice.primitive(parameters, residuals, without=left_out)
 

@@ -20,8 +20,9 @@ from service.core.frame import Vector
 from service.core.geometry import angles
 from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation
 from service.core.skill.skill import decided
+from service.learning.ambiguity import ambiguity
 from service.learning.choice import Choice, Parameters, rms
-from service.learning.judgement import Posed, ambiguity
+from service.learning.judgement import Posed
 
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned
 APART_RAD = math.radians(30.0)  # tools turned so far apart, with the hands the same, contradict each other
@@ -43,15 +44,17 @@ def learned_pose(
     *,
     points: int,
     gripper_ell: float,
+    near_m: float,
 ) -> Posed:
     """What demonstrations with these inputs (T, I) of the position's primitive, hands (T, 6) [m],
-    orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell.
+    orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell. `near_m` is as
+    in `ambiguity`.
     """
     mean = mean_orientation(np.concatenate(quaternions))
     unit = [q / np.linalg.norm(q, axis=1)[:, None] for q in quaternions]
     warnings: list[str] = []
     unsafe: list[str] = []
-    turn, turn_error = _learned_turn(mean, inputs, unit, points)
+    turn, turn_error, missed = _learned_turn(mean, inputs, unit, points)
     if turn is not None:
         share, worst = ambiguity(
             hands,
@@ -59,6 +62,8 @@ def learned_pose(
             names,
             lambda tools: angles(tools[:, None], tools),
             apart=APART_RAD,
+            near_m=near_m,
+            missed=missed,
             told=lambda apart_rad: f"turned by {math.degrees(apart_rad):.0f}°",
         )
         if share > NOTED:
@@ -85,7 +90,7 @@ def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
 
 def is_flat(primitive: KMP) -> bool:
     """Whether it says the same everywhere, but for what it was taught."""
-    return bool((primitive.base.reference.mean == primitive.prior_mean).all())
+    return bool((primitive.base.reference.mean == primitive.prior_offset).all())
 
 
 def mean_orientation(quaternions: ArrayLike) -> Vector:
@@ -100,16 +105,22 @@ def mean_orientation(quaternions: ArrayLike) -> Vector:
 
 def _learned_turn(
     mean: Vector, inputs: Sequence[Vector], unit: Sequence[Vector], points: int
-) -> tuple[LearnedOrientation | None, float | None]:
-    """The primitive of orientations (T, 4), None where they are constant, and its error [deg]."""
+) -> tuple[LearnedOrientation | None, float | None, list[Vector]]:
+    """The primitive of orientations (T, 4), None where they are constant; its error [deg], and by
+    how much the others' misses those of each demonstration (T,) [rad].
+    """
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
-        return None, None
+        return None, None, []
     zetas = [log(_near(q, mean), mean) for q in unit]
     choice = Choice.of(list(zip(inputs, zetas, strict=True)), points, alike=True)
     parameters = choice.parameters() if len(zetas) > 1 else ALONE
     residuals = choice.residuals(parameters.ell, parameters.noise)
     error_deg = math.degrees(2.0 * rms(residuals)) if len(zetas) > 1 else None
-    return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg
+    missed = []
+    for h, (at, zeta) in enumerate(zip(inputs, zetas, strict=True)):
+        others = choice.primitive(parameters, residuals, without=h if len(zetas) > 1 else None)
+        missed.append(2.0 * np.linalg.norm(zeta - others.mean(at), axis=1))
+    return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
 
 
 def _near(quaternions: Vector, mean: Vector) -> Vector:

@@ -24,6 +24,7 @@ from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
+from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import FARTHEST_M, Model
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
@@ -64,6 +65,7 @@ KNOWN = {
     "places",
     "replaced",
     "figures",
+    "conductor",
     "checksum",
     "names",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
@@ -106,6 +108,8 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         tolerance=np.array(skill.tolerance),
         **skill.model.primitive.to_arrays(),
     )
+    if skill.conductor is not None:
+        arrays["conductor"] = np.array(skill.conductor)
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
     arrays |= skill.model.own_arrays()
@@ -160,6 +164,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),
+            conductor=(0, 1)[int(arrays["conductor"])] if "conductor" in arrays else None,
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
@@ -196,6 +201,9 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield from _beyond(part, RANGES.keys() & part.keys(), prefix)
             if len(part["base_inputs"]) > MOST_POINTS:
                 yield f"{len(part['base_inputs'])} points of {prefix}, at most {MOST_POINTS} accepted"
+    for prefix in ("", TURN, GRIPPER):
+        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (prefix or _model(arrays) is not HandsKMP):
+            yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"

@@ -36,6 +36,8 @@ def adapted(
     if not tolerance >= 0:
         names = [point.name for point in via_points]
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
+    if skill.conductor is not None:
+        via_points = [_of_one(point, skill.conductor) for point in via_points]
     inputs, outputs, deviations = neighbourhoods(via_points)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
     _check_agreement(owners, inputs, outputs, deviations, max_gain)
@@ -54,6 +56,12 @@ def adapted(
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, turn=turn, gripper=gripper))
+
+
+def _of_one(point: ViaPoint, conductor: int) -> ViaPoint:
+    """The via-point with both hands where the one is that conducts."""
+    at = (point.left, point.right)[conductor]
+    return msgspec.structs.replace(point, left=at, right=at)
 
 
 def _check_agreement(

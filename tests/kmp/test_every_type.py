@@ -8,6 +8,7 @@ import pytest
 import kmp
 from kmp import (
     KMP,
+    AffineMean,
     CoordinateFrame,
     Correlation,
     GaussianKernel,
@@ -40,6 +41,7 @@ VALUES = [
     *(R, GaussianMixture.fit(np.hstack([S, S]), components=2, seed=0), NEUTRAL, IMPROVED, LEARNED, LEARNED.scores[0]),
     *(K, GaussianKernel([1.0, 2.0]), PeriodicKernel(1.0, 2.0), VelocityKernel(1.5), ONE.uncertainty(S)),
     *(ONE.predict_motion(S[0], S[1], S[2]), ONE.predict_motion(S[0], S[1], S[2], covariance=False)),
+    *(AffineMean(np.eye(2), [1.0, 2.0]), KMP.fit(S, R, kernel=K, lambda_mean=1.0, prior_mean=AffineMean(S[:2], S[2]))),
     *(LinearConstraints(S, S, S[:, 0]), LinearConstraints(S, S, S[:, 0], S)),
 ]
 

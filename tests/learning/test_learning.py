@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
+from service.learning.demonstration import Demonstration, lag
 from service.learning.learn import learn
 from service.learning.pose import mean_orientation
 from service.learning.skill_file import SkillError
+from support.circling import circling
 from support.taught_scene import demonstrated, deviations, error_m, quickly
 
 LATE = 40  # samples of 10 ms
@@ -23,6 +24,10 @@ def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(
 
 def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstration]) -> None:
     assert quickly(taught[:2]).file == coarse.file
+
+
+def test_hands_and_tool_that_move_steadily_are_taken_to_be_in_phase() -> None:
+    assert [lag(circling(seed)) for seed in range(5)] == [0] * 5
 
 
 def test_a_tool_that_lags_is_put_in_phase(coarse: Skill, taught: list[Demonstration]) -> None:

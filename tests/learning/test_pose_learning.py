@@ -13,6 +13,7 @@ from service.contract.requests import RequestError, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.skill import Skill
+from service.learning.ambiguity import SAME_M
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import learned_pose
@@ -73,6 +74,7 @@ def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demons
         list("abcd"),
         points=80,
         gripper_ell=HandsKMP.gripper_ell,
+        near_m=SAME_M,
     )
     assert "contradicts itself" in found.unsafe[0]
     assert "a (sample" in found.unsafe[0]

@@ -333,3 +333,24 @@ def test_hands_are_passed_on_by_a_daemons_session(sessions: tuple[zenoh.Session,
             time.sleep(0.02)
             taken.collect()
         taken.close()
+
+
+@pytest.mark.parametrize("who", ["left", "right"])
+def test_a_hand_that_conducts_alone_is_taken_without_the_other(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, who: str
+) -> None:
+    hearing, told = sessions
+    taken = Capture(hearing, "alone", Settings(), who)  # type: ignore[arg-type]
+    assert taken.missing == [f"hands/{who}", "tool/pose or joints/state"]
+    for i in range(20):
+        for key in ("hands/left", "hands/right", "tool/pose"):
+            at = (0.01 * i, 0.0, 0.5)
+            told.put(f"alone/{key}", cdr.encode_pose(PoseStamped(10**18 + i * 10**7, "base", at, (0.0, 0.0, 0.0, 1.0))))
+        heard(taken, 2 * (i + 1))
+    taken.close()
+    taken.write(tmp_path / "a.mcap")
+    got = read_demonstration(tmp_path / "a.mcap")
+    assert got.conducts == who
+    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(Recorded(tmp_path / "a.mcap").topics)
+    np.testing.assert_array_equal(got.left, got.right)
+    assert f"the {who} hand conducts alone" in table(summary(tmp_path / "a.mcap"))

@@ -46,6 +46,7 @@ ARM_ERROR, ARM_SILENT, TOOL_SPEED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT
 STARTS_ASSUMED = 1  # what a step says: the arm is taken to be at the configured posture
 STARTS_MEASURED = 2  # the arm appeared, where it is measured
 INSIDE = 64  # beside what the intake says: a part of the arm is inside of a thing ...
+ALONE = 128  # and that the hand that conducts the skill alone was seen, and the other never
 INSIDE_M = 0.01  # [m] ... by more than capsules are larger than links
 NOTICED, HELD = 1, 2  # of a tool that is stuck: it follows all the same; it holds, or is on a way out
 
@@ -75,8 +76,8 @@ class Decision:
         """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
         STARTS_MEASURED.
 
-        known: the flags that `Intake.step` gave, and INSIDE. gate_m: what the skill compares with
-        its threshold, NaN where it predicts nothing.
+        known: the flags that `Intake.step` gave, INSIDE and ALONE. gate_m: what the skill compares
+        with its threshold, NaN where it predicts nothing.
         """
         gates = gate_m, threshold
         starts, error, speed = _step(as_array(state), as_array(frame), here, self._parameters, known, *gates)
@@ -158,7 +159,8 @@ def _step(
     elif state.operator_hold:
         reason = OPERATOR
     elif math.isnan(gate_m):
-        reason = NO_HANDS if min(state.hand_ticks[0], state.hand_ticks[1]) < 0 else STALE_HAND
+        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ALONE
+        reason = NO_HANDS if unseen else STALE_HAND
     else:
         ease = GATE_EASE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else NONE

@@ -196,14 +196,14 @@ class Intake:
 
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands
-        self._stale_ticks = _stale_ticks("hands/left", settings)
+        self.stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
         limits = np.array([settings.joints.lower, settings.joints.upper])
         self._parameters = parameters(
             period_s=settings.period_s,
-            stale_ticks=self._stale_ticks,
+            stale_ticks=self.stale_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
             jump=float(hands.jump),
@@ -241,7 +241,7 @@ class Intake:
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         state["tick"] += ticks
-        self._estimator.advance(state, ticks, self._stale_ticks)
+        self._estimator.advance(state, ticks, self.stale_ticks)
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""

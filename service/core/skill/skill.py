@@ -168,6 +168,7 @@ class Skill:
     gripper: LearnedGripper | None = None
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
     digest: bytes = bytes(16)  # 16 bytes of its file that tell it from any other
+    conductor: int | None = None  # side of the hand that conducts alone: the other makes no difference
 
     def predict(
         self,
@@ -189,6 +190,9 @@ class Skill:
         """
         stacked = np.empty((3, 2, 3))
         stacked[0], stacked[1], stacked[2] = hands, velocities, accelerations
+        if self.conductor is not None:
+            stacked[:, 1 - self.conductor] = stacked[:, self.conductor]
+            stillness = stillness[[self.conductor] * 2]
         moving = stacked.reshape(3, 6)
         motion = self.model.predict(moving, stillness, None if before is None else before[0], memory)
         if self.turn is None and self.gripper is None:
@@ -207,7 +211,13 @@ class Skill:
 
     def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
         """The tool (T, 3) [m] for hands (T, 6) [m] that are so still (T, 2), or wholly."""
-        return self.model.mean(hands, stillness)
+        return self.model.mean(self.conducting(hands), stillness)
+
+    def conducting(self, hands: Vector) -> Vector:
+        """Hands (T, 6) [m] of which one that makes no difference is where the other is."""
+        if self.conductor is None:
+            return hands
+        return np.tile(hands[:, 3 * self.conductor : 3 * self.conductor + 3], 2)
 
     @property
     def hands(self) -> Vector:

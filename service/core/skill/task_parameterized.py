@@ -126,7 +126,7 @@ class TaskInstance:
         rows, nothing = np.empty((0, task.width + len(task.names) + 2)), np.empty((0, task.width + 3))
         if primitive is not None:
             tasks["scale"] = primitive.kernel.coordinates(1)[0]
-            via_points["prior"][1:], tasks["prior_offset"] = primitive.prior_mean[:-3], primitive.prior_mean[-3:]
+            via_points["prior"][1:], tasks["prior_offset"] = primitive.prior_offset[:-3], primitive.prior_offset[-3:]
             rows = np.hstack([primitive.centres, primitive.weights.reshape(-1, primitive.outputs)])
         known = nothing if errors is None else np.array(errors, order="C")
         return cls(tasks, via_points, rows, known, np.empty((0, 9)), nothing)

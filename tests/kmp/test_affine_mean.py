@@ -1,0 +1,134 @@
+"""A prior mean that goes with the input: the same as learning what is left of it, on every path."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from kmp import KMP, AffineMean, GaussianKernel, Gaussians, LinearConstraints, PeriodicKernel, VelocityKernel
+from kmp.functionals import Functionals
+from kmp.solution import mean_of
+
+KERNELS = {
+    "one length": GaussianKernel(0.5),
+    "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
+    "velocity": VelocityKernel(2.0),
+}
+POSITIONS = AffineMean([[0.5, -1.0, 2.0], [1.5, 0.25, -0.75]], [0.3, -0.2])
+OVER_TIME = AffineMean([[0.5], [-1.5], [0.0], [0.0]], [0.3, -0.2, 0.5, -1.5])  # the rates' offset is the values' slope
+
+
+def at(prior, points):
+    """The prior mean of functionals, written down as it stands."""
+    if points.directions is None:
+        return points.inputs @ prior.matrix.T + prior.offset
+    of_values = points.inputs @ prior.matrix.T + prior.offset
+    return np.where(points.values[:, None], of_values, points.along @ prior.matrix.T)
+
+
+def both(kernel, representation, how):
+    """A primitive over an affine mean, and the same over none of what is left of the outputs."""
+    random, kernel = np.random.default_rng(0), KERNELS[kernel]
+    t = np.linspace(0, 2, 60)[:, None]
+    s = t if kernel.channels == 2 else np.hstack([t, np.sin(3 * t), np.cos(2 * t)])
+    prior = OVER_TIME if kernel.channels == 2 else POSITIONS
+    rates = [2 * np.cos(2 * t), -3 * np.sin(3 * t)] if kernel.channels == 2 else []
+    mean = np.hstack([np.sin(2 * t), np.cos(3 * t), *rates])
+    root = 0.05 * random.normal(size=(60, mean.shape[1], mean.shape[1]))
+    covariance = root @ root.swapaxes(1, 2) + 1e-3 * np.eye(mean.shape[1])
+    along = np.zeros_like(s)
+    along[40:] = 0.7
+    points = Functionals.checked(s, along if how == "directions" else None)
+    moved, parameters = at(prior, points), {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 3.0}
+    parameters |= {"representation": representation, "directions": points.directions}
+    one = KMP.fit(s, Gaussians(mean + moved, covariance), prior_mean=prior, **parameters)
+    rest = KMP.fit(s, Gaussians(mean, covariance), **parameters)
+    if how == "adapted":
+        via, desired = s[20:22] + 0.01, Gaussians(mean[20:22] + 0.05, covariance[20:22])
+        shifted = Gaussians(desired.mean + at(prior, Functionals(via)), desired.covariance)
+        one, rest = one.adapt(via, shifted, tolerance=0.02), rest.adapt(via, desired, tolerance=0.02)
+    return prior, one, rest
+
+
+@pytest.mark.parametrize("how", ["fitted", "adapted", "directions"])
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_it_is_as_if_what_is_left_had_been_learned(kernel, representation, how):
+    prior, one, rest = both(kernel, representation, how)
+    queries = np.random.default_rng(1).normal(size=(5, one.inputs.shape[1]))
+    close = {"rtol": 0, "atol": 1e-8 * np.abs(one.weights).max()}
+    np.testing.assert_allclose(one.mean(queries), rest.mean(queries) + at(prior, Functionals(queries)), **close)
+    np.testing.assert_allclose(one.jacobians(queries), rest.jacobians(queries) + prior.matrix, **close)
+    np.testing.assert_array_equal(one.predict(queries).covariance, rest.predict(queries).covariance)
+    for s in queries:
+        v, a = np.random.default_rng(2).normal(size=(2, len(s)))
+        for motion, left in (
+            (one.predict_motion(s, v, a), rest.predict_motion(s, v, a)),  # compiled, where Numba is
+            (one.query.motion(s, v, a, covariance=True), rest.query.motion(s, v, a, covariance=True)),
+        ):
+            np.testing.assert_allclose(motion.mean, left.mean + prior.matrix @ s + prior.offset, **close)
+            np.testing.assert_allclose(motion.velocity, left.velocity + prior.matrix @ v, **close)
+            np.testing.assert_allclose(motion.acceleration, left.acceleration + prior.matrix @ a, **close)
+            np.testing.assert_allclose(motion.jacobian, left.jacobian + prior.matrix, **close)
+            np.testing.assert_allclose(motion.covariance, left.covariance, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            one.mean(s[None])[0], rest.mean(s[None])[0] + prior.matrix @ s + prior.offset, **close
+        )
+        np.testing.assert_allclose(one.jacobian(s), rest.jacobian(s) + prior.matrix, **close)
+    slopes = Functionals(queries, np.ones_like(queries))
+    expected = mean_of(rest.solution, slopes) + slopes.along @ prior.matrix.T
+    np.testing.assert_allclose(mean_of(one.solution, slopes), expected, **close)
+
+
+def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
+    _, one, _ = both("a length an input", "dense", "fitted")
+    where, wanted = one.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
+    exact = Gaussians(wanted, np.tile(1e-8 * np.eye(2), (2, 1, 1)))
+    through = one.adapt(where, exact, tolerance=0.0, directions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(through.mean(where[:1])[0], wanted[0], atol=1e-3)
+    np.testing.assert_allclose(through.jacobian(where[0])[:, 0], wanted[1], atol=1e-3)
+    above = LinearConstraints(one.inputs, np.tile([1.0, 0.0], (60, 1)), np.zeros(60))
+    assert one.mean(one.inputs)[:, 0].min() < -0.1
+    assert one.constrained(above).mean(one.inputs)[:, 0].min() > -1e-9
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_it_is_stored_pickled_and_refitted_with_the_primitive(representation):
+    prior, one, _ = both("one length", representation, "adapted")
+    queries = one.inputs[:7] + 0.1
+    for other in (KMP.from_arrays(one.to_arrays()), pickle.loads(pickle.dumps(one)), one.refitted(one.base.reference)):
+        assert np.array_equal(other.mean(queries), one.mean(queries))
+        assert np.array_equal(other.prior_mean.matrix, prior.matrix)
+        assert np.array_equal(other.prior_mean.offset, prior.offset)
+        with pytest.raises(ValueError, match="read-only"):
+            other.prior_mean.matrix[0, 0] = 1.0
+
+
+def test_far_from_the_data_it_extrapolates_and_is_as_unsure_as_any():
+    prior, one, rest = both("one length", "dense", "fitted")
+    far = np.full((1, 3), 100.0)
+    np.testing.assert_allclose(one.mean(far), at(prior, Functionals(far)))
+    np.testing.assert_array_equal(one.predict(far).covariance, rest.predict(far).covariance)
+    np.testing.assert_allclose(one.predict(far).covariance[0], 60 / 3.0 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("kernel", "prior", "says"),
+    [
+        (GaussianKernel(1.0), AffineMean(np.eye(2), [0, 0]), r"shape \(2, 2\) given, \(4, 1\) needed"),
+        (VelocityKernel(1.0), AffineMean([[1], [1], [0], [0]], [0, 0, 0, 0]), "rates of .* given"),
+        (VelocityKernel(1.0), AffineMean([[0], [0], [1], [0]], [0, 0, 0, 0]), "rates of .* given"),
+        (PeriodicKernel(1.0, 2.0), AffineMean([[1], [1], [0], [0]], [0, 0, 0, 0]), "a slope given"),
+    ],
+)
+def test_one_that_does_not_go_with_the_kernel_is_refused(kernel, prior, says):
+    reference = Gaussians(np.zeros((3, 4)), np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(ValueError, match=says):
+        KMP.fit(np.arange(3.0)[:, None], reference, kernel=kernel, lambda_mean=1.0, prior_mean=prior)
+
+
+def test_one_is_made_of_finite_numbers_that_go_together():
+    with pytest.raises(ValueError, match=r"prior_mean.matrix: shape \(2, 2\) given"):
+        AffineMean(np.eye(2), [0.0])
+    with pytest.raises(ValueError, match="must be finite"):
+        AffineMean([[np.nan]], [0.0])

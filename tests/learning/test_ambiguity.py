@@ -1,0 +1,90 @@
+"""Contradictions between demonstrations: told from fine motion by the tracker's noise."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.learning.ambiguity import ALIKE_M, NOISES, SAME_M, same_hands_m, tracker_noise_m
+from service.learning.demonstration import Demonstration
+from service.learning.judgement import Figures
+from service.learning.learn import learn
+from support.circling import circling
+from support.taught_scene import demonstrated
+
+FINE_M, TIMES = 0.015, 8.0  # the left hand goes to and fro so far, and the tool so many times as far
+
+
+def fine(seed: int, noise_m: float, way: float = 1.0, *, turned: bool = False) -> Demonstration:
+    """A take of the left hand moving by 15 mm, and the tool by 12 cm along it, or against it; or
+    turned by 90° as far.
+    """
+    random, t = np.random.default_rng(seed), np.arange(0.0, 10.0, 0.02)
+    going = 0.5 * np.sin(2 * np.pi * 0.3 * t + random.uniform(0, 6))
+    along, straight = np.eye(3)[:1] * going[:, None], np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    places = (
+        [0.5, 0.2, 0.3] + FINE_M * along,
+        [0.5, -0.2, 0.3] + 0.0 * along,
+        [0.5, 0.0, 0.4] + way * TIMES * FINE_M * along,
+    )
+    seen = [np.hstack([at + noise_m * random.normal(size=at.shape), straight]) for at in places]
+    if turned:
+        half = way * math.pi / 4 * going
+        seen[2][:, 5], seen[2][:, 6] = np.sin(half), np.cos(half)
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *seen)
+
+
+def judged(demonstrations: list[Demonstration]) -> Figures:
+    return msgspec.json.decode(learn(demonstrations, points=80).figures, type=Figures)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0002, 0.001, 0.003])
+@pytest.mark.parametrize("every", [1, 2])
+def test_the_noise_of_a_tracker_is_found_in_takes_however_the_hands_move(noise_m: float, every: int) -> None:
+    moving = [circling(seed, noise_m=noise_m).every(every) for seed in range(3)]
+    assert tracker_noise_m(moving) == pytest.approx(noise_m, rel=0.15, abs=2e-4)
+
+
+def test_hands_are_the_same_within_several_deviations_between_a_floor_and_a_ceiling() -> None:
+    near = [same_hands_m([fine(seed, noise_m) for seed in range(2)]) for noise_m in (0.0, 0.001, 0.01)]
+    assert near[0] == SAME_M
+    assert near[1] == pytest.approx(NOISES * 0.001, rel=0.1)
+    assert near[2] == ALIKE_M
+    random = np.random.default_rng(0)
+    apart = np.linalg.norm(0.001 * (random.normal(size=(20_000, 6)) - random.normal(size=(20_000, 6))), axis=1)
+    assert 0.998 < (apart < near[1]).mean() < 1.0
+
+
+def test_fine_motion_is_legal_where_the_tracker_can_tell_it_and_only_there() -> None:
+    found = judged([fine(seed, 0.0005) for seed in range(4)])
+    assert (found.unsafe, found.ambiguous) == ((), 0.0)
+    assert found.all.error_mm < 10
+    noisy = judged([fine(seed, 0.003) for seed in range(4)])
+    assert any("contradict others" in text for text in noisy.unsafe)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0005])
+def test_takes_that_go_opposite_ways_are_refused_however_good_the_tracker(noise_m: float) -> None:
+    found = judged([fine(seed, noise_m, way) for seed, way in enumerate((1.0, -1.0, 1.0, -1.0))])
+    assert found.ambiguous > 30
+    assert any("contradict others" in text for text in found.unsafe)
+
+
+def test_takes_whose_hands_are_a_centimetre_off_each_other_contradict_as_well() -> None:
+    """As people's are: farther than the noise, but nothing tells which way the tool goes."""
+    shown, beside = [one.every(8) for one in demonstrated(2)], np.array([0.006, 0.006, 0.006, 0, 0, 0, 0])
+    mirrored = [
+        one._replace(left=one.left + beside, right=one.right + beside, tool=one.tool * [1, -1, 1, 1, 1, 1, 1])
+        for one in shown
+    ]
+    assert same_hands_m(shown) < 0.0145 < ALIKE_M
+    assert any("contradict others" in text for text in judged([*shown, *mirrored]).unsafe)
+
+
+def test_turns_that_go_with_fine_motion_are_legal_and_those_that_go_both_ways_are_not() -> None:
+    assert judged([fine(seed, 0.0005, turned=True) for seed in range(4)]).unsafe == ()
+    both = judged([fine(seed, 0.0005, way, turned=True) for seed, way in enumerate((1.0, -1.0, 1.0, -1.0))])
+    assert any("contradicts itself" in text for text in both.unsafe)

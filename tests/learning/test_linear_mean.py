@@ -1,0 +1,142 @@
+"""A linear mean beneath the primitive: chosen where it predicts clearly better, and as safe."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kmp import KMP, AffineMean, GaussianKernel, Gaussians
+from service.core.frame import Vector
+from service.core.skill.model import standard_deviations
+from service.learning.baselines import left_out, linear
+from service.learning.choice import MAX_GAIN, Choice, ridge, rms
+from service.learning.gate import nonsense
+from service.learning.learn import Evidence, learn
+from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+from service.learning.via_points import adapted
+from support.circling import circling
+from support.paths import RECORDINGS
+from support.taught_scene import HANDOVER
+
+APART_M = 0.15  # the takes, from each other: a constant mean holds the tool back there
+
+
+@pytest.fixture(scope="module")
+def evidence() -> Evidence:
+    seen: list[Evidence] = []
+    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, show=seen.append)
+    return seen[0]
+
+
+@pytest.fixture(scope="module")
+def skill(evidence: Evidence) -> StoredSkill:
+    return evidence.skill
+
+
+@pytest.fixture(scope="module")
+def choice(evidence: Evidence) -> Choice:
+    return Choice.of(evidence.paths, 120)
+
+
+def mean_of(skill: StoredSkill) -> AffineMean:
+    prior = skill.model.primitive.prior_mean
+    assert isinstance(prior, AffineMean)
+    return prior
+
+
+def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant_and_than_by_a_line(
+    evidence: Evidence, choice: Choice
+) -> None:
+    assert mean_of(evidence.skill).matrix.shape == (3, 6)
+    error = rms(np.concatenate([one.errors for one in evidence.held_out]))
+    constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
+    over_constant = [
+        tool - choice.primitive(constant, residuals, without=h).mean(hands)
+        for h, (hands, tool) in enumerate(evidence.paths)
+    ]
+    assert error < 0.010
+    assert error < 0.6 * rms(np.concatenate(over_constant))
+    assert error < 0.75 * rms(np.concatenate(left_out(evidence.paths, linear)))
+
+
+def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without(choice: Choice) -> None:
+    for h in range(5):
+        rest, mine = choice.owner != h, choice.owner == h
+        fitted = KMP.fit(
+            choice.inputs[rest],
+            Gaussians(choice.outputs[rest], np.broadcast_to(np.eye(3), (rest.sum(), 3, 3))),
+            kernel=GaussianKernel(2.0),
+            lambda_mean=0.1,
+            prior_mean=ridge(choice.inputs[rest], choice.outputs[rest]),
+        )
+        expected = choice.outputs[mine] - fitted.mean(choice.inputs[mine])
+        np.testing.assert_allclose(choice.residuals(2.0, 0.1, is_linear=True)[mine], expected, atol=1e-9)
+
+
+def test_off_the_data_it_is_refused_as_over_a_constant(skill: StoredSkill, choice: Choice, evidence: Evidence) -> None:
+    """Where the mean extrapolates, the gate holds; and no less than with the constant mean."""
+    some = np.concatenate([hands[::20] for hands, _ in evidence.paths])
+    for beside_m in (1.0, 2.0, 5.0):
+        assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
+        assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
+    found = choice.parameters()
+    constant = choice.primitive(found, choice.residuals(found.ell, found.noise))
+
+    def rises(primitive: KMP, hands: Vector) -> Vector:
+        return standard_deviations(primitive.predict(hands).covariance) / np.quantile(
+            standard_deviations(primitive.predict(some).covariance), 0.98
+        )
+
+    for wrong in nonsense(some[::3]):
+        over_linear, over_constant = (rises(one, wrong) for one in (skill.model.primitive, constant))
+        assert (over_linear > 1.0).mean() > (over_constant > 1.0).mean() - 0.05
+
+
+def test_it_moves_the_tool_no_farther_than_between_via_points_whatever_was_shown(skill: StoredSkill) -> None:
+    assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
+    random = np.random.default_rng(0)
+    hands = random.normal(scale=0.1, size=(200, 6))
+    steep = ridge(hands, hands @ random.normal(scale=20.0, size=(6, 3)))
+    assert np.linalg.norm(steep.matrix, 2) == pytest.approx(MAX_GAIN)
+    trembling = ridge(hands * [1, 1, 1, 0.01, 0.01, 0.01], hands[:, :3] + 3 * hands[:, 3:] * 0.01)
+    assert np.abs(trembling.matrix[:, 3:]).max() < 0.2  # a hand that moved by 1 mm tells nothing
+
+
+def test_via_points_are_met_and_contradictions_refused_over_it(skill: StoredSkill) -> None:
+    point = HANDOVER
+    taught = adapted(skill, [point], tolerance=0.05)
+    hands = np.array([[*point.left, *point.right]])
+    np.testing.assert_allclose(taught.mean(hands)[0], point.tool, atol=2e-3)
+    np.testing.assert_array_equal(mean_of(taught).matrix, mean_of(skill).matrix)
+
+
+def test_it_is_stored_and_served_as_it_was_learned(skill: StoredSkill) -> None:
+    again = decoded(skill.file, origin="a file")
+    hands = skill.hands[::10] + 0.01
+    np.testing.assert_array_equal(again.mean(hands), skill.mean(hands))
+    step, velocity = 1e-4, np.random.default_rng(0).normal(size=(2, 3))
+    for at in hands:
+        found = again.predict(at.reshape(2, 3), velocity, np.zeros((2, 3)))
+        np.testing.assert_allclose(found.position, skill.mean(at[None])[0], atol=2e-6)
+        ahead, behind = skill.mean(np.stack([at + step * velocity.ravel(), at - step * velocity.ravel()]))
+        np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * step), atol=1e-4)
+
+
+def test_a_task_between_places_has_none() -> None:
+    shipped = decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="shipped")
+    primitive = shipped.model.primitive
+    width, outputs = primitive.inputs.shape[1], primitive.outputs
+    sloped = KMP.fit(
+        primitive.inputs,
+        primitive.reference,
+        kernel=primitive.kernel,
+        lambda_mean=1.0,
+        representation="dense",
+        prior_mean=AffineMean(np.zeros((outputs, width)), np.zeros(outputs)),
+    )
+    model = replace(shipped.model, primitive=sloped)  # type: ignore[type-var]
+    file = with_file(replace(shipped, model=model)).file
+    with pytest.raises(SkillError, match="prior_mean goes with the inputs"):
+        decoded(file, origin="a file")

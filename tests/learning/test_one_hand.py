@@ -1,0 +1,126 @@
+"""A task that one hand conducts: taken, learned and served without the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.contract.records import Mode, Reason
+from service.contract.requests import ViaPoint
+from service.core.controller import Controller
+from service.core.frame import Tick
+from service.demonstrations.demonstration_files import summary
+from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
+from service.learning.demonstration import Conducts, Demonstration
+from service.learning.judgement import Figures
+from service.learning.learn import learn
+from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.via_points import adapted
+from support.circling import circling
+from support.in_process import ASSUMED, frames, hand
+from support.wam import URDF
+
+AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
+FAR = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
+
+
+def led(seed: int, who: Conducts = "left") -> Demonstration:
+    """A take in which the tool goes with one hand."""
+    one = circling(seed, apart_m=0.03)
+    tool = one.tool.copy()
+    off = 0.005 * np.random.default_rng(seed).normal(size=3)  # as people are
+    tool[:, :3] = one.left[:, :3] * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25] + off
+    return one._replace(right=one.left, tool=tool, conducts=who)
+
+
+@pytest.fixture(scope="module", params=["left", "right"])
+def skill(request: pytest.FixtureRequest) -> StoredSkill:
+    return learn([led(seed, request.param) for seed in range(4)], points=100)
+
+
+def conducting(skill: StoredSkill, at: tuple[float, ...], other: tuple[float, ...]) -> np.ndarray:
+    assert skill.conductor is not None
+    return np.concatenate([at, other] if skill.conductor == 0 else [other, at])
+
+
+def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: Path) -> None:
+    for who in ("left", "right"):
+        write_demonstration(tmp_path / f"{who}.mcap", led(0, who))  # type: ignore[arg-type]
+        said: list[str] = []
+        got = read_demonstration(tmp_path / f"{who}.mcap", say=said.append)
+        assert got.conducts == who
+        np.testing.assert_array_equal(got.hands, led(0).hands)
+        np.testing.assert_array_equal(got.tool, led(0).tool)
+        assert f"the {who} hand conducts alone" in said[0]
+        assert [one.name for one in summary(tmp_path / f"{who}.mcap").streams] == [who, "tool"]
+
+
+def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(skill: StoredSkill) -> None:
+    found = msgspec.json.decode(skill.figures, type=Figures)
+    assert found.unsafe == ()
+    assert found.all.error_mm < min(found.all.other_mm.values())
+    assert found.beside > 80
+    again, still = decoded(skill.file, origin="a file"), np.zeros((2, 3))
+    assert again.conductor == skill.conductor
+    told = []
+    for other in ((0.5, -0.2, 0.3), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0)):
+        at = conducting(skill, AT, other)
+        moving = np.stack([[0.1, 0.0, 0.0], [3.0, 3.0, 3.0]])[:: 1 if skill.conductor == 0 else -1]
+        found_there = again.predict(at.reshape(2, 3), moving, still)
+        told.append(np.concatenate([*found_there[:3], found_there.covariance.ravel(), again.mean(at[None])[0]]))
+    np.testing.assert_array_equal(told, [told[0]] * 3)
+    assert np.linalg.norm(told[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25])) < 0.02
+    off = again.predict(conducting(skill, (1.1, 0.2, 0.3), AT).reshape(2, 3), still, still)
+    assert off.gate_m > skill.threshold
+
+
+def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: StoredSkill) -> None:
+    hands = conducting(skill, AT, (2.0, 2.0, 2.0))
+    near = np.array(AT) * [0.8, 0.8, 0.5] + [0.12, 0.05, 0.25]
+    point = ViaPoint("there", tuple(hands[:3].tolist()), tuple(hands[3:].tolist()), tuple(near.tolist()))
+    taught = adapted(skill, [point], tolerance=0.05)
+    for other in ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0)):
+        np.testing.assert_allclose(taught.mean(conducting(skill, AT, other)[None])[0], near, atol=2e-3)
+    beside = conducting(skill, AT, (-2.0, 2.0, 2.0))
+    other = msgspec.structs.replace(
+        point, name="twin", left=tuple(beside[:3].tolist()), right=tuple(beside[3:].tolist()), tool=(0.2, 0, 0.5)
+    )
+    with pytest.raises(SkillError, match="contradict each other"):
+        adapted(skill, [point, other], tolerance=0.05)
+
+
+def test_takes_of_different_hands_are_not_mixed() -> None:
+    with pytest.raises(SkillError, match="conducted by different hands: both, left"):
+        learn([led(0), circling(1)])
+
+
+def modes(skill: StoredSkill, other_from: int, other_to: int, one_to: int = 10_000) -> list[tuple[int, int]]:
+    """Mode and reason of each tick, the other hand seen for some, the one until another."""
+    one, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
+    ticks = []
+    for k in range(1200):
+        events = [hand(one, AT, k + 1)] if k % 5 == 0 and k < one_to else []
+        events += [hand(other, FAR, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
+        ticks.append(Tick(k, tuple(events)))
+    seen = frames(Controller(ASSUMED, skill, urdf=URDF), ticks)
+    return list(zip(seen["mode"].tolist(), seen["reason"].tolist(), strict=True))
+
+
+def test_it_is_served_without_a_hand_that_never_was_seen_and_never_without_one_that_was(skill: StoredSkill) -> None:
+    follow = (Mode.FOLLOW, Reason.NONE)
+    assert set(modes(skill, 0, 0)[5:]) == {follow}
+    lost = modes(skill, 300, 600)
+    assert set(lost[10:640]) == {follow}  # and both are seen
+    assert set(lost[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    assert set(modes(skill, 0, 0, one_to=600)[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    assert set(modes(skill, 0, 1200, one_to=0)) == {(Mode.HOLD, Reason.NO_HANDS)}
+
+
+def test_a_skill_of_both_hands_waits_for_both_as_ever() -> None:
+    both = learn([circling(seed, apart_m=0.03) for seed in range(3)], points=80)
+    assert both.conductor is None
+    ticks = [Tick(k, (hand("left", AT, k + 1),) if k % 5 == 0 else ()) for k in range(300)]
+    assert set(frames(Controller(ASSUMED, both, urdf=URDF), ticks)["reason"].tolist()) == {Reason.NO_HANDS}
