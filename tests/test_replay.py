@@ -43,7 +43,7 @@ def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
 
 
-@pytest.mark.timeout(500)
+@pytest.mark.timeout(500)  # it compiles all anew
 def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units() -> None:
     done = command(str(GOLDEN), "--exact", NUMBA_CPU_NAME="generic", timeout_s=480)
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout

@@ -10,7 +10,7 @@ import pytest
 
 from service.recording.replay import replay
 from service.timing import loads, soak
-from support.cell import thirdhand
+from support.cell import thirdhand, told
 
 pytestmark = pytest.mark.timeout(180)
 QUIET = {"say": lambda line: None}
@@ -66,6 +66,6 @@ def test_soak_reports_each_process() -> None:
 @pytest.mark.parametrize("rate", ["49", "1001", "fast"])
 @pytest.mark.parametrize("command", ["demo", "bench", "serve"])
 def test_a_rate_out_of_range_is_bad_usage(command: str, rate: str) -> None:
-    done = thirdhand(command, "--rate", rate)
+    done = told(command, "--rate", rate)
     assert done.returncode == 2
     assert f"{rate} given, 50 to 1000 Hz needed" in done.stderr

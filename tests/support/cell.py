@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -14,6 +16,7 @@ from typing import Any
 
 import zenoh
 
+from service.cli.main import main
 from service.client import Client, open_session
 from service.contract import cdr, messages
 from service.launch import Launched, launched
@@ -26,6 +29,19 @@ def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.C
     """A `thirdhand` command, run to its end."""
     command = [sys.executable, "-m", "service", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more)
+
+
+def told(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A `thirdhand` command, run to its end in this process, which has imported all it needs."""
+    out, errors, mask = io.StringIO(), io.StringIO(), os.umask(0o022)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            code = main(list(arguments))
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        finally:
+            os.umask(mask)  # `serve` sets its own
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), errors.getvalue())
 
 
 class Daemon:

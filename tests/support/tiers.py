@@ -15,6 +15,7 @@ RESEARCH = (
     "sim/test_experiments.py::TestExperiments",
     "sim/test_faults.py",
     "sim/test_people.py::test_a_reduced_comparison_keeps_the_order_that_is_stable",
+    "test_replay.py::test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units",
 )
 SLOW = (  # the longest first: so they begin first
     "daemon/test_survival.py",
