@@ -49,7 +49,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     what was recorded replays identically.
     """
     records = tmp_path / "records"
-    with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
+    with serving(tmp_path, "--arm", "assumed", "--record", str(records), drawn=True) as daemon:
         daemon.until(lambda s: (s["mode"], s["reason"]) == ("hold", "no_hands"))
         commands = daemon.session.declare_subscriber("thirdhand/joints/command", FifoChannel(100))
         with Tracker(daemon.session) as tracker:

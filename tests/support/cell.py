@@ -62,9 +62,9 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]:
+def serving(folder: Path, *arguments: str, before: str = "", drawn: bool = False) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
-    process runs that Python.
+    process runs that Python. What it records is `drawn` only where that is looked at.
     """
     program = (
         ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
@@ -72,7 +72,7 @@ def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]
         else ("-m", "service")
     )
     with (
-        launched(folder, *arguments, program=program) as service,
+        launched(folder, *arguments, program=program, rerun=drawn) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         yield Daemon(service, session)
