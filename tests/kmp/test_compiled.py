@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -28,6 +31,41 @@ def test_sums_keep_their_order_and_products_are_rounded(seed):
     left, right = random.normal(size=(2, 1001)) * 10.0 ** random.integers(-8, 9, (2, 1001))
     assert compiled(total)(left, right) == total(left, right)
     assert numba.njit(fastmath=True)(total)(left, right) != total(left, right)
+
+
+OPERATIONS = """
+import math
+import numpy as np
+from kmp.compiled import compiled
+
+def operations(a, b, m, out):
+    for k in range(len(a)):
+        x, y = a[k], b[k]
+        out[k] = math.exp(-x * x) + math.sqrt(x * x + y * y) * math.sin(x) - math.atan2(y, x) * math.cos(y)
+        out[k] += x**3 * math.log(1.0 + abs(y)) + abs(x) ** 1.7 + math.acos(abs(x) / (1.0 + abs(x)))
+    for i in range(len(m)):
+        for j in range(len(m)):
+            out[0] += m[i, j] * a[i] * b[j]
+    out[1] += np.sum(a * b) + np.dot(a, b) + (m @ m).sum() + a.max()
+
+random = np.random.default_rng(1)
+a, b = random.normal(size=(2, 1000))
+out = np.zeros(1000)
+compiled(operations)(a, b, random.normal(size=(20, 20)), out)
+print(out.tobytes().hex())
+"""
+
+
+def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
+    """Not rounded: the golden session, whose states are, is replayed so at length."""
+    here = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
+    command = [sys.executable, "-c", OPERATIONS]
+    native, generic = (
+        subprocess.run(command, env=here | more, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for more in ({}, {"NUMBA_CPU_NAME": "generic"})
+    )
+    assert len(native) > 1000
+    assert native == generic
 
 
 def test_nothing_is_compiled_otherwise():

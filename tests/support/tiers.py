@@ -43,6 +43,7 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_report_command.py",
     "test_examples.py",
     "kmp/test_distribution.py",
+    "kmp/test_compiled.py",
     "test_site.py",
     "test_wheel.py",
     "core/test_invariant.py",
