@@ -110,8 +110,12 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 
 
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
+    """One that has no folder for its lock, and is served all the same."""
+    (tmp_path / "state").write_text("a file where a folder is needed")
     with serving(tmp_path, "--arm", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
         started = children(daemon.process.pid)
+        daemon.until(lambda status: status["tick"] > 0)
+        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
         (tmp_path / "step").write_text("always")
         assert daemon.process.wait(20) == 1
         assert "step is sabotaged" in daemon.log.read_text()
@@ -206,13 +210,6 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
-def test_a_cell_without_a_folder_for_its_lock_is_served_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "state").write_text("a file where a folder is needed")
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        daemon.until(lambda status: status["tick"] > 0)
-        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
-
-
 def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
     go = tmp_path / "go"
     before = (
@@ -233,19 +230,34 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
         assert "starting" not in told("status", "--connect", daemon.endpoint).stdout
 
 
-def test_no_child_outlives_a_daemon_that_is_killed(tmp_path: Path) -> None:
+def test_a_workshop_killed_at_work_leaves_all_as_it_was_and_a_killed_daemon_no_child(tmp_path: Path) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
-        started = children(daemon.process.pid)
-        assert len(started) == 2
-        skill_worker = next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+
+        def skill_worker() -> int:
+            started = children(daemon.process.pid)
+            assert len(started) == 2
+            return next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+
+        taught, first = teach(daemon, 3), skill_worker()
+        os.kill(first, signal.SIGSTOP)
+        killing = threading.Timer(0.3, os.kill, [first, signal.SIGKILL])
+        killing.start()
+        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
+            teach(daemon, 5)
+        killing.join()
+        assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
+        assert len(teach(daemon, 5)) == 5
+
+        busy, started = skill_worker(), children(daemon.process.pid)
+        assert busy != first
         daemon.until(lambda status: status["tick"] > 600)
-        os.kill(skill_worker, signal.SIGSTOP)  # it is busy, and hears of nothing
+        os.kill(busy, signal.SIGSTOP)  # it hears of nothing
         daemon.process.kill()
         daemon.process.wait()
-        assert gone([pid for pid in started if pid != skill_worker], 20)
-        os.kill(skill_worker, signal.SIGCONT)
-        assert gone([skill_worker], 10)
+        assert gone([pid for pid in started if pid != busy], 20)
+        os.kill(busy, signal.SIGCONT)
+        assert gone([busy], 10)
     (recording,) = records.glob("*.mcap")
     assert replay(recording).exact
 
@@ -272,21 +284,6 @@ def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     running.wait()
     running.stdout.close()
     assert gone([busy], 5)
-
-
-def test_a_workshop_killed_at_work_leaves_all_as_it_was(tmp_path: Path) -> None:
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        taught = teach(daemon, 3)
-        (skill_worker,) = children(daemon.process.pid)
-        os.kill(skill_worker, signal.SIGSTOP)
-        killing = threading.Timer(0.3, os.kill, [skill_worker, signal.SIGKILL])
-        killing.start()
-        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
-            teach(daemon, 5)
-        killing.join()
-        assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
-        assert len(teach(daemon, 5)) == 5
-        assert daemon.end() == 0
 
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
