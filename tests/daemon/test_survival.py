@@ -230,7 +230,7 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
         assert "starting" not in told("status", "--connect", daemon.endpoint).stdout
 
 
-def test_a_workshop_killed_at_work_leaves_all_as_it_was_and_a_killed_daemon_no_child(tmp_path: Path) -> None:
+def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
 
