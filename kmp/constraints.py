@@ -13,7 +13,6 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from kmp.checks import Array, numbers
 from kmp.database import Changes, Database
@@ -170,6 +169,8 @@ def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
     scaled = stiffness / np.outer(size, size)
     values, vectors = np.linalg.eigh(scaled)
     root = np.sqrt(np.maximum(values, _RIDGE * values[-1]))
+    from scipy.optimize import nnls  # its import takes a quarter of a second
+
     found = nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[0] / size
     for _ in range(_ROUNDS):
         left = slack(found)

@@ -22,6 +22,7 @@ from service.recording.replay import replay
 from sim.golden import refresh
 from sim.scene import Scene
 from sim.script import HandScript
+from support.cell import told
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS
 from support.wam import URDF
@@ -43,7 +44,7 @@ def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
 
 
-@pytest.mark.timeout(500)
+@pytest.mark.timeout(500)  # it compiles all anew
 def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units() -> None:
     done = command(str(GOLDEN), "--exact", NUMBA_CPU_NAME="generic", timeout_s=480)
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
@@ -104,8 +105,8 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
     assert not result.exact
     assert result.within_tolerance
     assert "first difference at tick 600: joints by 1e-09" in result.text()
-    assert command(str(path)).returncode == 0
-    exact = command(str(path), "--exact")
+    assert told("replay", str(path)).returncode == 0
+    exact = told("replay", str(path), "--exact")
     assert exact.returncode == 1
     assert "first difference at tick 600" in exact.stdout
 
@@ -145,7 +146,7 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
     (gap,) = result.missing
     assert gap.resumed in (500, 750, 1000)
     assert f"gap after tick {gap.after}, before tick {gap.before}: damage at byte" in result.text()
-    exact = command(str(path), "--exact")
+    exact = told("replay", str(path), "--exact")
     assert (exact.returncode, "checksum" in exact.stdout or "damage" in exact.stdout) == (1, True)
 
 
@@ -169,9 +170,9 @@ def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_pat
 
 
 def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
-    done = command(str(RECORDINGS / "demonstration-1.mcap"))
+    done = told("replay", str(RECORDINGS / "demonstration-1.mcap"))
     assert done.returncode == 1
     assert "not a recording of thirdhand" in done.stderr
-    done = command(str(tmp_path / "missing.mcap"))
+    done = told("replay", str(tmp_path / "missing.mcap"))
     assert done.returncode == 1
     assert "missing.mcap" in done.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -11,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.main import GROUPS, main
+from service.cli.main import GROUPS
 from service.launch import free_port
-from support.cell import thirdhand
+from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
 
 COMMANDS = [name for names in GROUPS.values() for name in names]
@@ -21,30 +22,20 @@ RENAMED = ("--out", "--duration", "--json FILE", "--soak MIN")
 NOBODY = ("--connect", "tcp/127.0.0.1:1")
 
 
-def told(*arguments: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    """Exit code, and what was printed."""
-    try:
-        code = main(list(arguments))
-    except SystemExit as ended:
-        code = int(ended.code or 0)
-    printed = capsys.readouterr()
-    return code, printed.out + printed.err
-
-
-def test_help_lists_each_command_in_one_group(capsys: pytest.CaptureFixture[str]) -> None:
-    _, text = told("--help", capsys=capsys)
+def test_help_lists_each_command_in_one_group() -> None:
+    text = told("--help").stdout
     titles = re.findall(r"^([a-z ]+):$", text, re.MULTILINE)
     assert titles == list(GROUPS)
     assert re.findall(r"^  ([a-z-]+)\s", text, re.MULTILINE) == COMMANDS
     assert len(set(COMMANDS)) == len(COMMANDS)
-    _, refused = told("nonsense", capsys=capsys)
+    refused = told("nonsense").stderr
     assert set(re.findall(r"[a-z-]+", refused.partition("choose from")[2])) >= set(COMMANDS)
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "sim"])
-def test_one_thing_has_one_word(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, text = told(command, "--help", capsys=capsys)
-    assert code == 0
+def test_one_thing_has_one_word_and_an_example(command: str) -> None:
+    done = told(command, "--help")
+    assert (done.returncode, "example:" in (text := done.stdout)) == (0, True)
     assert not [word for word in RENAMED if re.search(rf"{word}\b", text)]
     assert "python -m sim " not in text
 
@@ -70,24 +61,24 @@ def test_the_bench_goes_by_its_own_name() -> None:
 )
 @pytest.mark.parametrize("command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")])
 def test_an_endpoint_without_all_its_parts_is_told_with_what_was_meant(
-    given: str, meant: str, command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+    given: str, meant: str, command: tuple[str, ...]
 ) -> None:
-    code, text = told(*command, given, capsys=capsys)
-    assert (code, text.rstrip().endswith(f": {meant} ?")) == (2, True), text
+    done = told(*command, given)
+    assert (done.returncode, done.stderr.rstrip().endswith(f": {meant} ?")) == (2, True), done.stderr
 
 
-def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text('[network]\nlisten = ["127.0.0.1:1"]\n')
-    code, text = told("serve", "--config", str(tmp_path / "cell.toml"), capsys=capsys)
-    assert (code, "$.network.listen[0]" in text, "tcp/127.0.0.1:1 ?" in text) == (2, True, True), text
+    done = told("serve", "--config", str(tmp_path / "cell.toml"))
+    assert done.returncode == 2
+    assert "$.network.listen[0]" in done.stderr
+    assert "tcp/127.0.0.1:1 ?" in done.stderr
 
 
 # --- exit codes, as docs/incidents.md promises them -----------------------------------------------
 
 
-def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(tmp_path: Path) -> None:
     config, demonstration = tmp_path / "cell.toml", str(RECORDINGS / "demonstration-1.mcap")
     config.write_text("rate_hz = 3\n")
     missing = str(tmp_path / "none.toml")
@@ -97,45 +88,61 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         ("learn", demonstration, "--output", str(tmp_path / "skill.npz")),
     ):
         for path, expected in ((str(config), 2), (missing, 1)):
-            code, text = told(*command, "--config", path, capsys=capsys)
-            assert (code, path in text) == (expected, True), text
+            done = told(*command, "--config", path)
+            assert (done.returncode, path in done.stderr) == (expected, True), done.stderr
 
 
 @pytest.mark.parametrize(
-    ("code", "arguments"),
+    ("code", "words", "arguments"),
     [
-        (0, ("--version",)),
-        (0, ("record", "--list", "--folder", "nowhere")),
-        (1, ("status", *NOBODY)),
-        (1, ("doctor", *NOBODY)),
-        (1, ("cells", *NOBODY)),
-        (1, ("hold", *NOBODY)),
-        (1, ("play", str(RECORDINGS / "demonstration-6.mcap"), *NOBODY)),
-        (1, ("replay", "nowhere.mcap")),
-        (1, ("report", "nowhere.mcap")),
-        (1, ("view", "nowhere.mcap")),
-        (1, ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
-        (1, ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
-        (2, ()),
-        (2, ("status", "--cell", "*")),
-        (2, ("serve", "--cell", "*")),
-        (2, ("hold", "--cell", "")),
-        (2, ("record",)),
-        (2, ("bench", "--seconds", "-1")),
-        (2, ("demo", "--rate", "3")),
-        (2, ("via-points", "add", "here", *NOBODY)),
-        (2, ("view", "live", "--time", "-1", *NOBODY)),
+        (0, "", ("record", "--list", "--folder", "nowhere")),
+        (1, "is a daemon running", ("status", *NOBODY)),
+        (1, "", ("doctor", *NOBODY)),
+        (1, "", ("cells", *NOBODY)),
+        (1, "is a daemon running", ("hold", *NOBODY)),
+        (1, "", ("play", str(RECORDINGS / "demonstration-6.mcap"), *NOBODY)),
+        *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
+        (1, "nowhere.rrd", ("view", "nowhere.rrd")),
+        (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
+        (1, "no such user's folder", ("status", "--certificate", "~nobody-of-this-name/x")),
+        (2, "--cell: $.cell", ("status", "--cell", "*")),
+        (2, "$.cell: ", ("serve", "--cell", "*")),
+        (2, "--cell: $.cell", ("hold", "--cell", "")),
+        (2, "--cell: $.cell", ("play", "nowhere.mcap", "--cell", "**")),
+        (2, "", ("record",)),
+        (2, "", ("bench", "--seconds", "-1")),
+        *((2, "50 to 1000 Hz", ("serve", "--rate", rate)) for rate in ("7", "5OO")),
+        (2, "needed", ("via-points", "add")),
+        (2, "", ("via-points", "add", "here", *NOBODY)),
+        (2, "", ("view", "live", "--time", "-1", *NOBODY)),
+        (2, "invalid choice", ("serve", "--arm", "left")),
+        (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
+        (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
     ],
 )
 def test_exit_codes_are_as_promised(
-    code: int, arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    code: int, words: str, arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("HOME", str(tmp_path))
-    done = thirdhand(*arguments)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
+    done = told(*arguments)
+    assert (done.returncode, words in done.stderr) == (code, True), done.stderr
     assert not code or done.stderr.strip() or done.stdout.startswith("wrong ")
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "arguments"),
+    [
+        (0, "thirdhand 0.", ("--version",)),
+        (1, "nowhere.mcap", ("replay", "nowhere.mcap")),
+        (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
+        (2, "COMMAND", ()),
+    ],
+)
+def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, ...], tmp_path: Path) -> None:
+    done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
+    assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
+    assert words in (done.stderr if code else done.stdout)
+    assert "Traceback" not in done.stderr
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:
@@ -176,7 +183,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 def test_a_shell_completes_commands_options_and_choices(words: str, found: set[str], tmp_path: Path) -> None:
     pytest.importorskip("shtab", reason="shtab, which writes the shells' scripts, is not installed")
     script = tmp_path / "thirdhand"
-    done = thirdhand("completion", "bash")
+    done = told("completion", "bash")
     assert done.returncode == 0, done.stderr
     script.write_text(done.stdout)
     program = BASH.format(words=words, last=len(words.split()) - 1)

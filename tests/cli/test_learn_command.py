@@ -1,4 +1,4 @@
-"""`thirdhand learn` as a process: table, file and picture; exit 1 and no file where unsafe."""
+"""`thirdhand learn`: table, file and picture; exit 1 and no file where unsafe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.learning.judgement import Figures
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations
-from support.cell import thirdhand
+from support.cell import thirdhand, told
 from support.paths import RECORDINGS
 
 
@@ -40,7 +40,7 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
 def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
     people = sorted((RECORDINGS / "people").glob("*.mcap"))[:4]
     out = tmp_path / "skill.npz"
-    done = thirdhand("learn", *map(str, people), "--output", str(out), "--points", "80")
+    done = told("learn", *map(str, people), "--output", str(out), "--points", "80")
     assert done.returncode == 0, done.stderr
     head, *lines = done.stdout.splitlines()
     assert head.endswith("held   without places   linear   look-up")
@@ -57,7 +57,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     mirrored = one.tool * np.array([1, -1, 1, 1, 1, 1, 1])
     write_demonstration(tmp_path / "mirrored.mcap", one._replace(tool=mirrored))
     out = tmp_path / "skill.npz"
-    done = thirdhand("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out), "--points", "80")
+    done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out), "--points", "80")
     assert done.returncode == 1
     assert "is not written: " in done.stderr
     assert "contradict others" in done.stderr
@@ -66,6 +66,6 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
 
 
 def test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read(tmp_path: Path) -> None:
-    done = thirdhand("learn", "no-such.mcap", "--output", str(tmp_path / "missing" / "skill.npz"))
+    done = told("learn", "no-such.mcap", "--output", str(tmp_path / "missing" / "skill.npz"))
     assert done.returncode == 2
     assert "there is no folder" in done.stderr

@@ -48,8 +48,11 @@ class Page:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A page beside a daemon that has a live view and sees two hands."""
-    with serving(tmp_path_factory.mktemp("cell"), "--arm", "assumed", "--live", "0") as daemon, Tracker(daemon.session):
+    """A page beside a daemon that has a live view and sees two hands; slow, for both are drawn
+    tick by tick.
+    """
+    arguments = ("--arm", "assumed", "--live", "0", "--rate", "100")
+    with serving(tmp_path_factory.mktemp("cell"), *arguments) as daemon, Tracker(daemon.session):
         daemon.until(lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S)
         command = [sys.executable, "-m", "service", "view", "live", "--web", "--connect", daemon.endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:

@@ -30,7 +30,7 @@ from service.core.skill.skill import Skill
 from service.daemon.status import MeasuredArm
 from service.recording.recording import Recording
 from service.recording.replay import replay
-from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand
+from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
 from support.in_process import arm
 from support.paths import RECORDINGS, ROOT
 from support.wam import JOINT_NAMES
@@ -49,7 +49,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     what was recorded replays identically.
     """
     records = tmp_path / "records"
-    with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
+    with serving(tmp_path, "--arm", "assumed", "--record", str(records), drawn=True) as daemon:
         daemon.until(lambda s: (s["mode"], s["reason"]) == ("hold", "no_hands"))
         commands = daemon.session.declare_subscriber("thirdhand/joints/command", FifoChannel(100))
         with Tracker(daemon.session) as tracker:
@@ -99,6 +99,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
 
 
 def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
+    """After the daemon has ended, and after it was killed: its lock keeps nobody out either."""
     with serving(tmp_path, "--arm", "assumed") as daemon:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
@@ -181,29 +182,28 @@ def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> N
     shared_daemon.client.ask("via_points", {"op": "clear"})
 
 
-def test_the_commands_of_a_client(shared_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     at = ("--connect", shared_daemon.endpoint)
     assert thirdhand("hold", *at).returncode == 0
-    status = thirdhand("status", *at)
+    status = told("status", *at)
     assert status.returncode == 0
     assert "hold (operator)" in status.stdout or "hold (no_hands)" in status.stdout
-    assert "resume in force since tick" in thirdhand("resume", *at).stdout
-    reset = thirdhand("reset", *at)
+    assert "resume in force since tick" in told("resume", *at).stdout
+    reset = told("reset", *at)
     assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
     place = ("--left", ".62", "-.28", ".3", "--right", ".98", ".32", ".06", "--tool", ".62", "-.28", ".3")
-    added = thirdhand("via-points", "add", "my place", *place, *at)
+    added = told("via-points", "add", "my place", *place, *at)
     assert added.returncode == 0, added.stderr
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
-    capsys.readouterr()
-    assert main(["via-points", "add", "my place", *place, *at]) == 0
-    assert "replaced, as there was one of this name: my place\n" in capsys.readouterr().out
-    assert "1 via-point in force" in thirdhand("via-points", "list", *at).stdout
-    refused = thirdhand("via-points", "remove", "other", *at)
+    again = told("via-points", "add", "my place", *place, *at)
+    assert (again.returncode, again.stdout.endswith("replaced, as there was one of this name: my place\n")) == (0, True)
+    assert "1 via-point in force" in told("via-points", "list", *at).stdout
+    refused = told("via-points", "remove", "other", *at)
     assert refused.returncode == 1
     assert "There are: my place" in refused.stderr
-    assert thirdhand("via-points", "clear", *at).returncode == 0
-    carried = json.loads(thirdhand("status", "--json", *at).stdout)
+    assert told("via-points", "clear", *at).returncode == 0
+    carried = json.loads(told("status", "--json", *at).stdout)
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
 
 
@@ -247,9 +247,8 @@ def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill:
 
 
 def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
-    played = thirdhand(
-        "play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "10", "--connect", shared_daemon.endpoint
-    )
+    demonstration = str(RECORDINGS / "demonstration-6.mcap")
+    played = told("play", demonstration, "--speed", "10", "--connect", shared_daemon.endpoint)
     assert played.returncode == 0, played.stderr
     status = shared_daemon.client.status()
     assert set(status.hand_age_ms) == {"left", "right"}
@@ -266,69 +265,6 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
         done = thirdhand("serve", "--listen", at, "--arm", "assumed", env=os.environ | {"HOME": str(tmp_path)})
     assert done.returncode == 1
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
-
-
-def test_the_version_is_told() -> None:
-    done = thirdhand("--version")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("thirdhand 0.")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("serve", "--rate", "7"), 2, "50 to 1000 Hz"),
-        (("serve", "--config", "missing.toml"), 1, "missing.toml"),
-        (("serve", "--skill", "missing.npz"), 1, "missing.npz"),
-        (("serve", "--arm", "left"), 2, "invalid choice"),
-        (("serve", "--connect", "tcp/10.0.0.1:7447"), 2, "allow_insecure = true needed"),
-        (("serve", "--rate", "5OO"), 2, "50 to 1000 Hz"),
-        (("status", "--rate", "500"), 2, "unrecognized arguments: --rate 500"),
-        (("stauts",), 2, "; did you mean status?"),
-        (("status", "--connect", "tcp/127.0.0.1:9"), 1, "is a daemon running"),
-        (("learn", "missing.mcap", "--output", "x.npz"), 1, "missing.mcap"),
-        (("view", "missing.rrd"), 1, "missing.rrd"),
-        (("via-points", "add"), 2, "needed"),
-        (("play", "missing.mcap"), 1, "missing.mcap"),
-        (("play", "missing.mcap", "--cell", "**"), 2, "--cell: $.cell"),
-        (("hold", "--cell", ""), 2, "--cell: $.cell"),
-        (("status", "--certificate", "~nobody-of-this-name/x"), 1, "no such user's folder"),
-        ((), 2, "COMMAND"),
-    ],
-)
-def test_bad_usage_and_failures_are_told_on_standard_error(
-    tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
-) -> None:
-    done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
-    assert done.returncode == code, done.stderr
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "demo",
-        "serve",
-        "play",
-        "replay",
-        "learn",
-        "via-points",
-        "status",
-        "doctor",
-        "hold",
-        "resume",
-        "reset",
-        "cells",
-        "record",
-        "view",
-        "certificates",
-    ],
-)
-def test_every_command_has_help_with_an_example(name: str) -> None:
-    done = thirdhand(name, "--help")
-    assert done.returncode == 0
-    assert "example:" in done.stdout
 
 
 def test_the_client_on_the_page_of_the_wire_works(shared_daemon: Any) -> None:

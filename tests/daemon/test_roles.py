@@ -25,7 +25,7 @@ from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.single_instance import BOUNDS
 from service.launch import launched
-from support.cell import LEFT, Tracker, thirdhand
+from support.cell import LEFT, Tracker, thirdhand, told
 
 CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", "objects")
@@ -169,7 +169,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
 def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Path) -> None:
     """Sessions of two trackers and two operators; of each the second was revoked."""
     for role in ("tracker", "operator"):
-        made = thirdhand("certificates", str(secrets), "--role", role)
+        made = told("certificates", str(secrets), "--role", role)
         assert made.returncode == 0, made.stderr
         assert f"{secrets / role}-2: {role}-2, of role {role}; valid until 20" in made.stdout
     full = {key: channels.key(CELL, key) for key in (*INPUTS, *OUTPUTS, *REQUESTS)}
@@ -235,16 +235,16 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
 def test_one_more_certificate_that_cannot_be_is_refused_in_words(
     secrets: Path, arguments: tuple[str, ...], code: int, words: str
 ) -> None:
-    done = thirdhand("certificates", str(secrets), *arguments)
+    done = told("certificates", str(secrets), *arguments)
     assert done.returncode == code
     assert words in done.stderr
-    nowhere = thirdhand("certificates", str(secrets / "none"), "--role", "tracker")
+    nowhere = told("certificates", str(secrets / "none"), "--role", "tracker")
     assert nowhere.returncode == 1
     assert "no authority in" in nowhere.stderr
 
 
 def test_a_name_that_was_given_is_not_given_again_when_its_folder_went_to_its_machine(secrets: Path) -> None:
-    made = [thirdhand("certificates", str(secrets), "--role", "bench") for _ in range(2) if _moved(secrets / "bench-2")]
+    made = [told("certificates", str(secrets), "--role", "bench") for _ in range(2) if _moved(secrets / "bench-2")]
     assert [done.returncode for done in made] == [0, 0]
     assert (secrets / "bench-3").is_dir()
     assert not (secrets / "bench-2").exists()
@@ -257,7 +257,7 @@ def _moved(folder: Path) -> bool:
 
 
 def test_the_daemons_certificate_can_be_made_anew(secrets: Path) -> None:
-    made = thirdhand("certificates", str(secrets), "--role", "daemon", "--name", "daemon-7", "--host", "bench.local")
+    made = told("certificates", str(secrets), "--role", "daemon", "--name", "daemon-7", "--host", "bench.local")
     assert made.returncode == 0, made.stderr
     certificate = x509.load_pem_x509_certificate((secrets / "daemon-7" / "certificate.pem").read_bytes())
     hosts = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -290,7 +290,7 @@ def test_a_certificate_out_of_its_time_is_told_in_words(
 
 
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:
-    assert thirdhand("certificates", str(tmp_path / "own")).returncode == 0
+    assert told("certificates", str(tmp_path / "own")).returncode == 0
     for certificate in (tmp_path / "own" / "operator", None):
         with pytest.raises(UnreachableError, match="nobody answers"):
             open_session(connect=[guarded.endpoint], certificate=certificate, timeout_s=1.0)
@@ -310,7 +310,7 @@ def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
 def test_what_the_command_makes_is_private_and_not_written_over(secrets: Path) -> None:
     for path in itertools.chain([secrets], secrets.rglob("*")):
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
-    again = thirdhand("certificates", str(secrets))
+    again = told("certificates", str(secrets))
     assert again.returncode == 1
     assert "not written over" in again.stderr
 
@@ -324,7 +324,7 @@ def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path
         assert held.returncode == 0, held.stderr
         from_shell = thirdhand("status", *at[:2], env=os.environ | {"THIRDHAND_CERTIFICATE": str(secrets / "operator")})
         assert from_shell.returncode == 0, from_shell.stderr
-        refused = thirdhand("resume", *at, str(secrets / "observer"))
+        refused = told("resume", *at, str(secrets / "observer"))
         assert refused.returncode == 1
         assert "nobody answers" in refused.stderr
         with (

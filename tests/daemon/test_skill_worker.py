@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,14 +23,6 @@ from support.paths import RECORDINGS
 
 PLACES = Scene().via_points()
 SOLDERING = RECORDINGS / "soldering.npz"
-
-
-@pytest.fixture(scope="module")
-def skill_worker() -> Iterator[SkillWorker]:
-    """A skill worker whose process is closed in the end."""
-    running = SkillWorker()
-    yield running
-    running.close()
 
 
 def newest_child() -> int:

@@ -23,7 +23,7 @@ from service.daemon.skill_worker import SkillWorker
 from service.daemon.supervised_thread import supervised
 from service.learning.skill_file import SkillError
 from service.recording.replay import replay
-from support.cell import Daemon, Tracker, serving, thirdhand
+from support.cell import Daemon, Tracker, serving, thirdhand, told
 
 SABOTAGE = """
 import pathlib
@@ -110,8 +110,12 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 
 
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
+    """One that has no folder for its lock, and is served all the same."""
+    (tmp_path / "state").write_text("a file where a folder is needed")
     with serving(tmp_path, "--arm", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
         started = children(daemon.process.pid)
+        daemon.until(lambda status: status["tick"] > 0)
+        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
         (tmp_path / "step").write_text("always")
         assert daemon.process.wait(20) == 1
         assert "step is sabotaged" in daemon.log.read_text()
@@ -132,30 +136,6 @@ def test_watched_work_begins_again_until_it_ends_by_itself() -> None:
     assert told == ["the work failed: ValueError('run 1')", "the work failed: ValueError('run 2')"]
 
 
-def test_nobody_cancels_the_stop_of_a_daemon_that_ends(tmp_path: Path) -> None:
-    """`resume` is asked again and again while it stops: the last command has come to rest."""
-    with serving(tmp_path, "--arm", "assumed") as daemon, Tracker(daemon.session) as tracker:
-        daemon.until(lambda status: status["mode"] == "follow")
-        tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
-        ended = threading.Event()
-
-        def resume() -> None:
-            while not ended.is_set():
-                with contextlib.suppress(UnreachableError, RefusedError):
-                    daemon.client.ask("resume")
-
-        asking = threading.Thread(target=resume)
-        asking.start()
-        time.sleep(0.2)
-        begun = time.monotonic()
-        daemon.process.send_signal(signal.SIGTERM)
-        assert daemon.process.wait(20) == 0
-        assert time.monotonic() - begun < 2.5  # not the time-out of the stop
-        ended.set()
-        asking.join(20)
-        assert "has not come to rest" not in daemon.log.read_text()
-
-
 def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("untouched")
@@ -172,6 +152,7 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]])
 def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: list[int]) -> None:
+    """`resume` is asked all the while: nobody cancels the stop of a daemon that ends."""
     records = tmp_path / "records"
     with (
         serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon,
@@ -179,18 +160,34 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
     ):
         daemon.until(lambda status: status["mode"] == "follow")
         tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
+        ended = threading.Event()
+
+        def resume() -> None:
+            while not ended.is_set():
+                with contextlib.suppress(UnreachableError, RefusedError):
+                    daemon.client.ask("resume")
+
+        asking = threading.Thread(target=resume)
+        asking.start()
         time.sleep(0.2)
         for number in signals:
             daemon.process.send_signal(number)
             time.sleep(0.02)
         assert daemon.process.wait(30) == 0
-        assert "Traceback" not in daemon.log.read_text()
+        ended.set()
+        asking.join(20)
+        said = daemon.log.read_text()
+        assert "Traceback" not in said
+        assert "has not come to rest" not in said  # the time-out of the stop
     (recording,) = records.glob("*.mcap")
     result = replay(recording)
     assert result.exact, result.text()
 
 
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
+    """Nor where Zenoh does not show it the first; a daemon of another cell does. That a cell is
+    free once its daemon has ended or was killed: test_taught_places_survive_a_restart.
+    """
     with serving(tmp_path, "--arm", "assumed") as daemon:
         at = ("serve", "--arm", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
         refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
@@ -198,37 +195,19 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert "cell thirdhand is served already" in refused.stderr
         assert f"listening on {daemon.endpoint}" in refused.stderr
         assert "Traceback" not in refused.stderr
+        unseen = thirdhand("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
+        assert unseen.returncode == 1
+        assert "cell thirdhand is served already on this machine" in unseen.stderr
+        assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in unseen.stderr
+        assert "Traceback" not in unseen.stderr
+        lock = tmp_path / "state" / "thirdhand" / "daemon.lock"
+        assert stat.S_IMODE(lock.stat().st_mode) == 0o600
+        assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
         other = tmp_path / "other"
         other.mkdir()
         with serving(other, "--arm", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
             assert daemon.client.status().cell == "thirdhand"
         assert daemon.end() == 0
-
-
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
-def test_a_second_daemon_does_not_start_where_zenoh_does_not_show_the_first(tmp_path: Path, ending: int) -> None:
-    """Each listens on a port of its own, and neither connects to the other."""
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        again = ("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
-        refused = thirdhand(*again)
-        assert refused.returncode == 1
-        assert "cell thirdhand is served already on this machine" in refused.stderr
-        assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in refused.stderr
-        assert "Traceback" not in refused.stderr
-        lock = tmp_path / "state" / "thirdhand" / "daemon.lock"
-        assert stat.S_IMODE(lock.stat().st_mode) == 0o600
-        assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
-        daemon.process.send_signal(ending)
-        daemon.process.wait(30)
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        assert daemon.end() == 0
-
-
-def test_a_cell_without_a_folder_for_its_lock_is_served_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "state").write_text("a file where a folder is needed")
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        daemon.until(lambda status: status["tick"] > 0)
-        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
 
 
 def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
@@ -239,31 +218,46 @@ def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: P
         "    run(*arguments)\ndaemon.run = late"
     )
     with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
-        told = daemon.client.status()
-        said = thirdhand("status", "--connect", daemon.endpoint)
-        assert (told.tick, told.mode, told.reason, told.remedy) == (-1, "hold", "", "")
-        assert (told.hand_age_ms, told.hand_distance_m) == ({}, 3.0)
+        first = daemon.client.status()
+        said = told("status", "--connect", daemon.endpoint)
+        assert (first.tick, first.mode, first.reason, first.remedy) == (-1, "hold", "", "")
+        assert (first.hand_age_ms, first.hand_distance_m) == ({}, 3.0)
         rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
         assert rows["mode"] == "starting: nothing has been decided yet"
         assert rows.keys() == {"mode", "skill", "listening"}
         go.touch()
         daemon.until(lambda status: status["tick"] >= 0)
-        assert "starting" not in thirdhand("status", "--connect", daemon.endpoint).stdout
+        assert "starting" not in told("status", "--connect", daemon.endpoint).stdout
 
 
-def test_no_child_outlives_a_daemon_that_is_killed(tmp_path: Path) -> None:
+def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
-        started = children(daemon.process.pid)
-        assert len(started) == 2
-        skill_worker = next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+
+        def skill_worker() -> int:
+            started = children(daemon.process.pid)
+            assert len(started) == 2
+            return next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+
+        taught, first = teach(daemon, 3), skill_worker()
+        os.kill(first, signal.SIGSTOP)
+        killing = threading.Timer(0.3, os.kill, [first, signal.SIGKILL])
+        killing.start()
+        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
+            teach(daemon, 5)
+        killing.join()
+        assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
+        assert len(teach(daemon, 5)) == 5
+
+        busy, started = skill_worker(), children(daemon.process.pid)
+        assert busy != first
         daemon.until(lambda status: status["tick"] > 600)
-        os.kill(skill_worker, signal.SIGSTOP)  # it is busy, and hears of nothing
+        os.kill(busy, signal.SIGSTOP)  # it hears of nothing
         daemon.process.kill()
         daemon.process.wait()
-        assert gone([pid for pid in started if pid != skill_worker], 20)
-        os.kill(skill_worker, signal.SIGCONT)
-        assert gone([skill_worker], 10)
+        assert gone([pid for pid in started if pid != busy], 20)
+        os.kill(busy, signal.SIGCONT)
+        assert gone([busy], 10)
     (recording,) = records.glob("*.mcap")
     assert replay(recording).exact
 
@@ -290,21 +284,6 @@ def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     running.wait()
     running.stdout.close()
     assert gone([busy], 5)
-
-
-def test_a_workshop_killed_at_work_leaves_all_as_it_was(tmp_path: Path) -> None:
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        taught = teach(daemon, 3)
-        (skill_worker,) = children(daemon.process.pid)
-        os.kill(skill_worker, signal.SIGSTOP)
-        killing = threading.Timer(0.3, os.kill, [skill_worker, signal.SIGKILL])
-        killing.start()
-        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
-            teach(daemon, 5)
-        killing.join()
-        assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
-        assert len(teach(daemon, 5)) == 5
-        assert daemon.end() == 0
 
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:

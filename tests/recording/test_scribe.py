@@ -25,13 +25,13 @@ from service.recording.recording import Recording
 from service.recording.scribe import Scribe
 from support.recorded import SKILL, at_ns, state_after, tell, ticks
 
-SETTINGS = Settings(cell="hall/bench-1", rate_hz=50)
+SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False))
 
 
 @contextmanager
-def scribe(**where: Any) -> Iterator[Scribe]:
+def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
     """A started scribe that is ended in any case."""
-    one = Scribe(SETTINGS, **where)
+    one = Scribe(settings, **where)
     try:
         one.start(skill=SKILL, state=state_after(-1))
         yield one
@@ -58,7 +58,8 @@ def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
 
 
 def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
-    with scribe(folder=tmp_path) as one:
+    settings = Settings(cell="hall/bench-1", rate_hz=50)
+    with scribe(settings, folder=tmp_path) as one:
         told = tell(one, 200)
         one.note("requests", "via_points add handover", at_ns(20))
         status = one.status()
@@ -67,7 +68,7 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
     recording = Recording.open(status["recording"])
     first, *steps = recording.steps()
     assert Path(status["recording"]).name.startswith("hall-bench-1-2")
-    assert (recording.settings, recording.skill, recording.truncated, first.tick) == (SETTINGS, SKILL, False, -1)
+    assert (recording.settings, recording.skill, recording.truncated, first.tick) == (settings, SKILL, False, -1)
     assert [step.events for step in steps] == [
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in told
     ]
@@ -78,12 +79,8 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
 
 
 def test_a_cell_may_record_without_a_drawing(tmp_path: Path) -> None:
-    one = Scribe(Settings(rate_hz=50, files=Files(rerun=False)), folder=tmp_path)
-    one.start(skill=SKILL, state=state_after(-1))
-    try:
+    with scribe(folder=tmp_path) as one:
         tell(one, 20)
-    finally:
-        one.close(10)
     assert [path.suffix for path in tmp_path.iterdir()] == [".mcap"]
 
 
@@ -202,10 +199,10 @@ def test_a_process_that_is_slow_to_listen_is_given_more_time_and_listens_at_last
 DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
-from service.config import Settings
+from service.config import Files, Settings
 from service.recording.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
-one = Scribe(Settings(cell="hall/bench-1", rate_hz=50), folder=Path(sys.argv[1]))
+one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))
 pid = one.status()["pid"]
 if sys.argv[2] == "stopped":

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -14,6 +16,7 @@ from typing import Any
 
 import zenoh
 
+from service.cli.main import main
 from service.client import Client, open_session
 from service.contract import cdr, messages
 from service.launch import Launched, launched
@@ -26,6 +29,19 @@ def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.C
     """A `thirdhand` command, run to its end."""
     command = [sys.executable, "-m", "service", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more)
+
+
+def told(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A `thirdhand` command, run to its end in this process, which has imported all it needs."""
+    out, errors, mask = io.StringIO(), io.StringIO(), os.umask(0o022)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            code = main(list(arguments))
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        finally:
+            os.umask(mask)  # `serve` sets its own
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), errors.getvalue())
 
 
 class Daemon:
@@ -46,9 +62,9 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]:
+def serving(folder: Path, *arguments: str, before: str = "", drawn: bool = False) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
-    process runs that Python.
+    process runs that Python. What it records is `drawn` only where that is looked at.
     """
     program = (
         ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
@@ -56,7 +72,7 @@ def serving(folder: Path, *arguments: str, before: str = "") -> Iterator[Daemon]
         else ("-m", "service")
     )
     with (
-        launched(folder, *arguments, program=program) as service,
+        launched(folder, *arguments, program=program, rerun=drawn) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         yield Daemon(service, session)

@@ -15,6 +15,7 @@ RESEARCH = (
     "sim/test_experiments.py::TestExperiments",
     "sim/test_faults.py",
     "sim/test_people.py::test_a_reduced_comparison_keeps_the_order_that_is_stable",
+    "test_replay.py::test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units",
 )
 SLOW = (  # the longest first: so they begin first
     "daemon/test_survival.py",
@@ -42,6 +43,7 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_report_command.py",
     "test_examples.py",
     "kmp/test_distribution.py",
+    "kmp/test_compiled.py",
     "test_site.py",
     "test_wheel.py",
     "core/test_invariant.py",
@@ -57,7 +59,9 @@ SLOW = (  # the longest first: so they begin first
     "kmp/test_tutorial.py",
     "recording/test_sinks.py",
     "recording/test_damage.py",
-    "daemon/test_requests.py",
+    "daemon/test_via_point_requests.py",
+    "daemon/test_skill_requests.py",
+    "daemon/test_order_requests.py",
     "sim/test_people.py",
     "sim/test_experiments_run_the_service.py",
     "test_hand_sample.py",

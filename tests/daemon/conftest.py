@@ -1,0 +1,58 @@
+"""What the tests of the daemon share: a skill worker, and cells that only answer requests."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from service.client import endpoints, open_session
+from service.core.skill.skill import Skill
+from service.daemon.skill_worker import SkillWorker
+from support.request_cell import PLACES, Cell
+
+
+@pytest.fixture(scope="session")
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """A listening session and one connected to it."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as near, open_session(connect=endpoints(near)) as far:
+        yield near, far
+
+
+@pytest.fixture(scope="session")
+def skill_worker() -> Iterator[SkillWorker]:
+    running = SkillWorker()
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def opened(
+    sessions: tuple[zenoh.Session, zenoh.Session], skill: Skill, tmp_path: Path
+) -> Iterator[Callable[[SkillWorker], Cell]]:
+    """Opens a cell; closes it."""
+    with contextlib.ExitStack() as closing:
+        yield lambda skill_worker: closing.enter_context(
+            contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path))
+        )
+
+
+@pytest.fixture
+def cell(opened: Callable[[SkillWorker], Cell], skill_worker: SkillWorker) -> Cell:
+    return opened(skill_worker)
+
+
+@pytest.fixture(scope="module")
+def taught_cell(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+    skill_worker: SkillWorker,
+    skill: Skill,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Cell]:
+    """A cell with three places taught, for requests that change nothing."""
+    with contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path_factory.mktemp("cell"))) as cell:
+        cell.client.add(PLACES)
+        yield cell

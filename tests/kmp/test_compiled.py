@@ -1,0 +1,75 @@
+"""What is compiled calculates as plain Python does, operation by operation, on every CPU."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from kmp.compiled import compiled
+from support.paths import ROOT
+
+numba = pytest.importorskip("numba")
+
+
+def total(left, right):
+    """A sum of products, as vector units would add it up in another order, or fuse it."""
+    out = 0.0
+    for k in range(len(left)):
+        out += left[k] * right[k]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sums_keep_their_order_and_products_are_rounded(seed):
+    """1e16 apart, so that any other order and any product that is not rounded gives other bits."""
+    random = np.random.default_rng(seed)
+    left, right = random.normal(size=(2, 1001)) * 10.0 ** random.integers(-8, 9, (2, 1001))
+    assert compiled(total)(left, right) == total(left, right)
+    assert numba.njit(fastmath=True)(total)(left, right) != total(left, right)
+
+
+OPERATIONS = """
+import math
+import numpy as np
+from kmp.compiled import compiled
+
+def operations(a, b, m, out):
+    for k in range(len(a)):
+        x, y = a[k], b[k]
+        out[k] = math.exp(-x * x) + math.sqrt(x * x + y * y) * math.sin(x) - math.atan2(y, x) * math.cos(y)
+        out[k] += x**3 * math.log(1.0 + abs(y)) + abs(x) ** 1.7 + math.acos(abs(x) / (1.0 + abs(x)))
+    for i in range(len(m)):
+        for j in range(len(m)):
+            out[0] += m[i, j] * a[i] * b[j]
+    out[1] += np.sum(a * b) + np.dot(a, b) + (m @ m).sum() + a.max()
+
+random = np.random.default_rng(1)
+a, b = random.normal(size=(2, 1000))
+out = np.zeros(1000)
+compiled(operations)(a, b, random.normal(size=(20, 20)), out)
+print(out.tobytes().hex())
+"""
+
+
+def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
+    """Not rounded: the golden session, whose states are, is replayed so at length."""
+    here = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
+    command = [sys.executable, "-c", OPERATIONS]
+    native, generic = (
+        subprocess.run(command, env=here | more, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for more in ({}, {"NUMBA_CPU_NAME": "generic"})
+    )
+    assert len(native) > 1000
+    assert native == generic
+
+
+def test_nothing_is_compiled_otherwise():
+    for room in ("kmp", "service", "sim"):
+        for path in sorted((ROOT / room).rglob("*.py")):
+            found = re.findall(r"^.*\b(?:numba|njit)\b.*$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert not found or path.name == "compiled.py" or not any("import" in line for line in found), path

@@ -1,0 +1,106 @@
+"""Requests of one cell without its loop: what is asked goes through Zenoh, a thread takes it."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from service.client import Client
+from service.config import Files, Settings
+from service.contract import channels, requests
+from service.contract.records import Mode, Reason
+from service.core.frame import Event
+from service.core.skill.skill import Skill
+from service.daemon.queryables import Queryables
+from service.daemon.saved_via_points import state_folder
+from service.daemon.skill_worker import SkillWorker
+from sim.scene import Scene
+
+PLACES = Scene().via_points()
+CELLS = (f"tests/cell{n}" for n in itertools.count())
+
+
+class Cell:
+    """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
+
+    def __init__(
+        self, near: zenoh.Session, far: zenoh.Session, skill: Skill, skill_worker: SkillWorker, folder: Path
+    ) -> None:
+        (folder / "soldering.npz").write_bytes(skill.file)
+        self.folder = folder
+        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")))
+        self.taken: list[Event] = []
+        self.notes: list[str] = []
+        self.kept: list[bytes] = []
+        self.running = True
+        self._tick = 0
+        self._end = threading.Event()
+        self.failures: list[str] = []
+        tell = {"status": lambda: requests.encode_json(self.status()), "frame": self.frame}
+        tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
+        self.requests = Queryables(near, self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
+        self._loop = threading.Thread(target=self._drain)
+        self._loop.start()
+        self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
+        self.session = far
+        self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
+        self.client.wait_until_ready()
+
+    def status(self) -> requests.Status:
+        none = requests.Percentiles()
+        numbers = {
+            "tick": self._tick,
+            "rate_hz": 500.0,
+            "missed": 0,
+            "realtime": False,
+            "memory_locked": False,
+            "rejected": {},
+            "hand_age_ms": {},
+            "hand_distance_m": 3.0,
+            "hand_limit_m_s": 1.5,
+            "scribe": {},
+        }
+        words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}
+        lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
+        return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
+
+    def frame(self) -> dict[str, int]:
+        return {"tick": self._tick, "mode": Mode.HOLD, "reason": Reason.NO_HANDS}
+
+    def _drain(self) -> None:
+        while not self._end.wait(0.0005):
+            self._tick += 1
+            while self.running and self.requests.inbox:
+                event = self.requests.inbox.popleft().claimed(self._tick)
+                self.taken += [event] if event else []
+
+    def refusal(self, suffix: str, request: Any) -> str:
+        """The words in which a request is refused; bytes are sent as they are."""
+        before = len(self.taken), self.names(), self.place_bytes()
+        payload = request if isinstance(request, bytes) else requests.encode_json(request)
+        replies = list(self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0))
+        assert len(replies) == 1
+        assert replies[0].err is not None
+        assert (len(self.taken), self.names(), self.place_bytes()) == before
+        return replies[0].err.payload.to_string()
+
+    def names(self) -> list[str]:
+        """The places in force."""
+        return [point["name"] for point in self.client.ask("via_points", {"op": "list"})["points"]]
+
+    def place_bytes(self) -> bytes:
+        folder = state_folder(self.settings)
+        return b"".join(file.read_bytes() for file in sorted(folder.glob("places-*.json")))
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.taken]
+
+    def close(self) -> None:
+        if not self._end.is_set():
+            self.requests.close()
+            self._end.set()
+            self._loop.join()
