@@ -20,8 +20,7 @@ from service.config import Settings, robot_description
 from service.contract.records import Flag
 from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
-from service.core.separation.constraints import SLIP, allowed_speed
-from service.core.separation.separation import Separation
+from service.core.separation.separation import SLIP, Separation, allowed_speed
 from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals

@@ -21,8 +21,7 @@ from service.core.controller import Controller, start_state
 from service.core.frame import Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from service.core.separation.body import Body, body_of
-from service.core.separation.constraints import SLIP, allowed_speed
-from service.core.separation.separation import TABLE_DEPTH, Separation
+from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from sim.experiments.separation import nearest as measured

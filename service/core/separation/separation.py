@@ -10,8 +10,6 @@ Where a hand and a part pass each other, what leads past the hand now may lead i
 later, as the direction between them turns faster than joints brake. So the rule is also asked about
 moments ahead, as if hands and joints went on as they do; what can still be braked until then is
 allowed on top.
-
-While the arm follows, the sides of the workspace are such things for the tool's point.
 """
 
 from __future__ import annotations
@@ -23,21 +21,20 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.contract.records import Mode
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
 from service.core.separation.body import body_of
 from service.core.separation.clearance import FARTHEST, NOBODY, PEOPLE, THINGS, clearance
-from service.core.separation.constraints import PLAN_SHARE, SLIP, allowed_speed, excess, may_pass, share_of, stay_inside
 
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
 THINGS_ROOM = 0.005  # [m] from things, likewise
+PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
 CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
 RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
 RETREAT_MIN_AUTHORITY = 0.1  # [m/s] only what the joints can move so fast is moved back
-FOLLOW = int(Mode.FOLLOW)
+SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
 NEAR_VIA_POINT = 0.02  # [m] beside a via-point's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
 CHANGE_S = 0.07  # over which a hand's acceleration fades
@@ -78,13 +75,10 @@ class Separation:
             frames=body.frames,
             axes=body.axes,
             max_velocity=np.array(limits.velocity, np.float64),
-            max_speed=float(settings.tool.max_speed),
             first=int(np.flatnonzero(body.capsules["link"])[0]),
-            workspace=np.array([[-np.inf] * 3, [np.inf] * 3]),
         )
-        self._reach = np.array([settings.reach.min_x, -np.inf, settings.reach.min_z])
         capsules, joints = len(body.capsules), len(limits.names)
-        most = 2 * capsules * len(AHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs) + 6
+        most = 2 * capsules * len(AHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
         self._jerk = np.array(limits.jerk)
         self.constraints = self.constraints_for(joints, most)
         self._contacts = structured(0, CONTACT)
@@ -106,10 +100,6 @@ class Separation:
         ]
         self._contacts = structured(len(found), CONTACT)
         self._contacts[:] = found
-
-    def set_workspace(self, box: Vector) -> None:
-        """From now on the tool is to stay in a box (2, 3) [m] while it follows, as in the reach."""
-        self._parameters[0]["workspace"] = np.maximum(box[0], self._reach), box[1]
 
     def step(self, state: Record, frame: Record, here: Records) -> None:
         """Finds what the rule says for the state's hands at the arm's kinematics `here` (1,)."""
@@ -145,13 +135,23 @@ class Separation:
 
     def share(self, velocity: Vector) -> float:
         """How much of joint velocities (J,) [rad/s] is slow enough for all that is near."""
-        return float(share_of(self.constraints, self.count, velocity))
+        return float(_share_of(self.constraints, self.count, velocity))
 
     def excess(self, velocity: Vector, acceleration: Vector) -> float:
         """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
         as their acceleration comes to 0; at most 0 if they do not.
         """
-        return float(excess(self.constraints, self.count, velocity, acceleration, self._jerk))
+        return float(_excess(self.constraints, self.count, velocity, acceleration, self._jerk))
+
+
+@compiled
+def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
+    """Speed [m/s] toward something `distance` [m] away that comes at `hand_speed` [m/s] all the
+    time, from which a stop that begins a reaction time [s] late and brakes so [m/s²] ends
+    `clearance` away.
+    """
+    square = hand_speed**2 + (brake * reaction) ** 2 + 2.0 * brake * (distance - clearance)
+    return max(0.0, math.sqrt(max(square, 0.0)) - brake * reaction - hand_speed)
 
 
 @compiled
@@ -218,7 +218,7 @@ def _step(
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += may_pass(constraints, count, planned, given.max_velocity)
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
     for capsule in range(given.first, len(capsules)):
         part = capsules[capsule]
         for box in range(len(boxes)):
@@ -234,12 +234,12 @@ def _step(
                     back = max(CLEARANCE_GAIN * (distance - given.clearance[THINGS]), -RETREAT_SPEED)
                     planned = min(planned, back)
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-                    if planned < 0.0 and not may_pass(constraints, count, RETREAT_MIN_AUTHORITY, given.max_velocity):
+                    if planned < 0.0 and not _may_pass(constraints, count, RETREAT_MIN_AUTHORITY, given.max_velocity):
                         planned = 0.0
                     constraint.planned = planned
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += may_pass(constraints, count, planned, given.max_velocity)
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
     for pair in range(len(pairs)):
         one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
         distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
@@ -249,9 +249,7 @@ def _step(
             constraint.planned, constraint.allowed = planned, _allowed(parameters, THINGS, distance, 0.0) + SLIP
             _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
             _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
-            count += may_pass(constraints, count, planned, given.max_velocity)
-    if state.mode == FOLLOW:
-        count = stay_inside(constraints, count, heres, parameters)
+            count += _may_pass(constraints, count, planned, given.max_velocity)
     return count, nearest_m, speed_limit, setpoint_share
 
 
@@ -271,6 +269,15 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
     brake, clearance = PLAN_SHARE * given.brake[rule], given.clearance[rule] + given.room[rule]
     planned = allowed_speed(distance, coming, brake, given.reaction_s[rule], clearance)
     return max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
+
+
+@compiled
+def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) -> int:
+    """1 if joints within their greatest velocities can pass a limit along a constraint, else 0."""
+    most = 0.0
+    for j in range(len(max_velocity)):
+        most += abs(constraints[k].row[j]) * max_velocity[j]
+    return 1 if most > limit else 0
 
 
 @compiled
@@ -335,3 +342,31 @@ def _bring_together(
         speed += n1 * (jacobian[1, j] + wz * x - wx * z)
         speed += n2 * (jacobian[2, j] + wx * y - wy * x)
         row[j] += sign * speed
+
+
+@compiled
+def _share_of(constraints: Records, count: int, velocity: Vector) -> float:
+    """`Separation.share`."""
+    share = 1.0
+    for k in range(count):
+        speed = 0.0
+        for j in range(len(velocity)):
+            speed += constraints[k].row[j] * velocity[j]
+        limit = max(constraints[k].planned, 0.5 * SLIP)
+        if speed > limit:
+            share = min(share, limit / speed)
+    return share
+
+
+@compiled
+def _excess(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> float:
+    """`Separation.excess`."""
+    most = -math.inf
+    for k in range(count):
+        constraint = constraints[k]
+        now = crest = 0.0
+        for j in range(len(dq)):
+            now += constraint.row[j] * dq[j]
+            crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
+        most = max(most, max(now, crest) - constraint.allowed)
+    return most
