@@ -200,20 +200,23 @@ def _factorised(information: Array, penalty: float) -> Array:
 
 def _add_information(total: Array, z: Array, precision: Array) -> None:
     """Adds sum_n z_n^T z_n (x) Sigma_n^-1 (r, D, r, D), of z (n, C, r), precisions (n, O, O)."""
-    n, c, _ = z.shape
+    n, c, r = z.shape
     d = total.shape[1]
     blocks = precision.reshape(n, c, d, c, d)
 
     def along(*outputs: int) -> Array:
         # A A^T is twice as fast as A B, so off the diagonal: 2 a b = (a + b)^2 - a^2 - b^2.
-        root = np.linalg.cholesky(sum(blocks[:, :, i, :, j] for i in outputs for j in outputs))  # (n, C, C)
-        parts = (np.asarray(sum(z[:, b] * root[:, b, a, None] for b in range(a, c))) for a in range(c))
-        return np.asarray(sum((part.T @ part for part in parts), start=np.zeros(())))
+        square = np.asarray(sum(blocks[:, 0, i, 0, j] for i in outputs for j in outputs))
+        part = z[:, 0] * np.sqrt(np.maximum(square, 0.0))[:, None]  # below 0 by rounding alone
+        return np.asarray(part.T @ part)
 
-    diagonal = [along(i) for i in range(d)]
+    diagonal = [along(i) for i in range(d)] if c == 1 else []
     for i in range(d):
-        total[:, i, :, i] += diagonal[i]
-        for j in range(i):
-            share = (along(i, j) - diagonal[i] - diagonal[j]) / 2
+        for j in range(i + 1):
+            if c == 1:
+                share = diagonal[i] if i == j else (along(i, j) - diagonal[i] - diagonal[j]) / 2
+            else:  # the block of two outputs between the channels is not symmetric
+                share = z.reshape(-1, r).T @ (blocks[:, :, i, :, j] @ z).reshape(-1, r)
             total[:, i, :, j] += share
-            total[:, j, :, i] += share.T
+            if i != j:
+                total[:, j, :, i] += share.T
