@@ -57,6 +57,11 @@ class Database(Immutable):
             return self.reference.mean - prior_mean
         return self.reference.mean - self.functionals.values[:, None] * prior_mean
 
+    def since(self, first: int) -> Database:
+        """The points from that one on."""
+        chosen = slice(first, None)
+        return Database(self.functionals.take(chosen), self.reference.take(chosen))
+
     def unchanged(self) -> Changes:
         """No changes at all."""
         nothing = frozen(np.empty(0, dtype=np.intp))

@@ -20,10 +20,10 @@ from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
-from kmp.kernel import between, variances
+from kmp.kernel import between
 from kmp.linear_algebra import kron_identity
+from kmp.solution import check_resolved
 
-_RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
 _COLUMNS = 64  # of a factor, copied at once
 
 
@@ -120,25 +120,10 @@ class Dense(Immutable):
     @cached_property
     def covariance_factor(self) -> Array:
         parameters = self.hyperparameters
-        self._check_resolved()
+        check_resolved(parameters, self.database.since(self.same), first=self.same)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self.mean_factor
         return self._factorised(parameters.lambda_covariance, self.base.covariance_factor if self.base else None)
-
-    def _check_resolved(self) -> None:
-        """Raises ValueError where rounding, some 1e-15 of k(s, s), would hide the covariance."""
-        points, reference = self.database.functionals.take(slice(self.same, None)), self.database.reference
-        parameters = self.hyperparameters
-        scale = np.sqrt(variances(parameters.kernel, points)).repeat(parameters.channel_outputs, axis=1)
-        covariance = reference.covariance[self.same :] / (scale[:, :, None] * scale[:, None, :])
-        least = parameters.lambda_covariance * np.linalg.eigvalsh(covariance)[:, 0]
-        for n in np.flatnonzero(least < _RESOLVED)[:1]:
-            enough = parameters.lambda_covariance * _RESOLVED / max(least[n], 1e-300)
-            raise ValueError(
-                f"The covariance at point {self.same + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} "
-                f"of k(s, s) there, at least {_RESOLVED:g} needed. Give the point a greater variance, or the "
-                f"primitive a lambda_covariance of at least {enough:.3g}."
-            )
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
         """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""

@@ -21,6 +21,7 @@ from kmp.linear_algebra import kron_identity
 from kmp.low_rank.conditioned import Conditioned
 from kmp.low_rank.error_bound import error_bound
 from kmp.low_rank.features import BLOCK, Features
+from kmp.solution import check_resolved
 
 RANK = 400
 TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
@@ -53,7 +54,11 @@ class LowRank(Immutable):
         features: Features,
         base: LowRank | None = None,
     ) -> LowRank:
-        """The solution. Raises ValueError if the normal equations cannot be solved."""
+        """The solution. Raises ValueError if the normal equations cannot be solved.
+
+        Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
+        """
+        check_resolved(hyperparameters, database, name="lambda_mean")
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
@@ -179,6 +184,7 @@ class LowRank(Immutable):
     def covariance_factor(self) -> Array:
         """The same with the lambda of the covariance."""
         parameters = self.hyperparameters
+        check_resolved(parameters, self.database)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self.mean_factor
         return _factorised(self.information, parameters.lambda_covariance)

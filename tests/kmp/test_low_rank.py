@@ -122,7 +122,7 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
 @given(seeds)
 def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed):
     inputs, reference = tube(seed, 60)
-    exact = Gaussians(reference.mean, np.tile(1e-12 * np.eye(3), (60, 1, 1)))
+    exact = Gaussians(reference.mean, np.tile(2e-11 * np.eye(3), (60, 1, 1)))
     low = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation="low_rank")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ViaPointMissed)
@@ -131,6 +131,28 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
         for covariance in (one.predict(inputs).covariance, one.predict(inputs[:1]).covariance):
             assert np.array_equal(covariance, covariance.swapaxes(1, 2))
             assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+@pytest.mark.parametrize("variance", [1e-12, 1e-16, 1e-19])
+@pytest.mark.parametrize("representation", ["dense", "low_rank", "auto"])
+def test_a_covariance_that_rounding_would_hide_is_refused(variance, representation):
+    inputs, reference = tube(0, 600)
+    options = {"kernel": kernel, "representation": representation}
+    hidden = Gaussians(reference.mean, np.tile(variance * np.eye(3), (600, 1, 1)))
+    with pytest.raises(ValueError, match=r"lost in rounding: .* 1e-11 needed|not positive definite to working"):
+        KMP.fit(inputs, hidden, lambda_mean=1.0, **options)
+    if representation != "dense":
+        with pytest.raises(ValueError, match=r"at point 0 would be lost .* a lambda_mean of at least"):
+            KMP.fit(inputs, hidden, lambda_mean=1.0, lambda_covariance=1e9, **options)
+    one, point = KMP.fit(inputs, reference, lambda_mean=1.0, **options), hidden[:1]
+    with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding: .* a lambda_\w+ of at least"):
+        one.adapt(inputs[:1] + 0.1, point, tolerance=0.0)
+    with pytest.raises(ValueError, match=r"at point 599 would be lost in rounding"):
+        one.adapt(inputs[:1], point, tolerance=0.001)
+    with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding"):
+        KMP.fit(inputs, reference, lambda_mean=1e6, lambda_covariance=1.0, **options).adapt(
+            inputs[:1] + 0.1, point, tolerance=0.0
+        )
 
 
 def test_threads_may_share_it():
