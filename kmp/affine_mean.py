@@ -21,6 +21,12 @@ class AffineMean(Immutable):
     offset: Array
 
     def __post_init__(self) -> None:
+        matrix = numbers("prior_mean.matrix", self.matrix, "O", "I")
         offset = numbers("prior_mean.offset", self.offset, "O")
+        if len(matrix) != len(offset):
+            raise ValueError(
+                f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} given, "
+                f"(O, I) and (O,) needed."
+            )
+        object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "offset", offset)
-        object.__setattr__(self, "matrix", numbers("prior_mean.matrix", self.matrix, len(offset), "I"))

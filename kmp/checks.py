@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from collections.abc import Sized
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +24,10 @@ class RankReached(UserWarning):
 
 def real(name: str, value: ArrayLike) -> Array:
     """The value as an array, without a copy if it is one. Raises ValueError unless it is real."""
-    given = np.asarray(value)
+    try:
+        given = np.asarray(value)
+    except ValueError:
+        raise ValueError(f"{name}: rows of different lengths given, an array of real numbers needed.") from None
     if given.dtype.char == "d":
         return given
     if given.dtype.kind not in "biuf":
@@ -42,13 +46,14 @@ def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     return frozen(array)
 
 
-def check_finite(name: str, array: Array) -> None:
+def check_finite(name: str, array: Array, what: str = "") -> None:
     """Raises ValueError unless every number is finite."""
     flat = array.ravel()
     if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
         return
     for place in np.argwhere(~np.isfinite(array))[:1].tolist():
-        raise ValueError(f"{name}{place} is {array[tuple(place)]}, and every number must be finite.")
+        of = f"{name}: {what} " if what else name
+        raise ValueError(f"{of}{place} is {array[tuple(place)]}, and every number must be finite.")
 
 
 def check_shape(name: str, array: Array, *shape: int | str) -> None:
@@ -71,12 +76,53 @@ def positive(name: str, value: float | Array) -> float:
     return number
 
 
-def whole(name: str, value: object, *, least: int = 1) -> int:
-    """The value as an integer. Raises ValueError unless it is one, and not below the least."""
+def not_negative(name: str, value: float | Array) -> float:
+    """The value as a float. Raises ValueError unless it is one number, and not below zero."""
+    given = real(name, value)
+    check_shape(name, given)
+    if not given >= 0:
+        raise ValueError(f"{name} is {given:g}, and must not be below 0.")
+    return float(given)
+
+
+def squared(name: str, deviation: float | Array) -> float:
+    """The variance. Raises ValueError unless the deviation is above zero, and its square too."""
+    variance = float(np.square(positive(name, deviation)))
+    if not 0 < variance < math.inf:
+        raise ValueError(f"{name} is {deviation:g}, and its square must be a number above 0.")
+    return variance
+
+
+def seeded(value: object) -> int:
+    """The seed. Raises ValueError unless it is a whole number of 32 bits, not below zero."""
+    return whole("seed", value, least=0, most=2**32 - 1)
+
+
+def check_some(name: str, values: Sized) -> None:
+    """Raises ValueError if there is none."""
+    if len(values) == 0:
+        raise ValueError(f"{name}: none given, at least 1 needed.")
+
+
+def parts_of(name: str, value: Any, kind: type | None = None, how: str = "") -> list[Any]:
+    """The parts, each of that kind. Raises ValueError unless there is one at least."""
+    if not isinstance(value, (list, tuple)) and np.ndim(value if isinstance(value, np.ndarray) else 0) == 0:
+        raise ValueError(f"{name}: {type(value).__name__} given, a list needed.")
+    check_some(name, value)
+    for i, part in enumerate(value):
+        if kind is not None:
+            check_kind(f"{name}[{i}]", part, kind, how)
+    return list(value)
+
+
+def whole(name: str, value: object, *, least: int = 1, most: int = 2**31 - 1) -> int:
+    """The value as an integer. Raises ValueError unless it is one, from the least to the most."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
         raise ValueError(f"{name} is {value!r}, and must be a whole number.")
     if value < least:
         raise ValueError(f"{name} is {value}, and must be at least {least}.")
+    if value > most:
+        raise ValueError(f"{name} is too large, and must be at most {most}.")
     return int(value)
 
 

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import Array, numbers
+from kmp.checks import Array, check_kind, numbers
 from kmp.database import Changes, Database
 from kmp.dense import Dense
 from kmp.functionals import Functionals
@@ -63,7 +63,11 @@ class LinearConstraints(Immutable):
         return Functionals(self.inputs, self.directions)
 
     def joined(self, other: LinearConstraints) -> LinearConstraints:
-        """These and the others."""
+        """These and the others. Raises ValueError if they have other inputs or outputs."""
+        check_kind("other", other, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
+        shapes = [(one.inputs.shape[1], one.normals.shape[1]) for one in (self, other)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(f"other: constraints of {shapes[1]} inputs and outputs given, {shapes[0]} needed.")
         points = Functionals.concatenated([self.functionals, other.functionals])
         normals = np.concatenate([self.normals, other.normals])
         return LinearConstraints(points.inputs, normals, np.concatenate([self.bounds, other.bounds]), points.directions)

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, check_kind, numbers, positive
+from kmp.checks import Array, check_kind, check_shape, numbers, positive, real, seeded, squared, whole
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
-from kmp.primitive import KMP
+from kmp.primitive import KMP, checked_primitive
 
 Reward = Callable[[Array], float]
 """How good a predicted trajectory (M, O) is; higher is better."""
@@ -55,7 +55,7 @@ class Correlation(Immutable):
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
         """Lambda = 1 everywhere, for so many outputs. Raises ValueError as the constructor does."""
         places = numbers("centres", centres, "B", "I")
-        return cls(places, width, np.ones((len(places), outputs)))
+        return cls(places, width, np.ones((len(places), whole("outputs", outputs))))
 
     def __call__(self, inputs: ArrayLike) -> Array:
         """The diagonals of Lambda at inputs (N, I): (N, O).
@@ -77,8 +77,7 @@ class Correlation(Immutable):
 
         Raises ValueError if it has another number of inputs or outputs.
         """
-        check_kind("primitive", primitive, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
-        base = primitive.base
+        base = checked_primitive(primitive).base
         if (given := self.theta.shape[1]) != base.outputs:
             raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
         scale, sigma = self(base.inputs), base.reference.covariance
@@ -121,18 +120,22 @@ def improve(
     Raises ValueError if shapes do not agree, a parameter is out of its range, or a reward is not
     finite.
     """
-    s = numbers("queries", queries, "M", primitive.inputs.shape[1])
-    positive("exploration", exploration)
-    if rollouts < 2 or updates < 1:
+    s = numbers("queries", queries, "M", checked_primitive(primitive).inputs.shape[1])
+    check_kind("correlation", correlation, Correlation, "Correlation.neutral(centres, width=..., outputs=...)")
+    squared("exploration", exploration)
+    if whole("rollouts", rollouts, least=0) < 2 or whole("updates", updates, least=0) < 1:
         raise ValueError(f"{rollouts} rollouts and {updates} updates given; at least 2 and 1 are needed.")
-    random = np.random.default_rng(seed)
+    if not callable(reward):
+        raise ValueError(f"reward: {type(reward).__name__} given, a function of a trajectory (M, O) needed.")
+    random = np.random.default_rng(seeded(seed))
 
     def tried(theta: Array) -> tuple[float, Correlation]:
         policy = replace(correlation, theta=theta)
-        value = float(reward(policy.applied(primitive).mean(s)))
+        value = real("reward", reward(policy.applied(primitive).mean(s)))
+        check_shape("reward", value)
         if not np.isfinite(value):
             raise ValueError(f"The reward is {value}, and must be a finite number for any trajectory (M, O).")
-        return value, policy
+        return float(value), policy
 
     theta = correlation.theta
     best = tried(theta)

@@ -51,6 +51,11 @@ class Database(Immutable):
         """(N, I) where the points are."""
         return self.functionals.inputs
 
+    def since(self, first: int) -> Database:
+        """The points from that one on."""
+        chosen = slice(first, None)
+        return Database(self.functionals.take(chosen), self.reference.take(chosen))
+
     def unchanged(self) -> Changes:
         """No changes at all."""
         nothing = frozen(np.empty(0, dtype=np.intp))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,37 @@ from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
-from kmp.kernel import between, variances
+from kmp.kernel import between
 from kmp.linear_algebra import kron_identity
+from kmp.solution import check_resolved
 
-_RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
+_SHARED = 0.75  # of the points: where fewer come before the first change, a border costs more than a fit
 _COLUMNS = 64  # of a factor, copied at once
+
+
+class _Bordered(NamedTuple):
+    """A Cholesky factor [[L, 0], [B^T, M]], whose L is that of another and not copied."""
+
+    base: Array  # L (p, p)
+    border: Array  # B (p, m)
+    corner: Array  # M (m, m)
+
+    def solve(self, right: Array) -> Array:
+        """The inverse of what is factorised times (p + m, J)."""
+        p = len(self.base)
+        forth, _ = lapack.dtrtrs(self.base, right[:p], lower=1)
+        last, _ = lapack.dpotrs(self.corner, right[p:] - self.border.T @ forth, lower=1)
+        first, _ = lapack.dtrtrs(self.base, forth - self.border @ last, lower=1, trans=1)
+        return np.concatenate([first, last])
+
+    def whole(self) -> Array:
+        """The factor as one (p + m, p + m)."""
+        p, n = len(self.base), sum(self.border.shape)
+        factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
+        for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
+            factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
+        factor[p:, :p], factor[p:, p:] = self.border.T, self.corner
+        return frozen(factor)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,7 +61,7 @@ class Dense(Immutable):
     """
 
     # A copy in another process predicts at once; only `adapted` would need the factors again.
-    _not_pickled = frozenset({"mean_factor", "covariance_factor"})
+    _not_pickled = frozenset({"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver"})
 
     hyperparameters: Hyperparameters
     database: Database
@@ -64,12 +90,18 @@ class Dense(Immutable):
 
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
-        solution, _ = lapack.dpotrs(self.mean_factor, right.reshape(len(self.mean_factor), -1), lower=1)
+        columns, solver = (
+            right.reshape(len(self.database) * self.hyperparameters.kernel.channels * self.apart, -1),
+            self._mean_solver,
+        )
+        solution = (
+            lapack.dpotrs(solver, columns, lower=1)[0] if isinstance(solver, np.ndarray) else solver.solve(columns)
+        )
         return np.ascontiguousarray(solution).reshape(right.shape)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
-        self.covariance_factor  # noqa: B018
+        self._covariance_solver  # noqa: B018
         return self
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
@@ -85,7 +117,8 @@ class Dense(Immutable):
         """The base's solution with these changes; they share the points before the first change."""
         base = self.base or self
         same = int(changes.replaced[0]) if len(changes.replaced) else len(base.database)
-        return Dense(self.hyperparameters, base.database.changed(changes), base, same)
+        worth_it = same >= _SHARED * len(base.database)
+        return Dense(self.hyperparameters, base.database.changed(changes), base, same if worth_it else 0)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
@@ -116,33 +149,32 @@ class Dense(Immutable):
 
     @cached_property
     def mean_factor(self) -> Array:
-        return self._factorised(self.hyperparameters.lambda_mean, self.base.mean_factor if self.base else None)
+        """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""
+        solver = self._mean_solver
+        return solver if isinstance(solver, np.ndarray) else solver.whole()
 
     @cached_property
     def covariance_factor(self) -> Array:
-        parameters = self.hyperparameters
-        self._check_resolved()
-        if parameters.lambda_covariance == parameters.lambda_mean:
+        """The same with the lambda of the covariance."""
+        solver = self._covariance_solver
+        if solver is self._mean_solver:
             return self.mean_factor
+        return solver if isinstance(solver, np.ndarray) else solver.whole()
+
+    @cached_property
+    def _mean_solver(self) -> Array | _Bordered:
+        return self._factorised(self.hyperparameters.lambda_mean, self.base.mean_factor if self.base else None)
+
+    @cached_property
+    def _covariance_solver(self) -> Array | _Bordered:
+        parameters = self.hyperparameters
+        check_resolved(parameters, self.database.since(self.same), first=self.same)
+        if parameters.lambda_covariance == parameters.lambda_mean:
+            return self._mean_solver
         return self._factorised(parameters.lambda_covariance, self.base.covariance_factor if self.base else None)
 
-    def _check_resolved(self) -> None:
-        """Raises ValueError where rounding, some 1e-15 of k(s, s), would hide the covariance."""
-        points, reference = self.database.functionals.take(slice(self.same, None)), self.database.reference
-        parameters = self.hyperparameters
-        scale = np.sqrt(variances(parameters.kernel, points)).repeat(parameters.channel_outputs, axis=1)
-        covariance = reference.covariance[self.same :] / (scale[:, :, None] * scale[:, None, :])
-        least = parameters.lambda_covariance * np.linalg.eigvalsh(covariance)[:, 0]
-        for n in np.flatnonzero(least < _RESOLVED)[:1]:
-            enough = parameters.lambda_covariance * _RESOLVED / max(least[n], 1e-300)
-            raise ValueError(
-                f"The covariance at point {self.same + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} "
-                f"of k(s, s) there, at least {_RESOLVED:g} needed. Give the point a greater variance, or the "
-                f"primitive a lambda_covariance of at least {enough:.3g}."
-            )
-
-    def _factorised(self, penalty: float, base_factor: Array | None) -> Array:
-        """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""
+    def _factorised(self, penalty: float, base_factor: Array | None) -> Array | _Bordered:
+        """The factor; with the base's in it, and not copied, where no point was taken out."""
         rows = self._rows(penalty)
         if base_factor is not None and self.base is not None and self.base.apart != self.apart:
             d = self.hyperparameters.channel_outputs
@@ -150,15 +182,20 @@ class Dense(Immutable):
         if base_factor is None or self.same == 0:
             # In place: the rows are symmetric, so that their transpose is as LAPACK reads it.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
+            found: Array | _Bordered = frozen(factor)
         else:
-            factor, info = _bordered(base_factor, rows)
+            p = rows.shape[1] - len(rows)
+            shared = np.asfortranarray(base_factor[:p, :p])
+            border, _ = lapack.dtrtrs(shared, rows[:, :p].T, lower=1)
+            corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
+            found = _Bordered(frozen(shared), frozen(border), frozen(corner))
         if info:
             point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.apart)
             raise ValueError(
                 f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
                 f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
             )
-        return frozen(factor)
+        return found
 
     def _rows(self, penalty: float) -> Array:
         """The rows of K (x) I + lambda Sigma that the base does not share: all columns."""
@@ -175,15 +212,3 @@ class Dense(Immutable):
         covariance = self.database.reference.covariance[same:].reshape(changed, c, every, c, every)[:, :, :d, :, :d]
         blocks[diagonal, :, diagonal + same, :] += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)
-
-
-def _bordered(base_factor: Array, rows: Array) -> tuple[Array, int]:
-    """The base's factor, bordered: that (n, n) of a matrix whose last rows are (m, n)."""
-    n, p = rows.shape[1], rows.shape[1] - len(rows)
-    factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
-    for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
-        factor[a:p, a : min(a + _COLUMNS, p)] = base_factor[a:p, a : min(a + _COLUMNS, p)]
-    border, _ = lapack.dtrtrs(factor[:p, :p], rows[:, :p].T, lower=1)
-    factor[p:, :p] = border.T
-    factor[p:, p:], info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
-    return factor, int(info)

@@ -66,8 +66,8 @@ class Functionals(Immutable):
     def values(self) -> NDArray[np.bool_]:
         """(N,) whether each is a value."""
         if self.directions is None:
-            return np.ones(len(self), dtype=bool)
-        return np.asarray(~self.directions.any(axis=1))
+            return frozen(np.ones(len(self), dtype=bool))
+        return frozen(np.asarray(~self.directions.any(axis=1)))
 
     def derivatives(self, stretch: Array) -> Derivatives | None:
         """The derivatives among them, in coordinates x = stretch * s; None if there is none."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, check_kind, numbers
+from kmp.checks import Array, check_kind, numbers, parts_of
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
 
@@ -31,10 +31,8 @@ class Gaussians(Immutable):
     def __post_init__(self) -> None:
         mean = numbers("mean", self.mean, "N", "O")
         n, outputs = mean.shape
-        covariance = numbers("covariance", self.covariance, n, outputs, outputs)
-        _check_covariances("covariance", covariance)
         object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "covariance", frozen(symmetric(covariance)))
+        object.__setattr__(self, "covariance", covariances("covariance", self.covariance, n, outputs))
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -66,7 +64,8 @@ class Gaussians(Immutable):
         """
         a = numbers("matrix", matrix, "P", self.outputs)
         b = numbers("offset", offset, len(a))
-        return Gaussians(self.mean @ a.T + b, symmetric(a @ self.covariance @ a.T))
+        covariance = covariances("matrix: covariance", symmetric(a @ self.covariance @ a.T), len(self), len(a))
+        return Gaussians(self.mean @ a.T + b, covariance)
 
     def product(self, *others: Gaussians) -> Gaussians:
         """The normalised product with others, one by one: the surer a factor, the more it counts.
@@ -86,8 +85,11 @@ class Gaussians(Immutable):
     @staticmethod
     def concatenated(parts: Sequence[Gaussians]) -> Gaussians:
         """All distributions of the parts, in order. Raises ValueError if O differs."""
-        means, covariances = zip(*((part.mean, part.covariance) for part in parts), strict=True)
-        return unchecked(np.concatenate(means), np.concatenate(covariances))
+        for i, part in enumerate(parts_of("parts", parts)):
+            check_gaussians(f"parts[{i}]", part, parts[0].outputs if i else None)
+        return unchecked(
+            np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
+        )
 
 
 def unchecked(mean: Array, covariance: Array) -> Gaussians:
@@ -103,22 +105,26 @@ def fused_mean(covariance: Array, precisions: Sequence[NDArray[Any]], factors: S
     return np.asarray((covariance @ np.sum(pulls, axis=0))[:, :, 0])
 
 
-def check_gaussians(name: str, value: object) -> None:
-    """Raises ValueError unless the value is `Gaussians`."""
+def check_gaussians(name: str, value: object, outputs: int | None = None) -> None:
+    """Raises ValueError unless the value is `Gaussians`, over so many outputs."""
     check_kind(name, value, Gaussians, "Gaussians(mean (N, O), covariance (N, O, O))")
+    if outputs is not None and isinstance(value, Gaussians) and value.outputs != outputs:
+        raise ValueError(f"{name}: normals over {value.outputs} outputs given, {outputs} needed.")
 
 
-def check_pairs(inputs: Array, points: Gaussians, outputs: int) -> None:
+def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> None:
     """Raises ValueError unless there is one normal over that many outputs for each input (N, I)."""
-    check_gaussians("points", points)
+    check_gaussians(name, points)
     if points.mean.shape != (len(inputs), outputs):
         n, given = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
-        raise ValueError(f"{given} given for {n} inputs; {n} over {outputs} needed.")
+        raise ValueError(f"{name}: {given} given for {n} inputs; {n} over {outputs} needed.")
 
 
-def _check_covariances(name: str, covariance: Array) -> None:
+def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
+    """Covariances (N, O, O). Raises ValueError unless they are symmetric and positive definite."""
+    covariance = numbers(name, value, count, outputs, outputs)
     if covariance.size == 0:
-        return
+        return covariance
     size = np.abs(covariance).max(axis=(1, 2))
     lopsided = np.abs(covariance - covariance.swapaxes(1, 2)).max(axis=(1, 2))
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
@@ -130,3 +136,4 @@ def _check_covariances(name: str, covariance: Array) -> None:
             f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest[n]:.3g}, "
             "and must be above 0. Add a small variance to the diagonal: (deviation that may be ignored)^2."
         )
+    return frozen(symmetric(covariance))

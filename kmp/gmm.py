@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, numbers, positive, whole
-from kmp.gaussians import Gaussians
+from kmp.checks import Array, check_finite, check_some, numbers, positive, seeded, whole
+from kmp.gaussians import Gaussians, covariances
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
 
@@ -39,11 +39,10 @@ class GaussianMixture(Immutable):
         weights = numbers("weights", self.weights, "K")
         if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
             raise ValueError(f"weights: {weights} given; needed are numbers of sum 1, none below 0.")
-        numbers("means", self.means, len(weights), "I+O")
-        components = Gaussians(self.means, self.covariances)
+        means = numbers("means", self.means, len(weights), "I+O")
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "means", components.mean)
-        object.__setattr__(self, "covariances", components.covariance)
+        object.__setattr__(self, "means", means)
+        object.__setattr__(self, "covariances", covariances("covariances", self.covariances, *means.shape))
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
@@ -57,8 +56,10 @@ class GaussianMixture(Immutable):
         than components, or a parameter is out of its range.
         """
         data = numbers("samples", samples, "M", "I+O")
-        positive("regularization", regularization)
+        check_some("samples", data.T)
+        added = positive("regularization", regularization)
         whole("components", components)
+        seeded(seed)
         if len(data) < components:
             given = f"{len(data)} samples given for {components} components"
             raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
@@ -66,17 +67,21 @@ class GaussianMixture(Immutable):
         from sklearn.mixture import GaussianMixture as Estimator
         from threadpoolctl import threadpool_limits
 
-        with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
-            found = Estimator(
-                components,
-                covariance_type="full",
-                init_params="kmeans",
-                random_state=seed,
-                reg_covar=regularization,
-                tol=_TOLERANCE,
-                max_iter=_ITERATIONS,
-            ).fit(data)
-        return cls(found.weights_, found.means_, symmetric(found.covariances_))
+        estimator = Estimator(
+            components,
+            covariance_type="full",
+            init_params="kmeans",
+            random_state=seed,
+            reg_covar=added,
+            tol=_TOLERANCE,
+            max_iter=_ITERATIONS,
+        )
+        try:
+            with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
+                found = estimator.fit(data)
+            return cls(found.weights_, found.means_, symmetric(found.covariances_))
+        except ValueError as error:
+            raise ValueError(f"samples: with regularization {added:g} no mixture was found: {error}") from None
 
     def regress(self, inputs: ArrayLike) -> Gaussians:
         """xi | s at each input (N, I): N normals, by Gaussian mixture regression.
@@ -104,6 +109,7 @@ class GaussianMixture(Immutable):
         apart = means - mean[:, None, :]
         covariance = np.einsum("nk,kop->nop", share, within)
         covariance = covariance + np.einsum("nk,nko,nkp->nop", share, apart, apart)
+        check_finite("inputs", mean, "far outside the mixture: its mean there")
         return Gaussians(mean, symmetric(covariance))
 
     def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
@@ -112,8 +118,8 @@ class GaussianMixture(Immutable):
         Raises ValueError if the count is below 1, or no output is left.
         """
         whole("count", count)
-        i = self._checked_dimensions(dimensions)
-        random = np.random.default_rng(seed)
+        i = self._checked_dimensions(whole("dimensions", dimensions, least=0))
+        random = np.random.default_rng(seeded(seed))
         component = random.choice(len(self.weights), size=count, p=self.weights / self.weights.sum())
         root = np.linalg.cholesky(self.covariances[:, :i, :i])[component]  # (count, I, I)
         drawn = self.means[component, :i] + (root @ random.standard_normal((count, i, 1)))[:, :, 0]
@@ -123,5 +129,5 @@ class GaussianMixture(Immutable):
         total = self.means.shape[1]
         if not 1 <= inputs < total:
             takes = f"this mixture of {total} dimensions in all takes 1 to {total - 1}"
-            raise ValueError(f"{inputs} input dimensions given; {takes}.")
+            raise ValueError(f"inputs: {inputs} input dimensions given; {takes}.")
         return inputs

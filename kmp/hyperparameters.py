@@ -37,9 +37,7 @@ class Hyperparameters(Immutable):
         outputs: int,
     ) -> Hyperparameters:
         """The parameters, or their defaults. Raises ValueError if they do not go with I and O."""
-        if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
-            raise ValueError(f"kernel: {kernel!r} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
-        kernel.check(inputs, outputs)
+        checked_kernel(kernel).check(inputs, outputs)
         penalty = positive("lambda_mean", lambda_mean)
         other = penalty if lambda_covariance is None else positive("lambda_covariance", lambda_covariance)
         if isinstance(prior_mean, AffineMean):
@@ -87,3 +85,10 @@ class Hyperparameters(Immutable):
     def channel_outputs(self) -> int:
         """D, the outputs of each of the kernel's C channels: O = C D."""
         return len(self.prior_offset) // self.kernel.channels
+
+
+def checked_kernel(kernel: Kernel) -> Kernel:
+    """The kernel. Raises ValueError unless it is one."""
+    if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
+        raise ValueError(f"kernel: {kernel!r} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
+    return kernel

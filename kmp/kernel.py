@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, numbers, positive
+from kmp.checks import Array, check_some, numbers, positive, real
 from kmp.functionals import Derivatives, Functionals
 from kmp.immutable import Immutable, frozen
 
@@ -112,10 +112,11 @@ class GaussianKernel(Immutable):
     ell: float | Array
 
     def __post_init__(self) -> None:
-        if np.ndim(self.ell) == 0:
+        if real("ell", self.ell).ndim == 0:
             object.__setattr__(self, "ell", positive("ell", self.ell))
             return
         ell = numbers("ell", self.ell, "I")
+        check_some("ell", ell)
         for i, value in enumerate(ell):
             positive(f"ell[{i}]", value)
         object.__setattr__(self, "ell", ell)
@@ -136,7 +137,9 @@ class GaussianKernel(Immutable):
     def check(self, inputs: int, outputs: int) -> None:
         """Raises ValueError unless there is one ell for each input, or one for all."""
         if np.ndim(self.ell) and np.size(self.ell) != inputs:
-            raise ValueError(f"ell: {np.size(self.ell)} values given, 1 or {inputs} needed for {inputs} inputs.")
+            raise ValueError(
+                f"kernel's ell: {np.size(self.ell)} values given, 1 or {inputs} needed for {inputs} inputs."
+            )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         if np.ndim(self.ell):

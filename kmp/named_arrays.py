@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.affine_mean import AffineMean
-from kmp.checks import numbers
+from kmp.checks import check_kind, numbers, real
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database
 from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians, check_pairs
+from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
 from kmp.kernel import GaussianKernel, Kernel
@@ -66,6 +66,7 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, Solution]:
     """What `to_arrays` was given. Raises ValueError if arrays lack or do not go together."""
+    check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
         raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
@@ -89,8 +90,8 @@ def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Cons
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
-    reference = Gaussians(arrays["base_mean"], arrays["base_covariance"])
-    check_pairs(inputs, reference, reference.outputs)
+    reference = _normals("base", arrays)
+    check_pairs("base_mean", inputs, reference, reference.outputs)
     prior = np.asarray(arrays["prior_mean"])
     parameters = Hyperparameters.checked(
         _kernel(arrays),
@@ -108,13 +109,17 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
 
 def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
     via = numbers("via_inputs", arrays["via_inputs"], "V", database.inputs.shape[1])
-    points = Gaussians(arrays["via_mean"], arrays["via_covariance"])
-    check_pairs(via, points, database.reference.outputs)
-    replaced = np.array(arrays["replaced"], dtype=np.intp)
-    n = len(database)
+    points = _normals("via", arrays)
+    check_pairs("via_mean", via, points, database.reference.outputs)
+    replaced, n = real("replaced", arrays["replaced"]), len(database)
     if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
-        raise ValueError(f"replaced: {replaced} given, ascending indices of the {n} base points needed.")
-    return Changes(frozen(replaced), Functionals.checked(via, arrays.get("via_directions")), points)
+        raise ValueError(f"replaced: {arrays['replaced']} given, ascending indices of the {n} base points needed.")
+    return Changes(frozen(replaced.astype(np.intp)), Functionals.checked(via, arrays.get("via_directions")), points)
+
+
+def _normals(of: str, arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
+    mean = numbers(f"{of}_mean", arrays[f"{of}_mean"], "N", "O")
+    return unchecked(mean, covariances(f"{of}_covariance", arrays[f"{of}_covariance"], *mean.shape))
 
 
 def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
@@ -127,6 +132,6 @@ def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
         return PeriodicKernel(float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"])))
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
-    if int(arrays["channels"]) != 2:
-        raise ValueError(f"channels: {int(arrays['channels'])} given, 2 needed where it is given.")
+    if (channels := float(numbers("channels", arrays["channels"]))) != 2:
+        raise ValueError(f"channels: {channels:g} given, 2 needed where it is given.")
     return VelocityKernel(float(numbers("ell", arrays["ell"])))

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_kind, numbers, real
+from kmp.checks import Array, check_finite, not_negative, numbers, real
 from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
-from kmp.primitive import KMP
+from kmp.primitive import KMP, checked_primitive
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
 _CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
@@ -39,6 +39,13 @@ def continuous(quaternions: ArrayLike) -> Array:
 
 def multiplied(a: Array, b: Array) -> Array:
     """The products a b (..., 4): first b, then a. x y z w. Raises ValueError if shapes differ."""
+    a, b = real("a", a), real("b", b)
+    for name, one, other in (("a", a, b), ("b", b, a)):
+        if one.shape[-1:] != (4,) or (one.ndim > 1 and other.ndim > 1 and one.shape != other.shape):
+            raise ValueError(
+                f"{name}: shape {one.shape} given, for a of {a.shape} and b of {b.shape}; (..., 4) needed."
+            )
+        check_finite(name, one)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
@@ -51,7 +58,7 @@ def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
     number is not finite, a norm is far from 1, or q = -q_a, where the angle of rotation would be
     360 degrees.
     """
-    q_a = _unit("auxiliary", np.atleast_2d(auxiliary))[0]
+    q_a = _unit("auxiliary", auxiliary, 4)
     q = multiplied(_unit("quaternions", quaternions), q_a * _CONJUGATE)
     length = np.linalg.norm(q[:, :3], axis=1, keepdims=True)
     angle = np.arctan2(length, q[:, 3:])
@@ -66,7 +73,9 @@ def exp(zeta: Array, auxiliary: Array) -> Array:
 
     T-RO, section II. Raises ValueError if a shape is another.
     """
+    zeta, auxiliary = numbers("zeta", zeta, "T", 3), numbers("auxiliary", auxiliary, 4)
     angle = np.linalg.norm(zeta, axis=1, keepdims=True)
+    check_finite("zeta", angle)
     return multiplied(np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary)
 
 
@@ -101,11 +110,10 @@ class OrientationKMP(Immutable):
     """(4,) q_a, x y z w."""
 
     def __post_init__(self) -> None:
-        check_kind("primitive", self.primitive, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
-        wanted = 3 * self.primitive.kernel.channels
+        wanted = 3 * checked_primitive(self.primitive).kernel.channels
         if (outputs := self.primitive.outputs) != wanted:
             raise ValueError(f"primitive: {outputs} outputs given, {wanted} needed for an orientation.")
-        auxiliary = _unit("auxiliary", np.atleast_2d(self.auxiliary))[0]
+        auxiliary = _unit("auxiliary", self.auxiliary, 4)
         object.__setattr__(self, "auxiliary", frozen(auxiliary.copy()))
 
     def mean(self, queries: ArrayLike) -> Array:
@@ -128,8 +136,8 @@ class OrientationKMP(Immutable):
         Over time the velocity of the input is 1. Raises ValueError if a shape is another or a
         number is not finite.
         """
-        s = real("query", query)
-        moving = self.primitive.predict_motion(s, velocity, np.zeros_like(s), covariance=False)
+        still = np.zeros(self.primitive.inputs.shape[1])
+        moving = self.primitive.predict_motion(query, velocity, still, covariance=False)
         return np.asarray(rotation_per_zeta(moving.mean[:3]) @ moving.velocity[:3])
 
     def adapt(
@@ -153,7 +161,8 @@ class OrientationKMP(Immutable):
         skill.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
-        q = numbers("quaternions", quaternions, len(where), 4)
+        not_negative("tolerance", tolerance)
+        q = _unit("quaternions", numbers("quaternions", quaternions, len(where), 4))
         zeta = self._nearest(where, q)
         back = np.array([np.linalg.inv(rotation_per_zeta(one)) for one in zeta]).reshape(-1, 3, 3)
         turned = back @ _each("covariance", covariance, len(where)) @ back.transpose(0, 2, 1)
@@ -185,12 +194,13 @@ class OrientationKMP(Immutable):
         return log(signs * quaternions, self.auxiliary)
 
 
-def _unit(name: str, quaternions: ArrayLike) -> Array:
-    q = numbers(name, quaternions, "T", 4)
-    length = np.linalg.norm(q, axis=1, keepdims=True)
+def _unit(name: str, quaternions: ArrayLike, *shape: int) -> Array:
+    q = numbers(name, quaternions, *(shape or ("T", 4)))
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
     for n in np.flatnonzero(np.abs(length - 1) > _UNIT)[:1]:
-        norm = f"{length[n, 0]:.4g}"
-        raise ValueError(f"{name}[{n}] has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
+        which = "" if shape else f"[{n}]"
+        norm = f"{length.flat[n]:.4g}"
+        raise ValueError(f"{name}{which} has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
     return np.asarray(q / length)
 
 

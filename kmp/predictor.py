@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_finite, check_shape, real, whole
+from kmp.checks import Array, check_finite, check_shape, real, seeded, whole
 from kmp.compiled_query import CompiledQuery
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
@@ -100,7 +100,7 @@ class Predictor(Immutable):
         joint = self.predict_joint(queries)
         values, vectors = np.linalg.eigh(joint.covariance[0])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ root.T
+        drawn = np.random.default_rng(seeded(seed)).standard_normal((count, len(values))) @ root.T
         return np.asarray((joint.mean + drawn).reshape(count, -1, self.outputs))
 
     def predict_motion(
@@ -170,7 +170,7 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         total = self.predict(s).covariance
         c = self.kernel.channels
-        z = self._spanned(Functionals(s)).T.reshape(len(s), c, -1)
+        z = self._spanned(Functionals(s)).T.reshape(len(s), c, len(self._spanned.pivots))
         residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
         distance = nearest_positive_semidefinite(residual) * self.query.covariance_scale
         return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_kind, numbers, positive, real, whole
+from kmp.checks import Array, check_kind, not_negative, numbers, positive, squared, whole
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
@@ -85,7 +85,7 @@ class KMP(Predictor):
         if len(s) == 0:
             raise ValueError("inputs: no reference point given, at least 1 needed.")
         check_gaussians("reference", reference)
-        check_pairs(s, reference, reference.outputs)
+        check_pairs("reference", s, reference, reference.outputs)
         parameters = Hyperparameters.checked(
             kernel,
             lambda_mean,
@@ -94,10 +94,11 @@ class KMP(Predictor):
             inputs=s.shape[1],
             outputs=reference.outputs,
         )
-        if representation not in {"auto", "dense", "low_rank"}:
+        if not isinstance(representation, str) or representation not in {"auto", "dense", "low_rank"}:
             raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
         whole("rank", rank)
-        positive("rank_tolerance", rank_tolerance)
+        if positive("rank_tolerance", rank_tolerance) >= 1:
+            raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
         database = Database(Functionals.checked(s, directions), reference)
         return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
 
@@ -130,9 +131,8 @@ class KMP(Predictor):
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
         check_gaussians("desired", desired)
-        check_pairs(via, desired, self.outputs)
-        if not real("tolerance", tolerance) >= 0:
-            raise ValueError(f"tolerance is {tolerance:g}, and must not be below 0.")
+        check_pairs("desired", via, desired, self.outputs)
+        not_negative("tolerance", tolerance)
         points = Functionals.checked(via, directions)
         adapted = self._through(points, desired, tolerance)
         warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
@@ -151,7 +151,7 @@ class KMP(Predictor):
         given = numbers("jacobians", jacobians, len(via), self.outputs, self._dimensions)
         axes = np.tile(np.eye(self._dimensions), (len(via), 1))
         means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
-        variance = positive("deviation", deviation) ** 2
+        variance = squared("deviation", deviation)
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
         adapted = self._through(points, desired, 0.0)
@@ -188,7 +188,7 @@ class KMP(Predictor):
         Raises ValueError as `fit` and `adapt` do.
         """
         points = self.base.solution.database.functionals
-        check_pairs(points.inputs, reference, self.outputs)
+        check_pairs("reference", points.inputs, reference, self.outputs)
         database, parameters = Database(points, reference), self.solution.hyperparameters
         fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         if self is self.base:
@@ -260,3 +260,9 @@ class KMP(Predictor):
     def via_points(self) -> Gaussians:
         """The V via-points."""
         return self.changes.points
+
+
+def checked_primitive(value: object, name: str = "primitive") -> KMP:
+    """The value. Raises ValueError unless it is a `KMP`."""
+    check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
+    return cast(KMP, value)

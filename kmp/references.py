@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, pair, real
+from kmp.checks import Array, check_some, not_negative, numbers, pair, parts_of, real
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, fused_mean
 from kmp.gmm import GaussianMixture
+from kmp.hyperparameters import checked_kernel
 from kmp.immutable import Immutable
 from kmp.kernel import Kernel
 from kmp.linear_algebra import symmetric
-from kmp.primitive import KMP
+from kmp.primitive import KMP, checked_primitive
 
 
 def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussians:
@@ -30,9 +31,7 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
     Raises ValueError if there is no reference, shapes do not agree, or a priority is below 0 or
     their sum is not 1.
     """
-    if len(references) == 0:
-        raise ValueError("references: none given, at least 1 needed.")
-    for i, reference in enumerate(references):
+    for i, reference in enumerate(parts_of("references", references)):
         check_gaussians(f"references[{i}]", reference)
     n, outputs = references[0].mean.shape
     for i, other in enumerate(references):
@@ -71,6 +70,7 @@ class CoordinateFrame(Immutable):
 
     def __post_init__(self) -> None:
         offset = numbers("offset", self.offset, "O")
+        check_some("offset", offset)
         matrix = numbers("matrix", self.matrix, len(offset), len(offset))
         if np.linalg.cond(matrix) > 1e12:
             raise ValueError(f"matrix: {matrix.tolist()} given, and it must have an inverse.")
@@ -84,6 +84,7 @@ class CoordinateFrame(Immutable):
         Raises ValueError if the shape is another or a number is not finite.
         """
         offset = numbers("origin", origin, "O")
+        check_some("origin", offset)
         return cls(np.eye(len(offset)), offset)
 
     @classmethod
@@ -93,7 +94,7 @@ class CoordinateFrame(Immutable):
         Raises ValueError if the shape is another, a number is not finite, or there is no point.
         """
         points = numbers("path", path, "T", "O")
-        if len(points) == 0:
+        if points.size == 0:
             raise ValueError("path: no point given, at least 1 needed.")
         return cls.at(points[0]), cls.at(points[-1])
 
@@ -112,12 +113,19 @@ class CoordinateFrame(Immutable):
 
     def localised(self, normals: Gaussians) -> Gaussians:
         """The same normals in this frame's coordinates. Raises ValueError if O is another."""
+        check_gaussians("normals", normals, len(self.offset))
         inverse = np.linalg.inv(self.matrix)
         return normals.affine(inverse, -inverse @ self.offset)
 
     def placed(self, normals: Gaussians) -> Gaussians:
         """Normals of this frame's coordinates in the world's. Raises ValueError if O is another."""
+        check_gaussians("normals", normals, len(self.offset))
         return normals.affine(self.matrix, self.offset)
+
+
+def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
+    """How many there are. Raises ValueError unless they are frames."""
+    return len(parts_of(name, frames, CoordinateFrame, "CoordinateFrame(matrix, offset)"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,6 +139,14 @@ class LocalKMP(Immutable):
 
     primitives: tuple[KMP, ...]
     frames: tuple[CoordinateFrame, ...]
+
+    def __post_init__(self) -> None:
+        for i, primitive in enumerate(parts_of("primitives", self.primitives)):
+            checked_primitive(primitive, f"primitives[{i}]")
+        _check_frames("frames", self.frames)
+        needed = [primitive.outputs for primitive in self.primitives]
+        if (given := [len(frame.offset) for frame in self.frames]) != needed:
+            raise ValueError(f"frames: over {given} outputs given, over {needed} needed.")
 
     @classmethod
     def learn(
@@ -153,7 +169,9 @@ class LocalKMP(Immutable):
 
         Raises ValueError if not each demonstration has F frames, and as these two do.
         """
-        counts = [len(one) for one in frames]
+        kernel = checked_kernel(kernel)
+        parts_of("demonstrations", demonstrations)
+        counts = [_check_frames(f"frames[{h}]", one) for h, one in enumerate(parts_of("frames", frames))]
         if len(counts) != len(demonstrations) or len(set(counts)) != 1:
             count = len(demonstrations)
             raise ValueError(f"frames: {counts} given for {count} demonstrations, as many for each needed.")
@@ -187,7 +205,9 @@ class LocalKMP(Immutable):
 
     def placed(self, frames: Sequence[CoordinateFrame]) -> LocalKMP:
         """The skill with its F frames elsewhere. Raises ValueError if F or O is another."""
-        if [len(frame.offset) for frame in frames] != [len(frame.offset) for frame in self.frames]:
+        if _check_frames("frames", frames) and [len(frame.offset) for frame in frames] != [
+            len(frame.offset) for frame in self.frames
+        ]:
             count, outputs = len(self.frames), len(self.frames[0].offset)
             raise ValueError(f"frames: {len(frames)} given, {count} over {outputs} outputs needed.")
         return LocalKMP(self.primitives, tuple(frames))
@@ -212,7 +232,8 @@ class LocalKMP(Immutable):
         `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
-        check_pairs(via, desired, self.primitives[0].outputs)
+        not_negative("tolerance", tolerance)
+        check_pairs("desired", via, desired, self.primitives[0].outputs)
         pairs = zip(self.frames, self.primitives, strict=True)
         adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)
         return LocalKMP(tuple(adapted), self.frames)

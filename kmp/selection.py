@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, numbers, pair, positive
+from kmp.checks import Array, check_kind, numbers, pair, parts_of, positive, whole
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
+from kmp.hyperparameters import checked_kernel
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.primitive import KMP
@@ -55,7 +56,7 @@ class Learned(Immutable):
     def report(self, count: int = 10) -> str:
         """The best `count` of the scores as a table."""
         lines = [f"{'ell':>40} {'lambda':>10} {'lambda_c':>10} {'RMSE':>10} {'-log lik.':>10}"]
-        for one in self.scores[:count]:
+        for one in self.scores[: whole("count", count)]:
             ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(one.ell))
             other = "" if one.lambda_covariance is None else f"{one.lambda_covariance:.3g}"
             likelihood = "" if one.negative_log_likelihood is None else f"{one.negative_log_likelihood:.3f}"
@@ -156,6 +157,10 @@ def learn(
     for name, value in (("lambda_mean", lambda_mean), ("lambda_covariance", lambda_covariance)):
         if value is not None:
             positive(name, value)
+    whole("count", count)
+    check_kind("velocity", velocity, bool, "True or False")
+    if kernel is not None:
+        checked_kernel(kernel).check(data[0][0].shape[1], data[0][1].shape[1])
     recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1)
     full, mixture = recipe.reference(data)
     scores: list[Score] = []
@@ -254,10 +259,8 @@ def _negative_log_likelihood(residual: Array, covariance: Array) -> float:
 
 
 def _checked(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:
-    if len(demonstrations) == 0:
-        raise ValueError("demonstrations: none given, at least 1 needed.")
     data: list[tuple[Array, Array]] = []
-    for h, demonstration in enumerate(demonstrations):
+    for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):
         inputs, outputs = pair(f"demonstrations[{h}]", demonstration)
         i, o = (data[0][0].shape[1], data[0][1].shape[1]) if data else ("I", "O")
         s = numbers(f"demonstrations[{h}] inputs", inputs, "T", i)

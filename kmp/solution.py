@@ -11,7 +11,9 @@ from kmp.checks import Array
 from kmp.database import Changes, Database
 from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
-from kmp.kernel import between
+from kmp.kernel import between, variances
+
+_RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
 
 
 class Solution(Protocol):
@@ -81,3 +83,27 @@ def mean_of(solution: Solution, queries: Functionals) -> Array:
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
     expansion = (between(parameters.kernel, queries, solution.functionals) @ weights).reshape(-1, parameters.outputs)
     return np.asarray(expansion + parameters.prior_at(queries))
+
+
+def check_resolved(
+    parameters: Hyperparameters,
+    points: Database,
+    *,
+    first: int = 0,
+    name: Literal["lambda_mean", "lambda_covariance"] = "lambda_covariance",
+) -> None:
+    """Raises ValueError where rounding would hide what lambda Sigma adds to k(s, s).
+
+    The points are numbered from the `first` on; `name` says which lambda.
+    """
+    penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
+    scale = np.sqrt(variances(parameters.kernel, points.functionals)).repeat(parameters.channel_outputs, axis=1)
+    covariance = points.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+    least = penalty * np.linalg.eigvalsh(covariance)[:, 0]
+    for n in np.flatnonzero(least < _RESOLVED)[:1]:
+        enough = penalty * _RESOLVED / max(least[n], 1e-300)
+        raise ValueError(
+            f"The covariance at point {first + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} of "
+            f"k(s, s) there, at least {_RESOLVED:g} needed. Give the point a greater variance, or the primitive a "
+            f"{name} of at least {enough:.3g}."
+        )

@@ -49,6 +49,12 @@ def save(path: str | Path, value: object, *, input_unit: str, output_unit: str) 
     Or any other value of this package. The file has this very name. Raises OSError if the file
     cannot be written, and ValueError if the value is none of this package.
     """
+    for name, given in (
+        ("path", str(path) if isinstance(path, Path) else path),
+        ("input_unit", input_unit),
+        ("output_unit", output_unit),
+    ):
+        check_kind(name, given, str, "a text")
     units = {
         "kmp_format": np.array(_FORMAT),
         "input_unit": np.array(input_unit),
@@ -65,6 +71,7 @@ def load(path: str | Path) -> Stored:
     Raises OSError if the file cannot be read, and ValueError if it is not one that `save` wrote, or
     was changed since. Files of earlier versions have no checksum, and are taken without.
     """
+    check_kind("path", str(path) if isinstance(path, Path) else path, str, "the file's name")
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = dict(archive)

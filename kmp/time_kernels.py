@@ -117,7 +117,7 @@ class VelocityKernel(_OneInput):
         """Raises ValueError unless there is one input, and there are as many rates as values."""
         if inputs != 1 or outputs % 2:
             raise ValueError(
-                f"{inputs} inputs and {outputs} outputs given; value and rate over time need "
+                f"kernel: {inputs} inputs and {outputs} outputs given; value and rate over time need "
                 "1 input and an even number of outputs: the values, then their rates."
             )
 
@@ -131,6 +131,7 @@ class VelocityKernel(_OneInput):
 
     @staticmethod
     def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
+        r = np.where(values > 0, r, 0.0)  # far away all is 0, where infinity times 0 would be no number
         # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
         k = [values, -2 * scale * r * values]
         for n in range(1, order + 2):
@@ -162,7 +163,7 @@ class PeriodicKernel(_OneInput):
     def check(self, inputs: int, outputs: int) -> None:
         """Raises ValueError unless there is one input."""
         if inputs != 1:
-            raise ValueError(f"{inputs} inputs given; a periodic kernel needs 1, the time or a phase.")
+            raise ValueError(f"kernel: {inputs} inputs given; a periodic kernel needs 1, the time or a phase.")
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         """In radians."""

@@ -168,6 +168,22 @@ def test_adapt_200(benchmark, small):
     compare(benchmark, call, factorised(), 0.6, "dpotrf(600 x 600)")
 
 
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # others near it say something else
+@pytest.mark.parametrize(("count", "inserted", "replaced"), [(200, 0.22, 1.5), (1000, 0.07, 1.3)])
+def test_adapt_beside_a_fit(benchmark, mixture, count, inserted, replaced):
+    data = database(mixture, count)
+    fitted = KMP.fit(*data, kernel=GaussianKernel(0.5), lambda_mean=2.0, representation="dense")
+    calls = (
+        lambda: KMP.fit(*data, kernel=GaussianKernel(0.5), lambda_mean=2.0, representation="dense"),
+        lambda: fitted.adapt(*VIA, tolerance=0.0),
+        lambda: fitted.adapt(data[0][3:4], data[1][3:4], tolerance=1e-9),
+    )
+    benchmark.pedantic(calls[1], rounds=5)
+    fit_s, insert_s, replace_s = np.min([[best(one, rounds=1) for one in calls] for _ in range(5)], axis=0)
+    report(benchmark, insert_s, fit_s, inserted, "a fit, for one more point")
+    report(benchmark, replace_s, fit_s, replaced, "a fit, for an early point replaced")
+
+
 def test_fit_100_000(benchmark, large):
     primitive, took, (before, peak) = large
     r, d = primitive.solution.w.shape

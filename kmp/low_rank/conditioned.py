@@ -18,6 +18,7 @@ from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bound
+from kmp.solution import check_resolved
 
 if TYPE_CHECKING:
     from kmp.low_rank.solution import LowRank
@@ -77,7 +78,7 @@ class Conditioned(Immutable):
         """(r + V, O) the weights of the kernels there."""
         base, penalty, d = self.base, self.hyperparameters.lambda_mean, self.base.w.shape[1]
         shared = penalty == self.hyperparameters.lambda_covariance
-        system = self._covariance_system if shared else self._system(penalty, base.mean_factor)
+        system = self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
         wanted = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
         pull = system.solve((wanted - mean).ravel())
@@ -136,7 +137,7 @@ class Conditioned(Immutable):
 
     @cached_property
     def _covariance_system(self) -> _System:
-        return self._system(self.hyperparameters.lambda_covariance, self.base.covariance_factor)
+        return self._system("lambda_covariance", self.base.covariance_factor)
 
     def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
@@ -155,11 +156,16 @@ class Conditioned(Immutable):
         before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
         return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
-    def _system(self, penalty: float, base_factor: Array) -> _System:
+    def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
+        parameters, added = self.hyperparameters, Database(self.changes.functionals, self.changes.points)
+        check_resolved(parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name)
+        penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
-        added, first = self.changes.functionals, self._added_columns
+        first = self._added_columns
         lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
-        left = between(self.hyperparameters.kernel, added, added) - self._z[:, :first].T @ self._z[:, :first]
+        left = (
+            between(parameters.kernel, added.functionals, added.functionals) - self._z[:, :first].T @ self._z[:, :first]
+        )
         for i in range(d):
             lifted[:, i, :, i] = self._z
             residual[:first, i, :first, i] = left

@@ -14,31 +14,42 @@ def error_bound(solution: Solution, features: Features, *, added: int = 0) -> fl
 
     The last `added` reference points are via-points. The least of two bounds. Let K = Z^T Z + E: E
     is positive semidefinite and its diagonal e is known. With alpha = Sigma^-1 (mu - xi) / lambda
-    the low rank solution is the dense one for means moved by E alpha, of which element n is at most
-    sqrt(e_n) sum_m sqrt(e_m) |alpha_m|; and moving the means by delta moves the solution f by so
-    much that |Sigma^-1/2 df| <= |Sigma^-1/2 delta|. This is the lower where the rank suffices.
+    the low rank solution is the dense one for means moved by delta = K alpha - xi, the prior mean
+    subtracted, and off by (I - S) delta, where S smooths: |Sigma^-1/2 (I - S) delta| is at most
+    |Sigma^-1/2 delta|, and sqrt(lambda) / 2 |g| where delta = Z^T g. So count E alpha, of which
+    element n is at most sqrt(e_n) sum_m sqrt(e_m) |alpha_m|, and g = Z alpha - w, by which the low
+    rank equations are not solved. This is the lower where the rank suffices.
 
     The cost (4) is quadratic and least at the dense solution: |Sigma^-1/2 df|^2 is at most what (4)
     is.
     """
     kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
-    points, reference = solution.database.functionals, solution.database.reference
-    c, count = kernel.channels, len(points)
+    points, reference, known = solution.database.functionals, solution.database.reference, solution.functionals
+    c, count, rank = kernel.channels, len(points), len(features.pivots)
     blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
     miss = reference.mean - np.concatenate([mean_of(solution, block) for block in blocks])
     pull = np.linalg.solve(reference.covariance, miss[:, :, None])[:, :, 0]
     spread = np.linalg.eigvalsh(reference.covariance)
 
+    alpha = pull.reshape(count, c, -1) / lambda_mean  # (N, C, D)
+    weights = solution.weights.reshape(len(known), c, -1)
+    neglected = alpha.copy()
+    neglected[count - added :] = 0  # to via-points nothing is neglected
+    alpha[count - added :] -= weights[rank:]
     residual = np.concatenate([features.residual(block) for block in blocks])
     root = np.sqrt(residual * variances(kernel, points))[:, :, None]  # (N, C, 1)
-    pulled = root * np.abs(pull.reshape(count, c, -1)) / lambda_mean
-    data, via = pulled[: count - added].sum(axis=(0, 1)), pulled[count - added :].sum(axis=(0, 1))
-    moved = root * (data + via)  # (N, C, D)
-    moved[count - added :] -= root[count - added :] * via  # between via-points nothing is neglected
-    total = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum())
-    by_means = total + moved[: count - added].max(initial=0) / np.sqrt(spread[:, -1].max())
+    moved = root * (root * np.abs(neglected)).sum(axis=(0, 1))
+    unsolved = -features.root.T @ weights[:rank, 0]  # g (r, D)
+    for i, block in zip(range(0, count, BLOCK), blocks, strict=True):
+        part = alpha[i : i + BLOCK]
+        unsolved += features(block) @ part.reshape(-1, part.shape[2])
+    via = points.take(slice(count - added, None))
+    apart = alpha[count - added :].reshape(added * c, alpha.shape[2])
+    z = features(via)
+    squared = (unsolved**2).sum() + (apart * ((between(kernel, via, via) - z.T @ z) @ apart)).sum()
+    by_means = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum()) + np.sqrt(lambda_mean * squared) / 2
 
-    weights = solution.weights.reshape(len(solution.functionals) * c, -1)
-    penalty = (weights * (between(kernel, solution.functionals, solution.functionals) @ weights)).sum()
+    flat = weights.reshape(len(known) * c, -1)
+    penalty = (flat * (between(kernel, known, known) @ flat)).sum()
     by_cost = np.sqrt((miss * pull).sum() + lambda_mean * max(float(penalty), 0.0))
     return float(np.sqrt(spread[:, -1].max()) * min(by_means, by_cost))

@@ -46,8 +46,11 @@ class Features(Immutable):
         """The features of N points, at most `rank`, and their largest residual at one of them.
 
         That is a share of k(s, s), and no more than `tolerance` unless the rank does not reach so
-        far.
+        far. Where the kernel has rates too, the rates at the points may be pivots, as derivatives.
         """
+        if kernel.channels > 1:
+            values = points.inputs[points.values]
+            points = Functionals.concatenated([points, Functionals(values, frozen(np.ones(values.shape)))])
         count = len(points)
         index = np.linspace(0, count - 1, min(count, _CANDIDATES)).astype(np.intp)
         for _ in range(_ROUNDS):

@@ -21,6 +21,7 @@ from kmp.linear_algebra import kron_identity
 from kmp.low_rank.conditioned import Conditioned
 from kmp.low_rank.error_bound import error_bound
 from kmp.low_rank.features import BLOCK, Features
+from kmp.solution import check_resolved
 
 RANK = 400
 TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
@@ -53,7 +54,11 @@ class LowRank(Immutable):
         features: Features,
         base: LowRank | None = None,
     ) -> LowRank:
-        """The solution. Raises ValueError if the normal equations cannot be solved."""
+        """The solution. Raises ValueError if the normal equations cannot be solved.
+
+        Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
+        """
+        check_resolved(hyperparameters, database, name="lambda_mean")
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
@@ -179,6 +184,7 @@ class LowRank(Immutable):
     def covariance_factor(self) -> Array:
         """The same with the lambda of the covariance."""
         parameters = self.hyperparameters
+        check_resolved(parameters, self.database)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self.mean_factor
         return _factorised(self.information, parameters.lambda_covariance)
@@ -200,20 +206,23 @@ def _factorised(information: Array, penalty: float) -> Array:
 
 def _add_information(total: Array, z: Array, precision: Array) -> None:
     """Adds sum_n z_n^T z_n (x) Sigma_n^-1 (r, D, r, D), of z (n, C, r), precisions (n, O, O)."""
-    n, c, _ = z.shape
+    n, c, r = z.shape
     d = total.shape[1]
     blocks = precision.reshape(n, c, d, c, d)
 
     def along(*outputs: int) -> Array:
         # A A^T is twice as fast as A B, so off the diagonal: 2 a b = (a + b)^2 - a^2 - b^2.
-        root = np.linalg.cholesky(sum(blocks[:, :, i, :, j] for i in outputs for j in outputs))  # (n, C, C)
-        parts = (np.asarray(sum(z[:, b] * root[:, b, a, None] for b in range(a, c))) for a in range(c))
-        return np.asarray(sum((part.T @ part for part in parts), start=np.zeros(())))
+        square = np.asarray(sum(blocks[:, 0, i, 0, j] for i in outputs for j in outputs))
+        part = z[:, 0] * np.sqrt(np.maximum(square, 0.0))[:, None]  # below 0 by rounding alone
+        return np.asarray(part.T @ part)
 
-    diagonal = [along(i) for i in range(d)]
+    diagonal = [along(i) for i in range(d)] if c == 1 else []
     for i in range(d):
-        total[:, i, :, i] += diagonal[i]
-        for j in range(i):
-            share = (along(i, j) - diagonal[i] - diagonal[j]) / 2
+        for j in range(i + 1):
+            if c == 1:
+                share = diagonal[i] if i == j else (along(i, j) - diagonal[i] - diagonal[j]) / 2
+            else:  # the block of two outputs between the channels is not symmetric
+                share = z.reshape(-1, r).T @ (blocks[:, :, i, :, j] @ z).reshape(-1, r)
             total[:, i, :, j] += share
-            total[:, j, :, i] += share.T
+            if i != j:
+                total[:, j, :, i] += share.T

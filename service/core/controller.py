@@ -15,7 +15,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.records import Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
-from service.core.decision.decision import FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
+from service.core.decision.decision import ALONE, FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
 from service.core.frame import (
     Event,
     Frame,
@@ -109,6 +109,7 @@ class Controller:
         state, frame = self._state, self._blank.copy()[0]
         known = self._take_in(tick, frame)
         lap("intake")
+        known |= self._alone(frame)
         wanted = self._skill.step(state, frame) if known & HANDS_KNOWN else None
         lap("skill")
         here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
@@ -138,6 +139,15 @@ class Controller:
             else:
                 self.decision.take(state, event)
         return self.intake.step(state, frame, tick.index - int(state["tick"]), samples)
+
+    def _alone(self, frame: Frame) -> int:
+        """HANDS_KNOWN and ALONE, where one hand conducts the skill and the other never was seen.
+        One that was seen once may be anywhere: the arm keeps away from it, so it must be seen.
+        """
+        side, ages = self.skill.conductor, frame["hand_ages"]
+        if side is None or not ages[1 - side] < 0 <= ages[side]:
+            return 0
+        return ALONE | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
 
     def _adopt(self, skill: Skill) -> None:
         self._skill.adopt(self._state, skill)

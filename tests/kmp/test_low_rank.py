@@ -3,13 +3,15 @@
 import pickle
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kmp import KMP, GaussianKernel, Gaussians, RankReached, VelocityKernel, ViaPointMissed
+from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, RankReached, VelocityKernel, ViaPointMissed
+from kmp.solution import mean_of
 
 properties = settings(max_examples=10, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -120,7 +122,7 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
 @given(seeds)
 def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_known(seed):
     inputs, reference = tube(seed, 60)
-    exact = Gaussians(reference.mean, np.tile(1e-12 * np.eye(3), (60, 1, 1)))
+    exact = Gaussians(reference.mean, np.tile(2e-11 * np.eye(3), (60, 1, 1)))
     low = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation="low_rank")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ViaPointMissed)
@@ -129,6 +131,28 @@ def test_the_covariance_is_symmetric_and_positive_definite_even_where_all_is_kno
         for covariance in (one.predict(inputs).covariance, one.predict(inputs[:1]).covariance):
             assert np.array_equal(covariance, covariance.swapaxes(1, 2))
             assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+@pytest.mark.parametrize("variance", [1e-12, 1e-16, 1e-19])
+@pytest.mark.parametrize("representation", ["dense", "low_rank", "auto"])
+def test_a_covariance_that_rounding_would_hide_is_refused(variance, representation):
+    inputs, reference = tube(0, 600)
+    options = {"kernel": kernel, "representation": representation}
+    hidden = Gaussians(reference.mean, np.tile(variance * np.eye(3), (600, 1, 1)))
+    with pytest.raises(ValueError, match=r"lost in rounding: .* 1e-11 needed|not positive definite to working"):
+        KMP.fit(inputs, hidden, lambda_mean=1.0, **options)
+    if representation != "dense":
+        with pytest.raises(ValueError, match=r"at point 0 would be lost .* a lambda_mean of at least"):
+            KMP.fit(inputs, hidden, lambda_mean=1.0, lambda_covariance=1e9, **options)
+    one, point = KMP.fit(inputs, reference, lambda_mean=1.0, **options), hidden[:1]
+    with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding: .* a lambda_\w+ of at least"):
+        one.adapt(inputs[:1] + 0.1, point, tolerance=0.0)
+    with pytest.raises(ValueError, match=r"at point 599 would be lost in rounding"):
+        one.adapt(inputs[:1], point, tolerance=0.001)
+    with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding"):
+        KMP.fit(inputs, reference, lambda_mean=1e6, lambda_covariance=1.0, **options).adapt(
+            inputs[:1] + 0.1, point, tolerance=0.0
+        )
 
 
 def test_threads_may_share_it():
@@ -194,6 +218,50 @@ def test_position_with_velocity_too():
     dense, low = (one.adapt(*via, tolerance=0.01) for one in (dense, low))
     agree(dense, low, t[::10] + 0.003, within=1e-5)
     np.testing.assert_allclose(low.mean([[0.77]]), [[0.9, 0.0, 0.5, -2.0]], atol=1e-3)
+
+
+def correlated(seed, count, outputs, spread):
+    """A path over time with its rates, and correlations: deviations of 10 mm to 10 mm / spread."""
+    random, t = np.random.default_rng(seed), np.linspace(0, 2, count)[:, None]
+    half = np.arange(2, 2 + outputs // 2)
+    mean = np.hstack([np.sin(half * t), half * np.cos(half * t)])
+    turn = np.linalg.qr(random.normal(size=(count, outputs, outputs)))[0]
+    covariance = (turn * np.geomspace(1e-4, 1e-4 / spread**2, outputs)) @ turn.swapaxes(1, 2)
+    return t, Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2)
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are surer than the data is smooth
+@pytest.mark.parametrize("one", [GaussianKernel(8.0), PeriodicKernel(2.0, 3.0), VelocityKernel(8.0)], ids=repr)
+@pytest.mark.parametrize("outputs", [2, 4, 6])
+@pytest.mark.parametrize("spread", [1.0, 30.0, 300.0])
+def test_correlations_of_any_outputs_count_with_any_kernel(one, outputs, spread):
+    t, reference = correlated(outputs, 150, outputs, spread)
+    dense, low = of_both(t, reference, kernel=one, lambda_mean=10.0)
+    via = t[50:51] + 0.004, Gaussians(reference.mean[50:51] + 0.01, reference.covariance[70:71])
+    for a, b in ((dense, low), (dense.adapt(*via, tolerance=0.02), low.adapt(*via, tolerance=0.02))):
+        error = np.linalg.norm(b.mean(dense.inputs) - a.mean(dense.inputs), axis=1).max()
+        assert error < 1e-5
+        assert error <= b.error_bound
+        scale = np.abs(a.predict(t).covariance).max()
+        np.testing.assert_allclose(b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale)
+
+
+def test_the_rank_suffices_for_rates_too_also_where_points_are_far_apart():
+    for count in (12, 150):
+        t, reference = correlated(0, count, 4, 1.0)
+        for one in (VelocityKernel(8.0), VelocityKernel(200.0)):
+            dense, low = of_both(t, reference, kernel=one, lambda_mean=10.0)
+            residual = low.solution.features.residual(low.solution.database.functionals)
+            assert residual.max(axis=0) == pytest.approx(0, abs=4e-12)
+            np.testing.assert_allclose(low.mean(t), dense.mean(t), atol=1e-8)
+
+
+def test_the_error_bound_tells_of_equations_that_are_not_solved():
+    low = both(0)[1].solution
+    wrong = replace(low, w=low.w * (1 + 1e-3))
+    error = np.linalg.norm(mean_of(wrong, low.functionals) - mean_of(low, low.functionals), axis=1).max()
+    assert error > 1e-4
+    assert low.error_bound < 1e-5 < error < wrong.error_bound + low.error_bound
 
 
 def test_large_problems_choose_the_low_rank_and_small_ones_the_dense_solution():

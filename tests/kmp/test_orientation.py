@@ -144,7 +144,7 @@ def test_what_cannot_be_done_is_refused_with_what_could():
     for call, says in (
         (lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]), r"quaternions\[0\] has norm 2, and must have 1"),
         (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
-        (lambda: OrientationKMP(one.primitive, [0, 0, 1.0]), r"auxiliary: shape \(1, 3\) given, \(T, 4\) needed"),
+        (lambda: OrientationKMP(one.primitive, [0, 0, 1.0]), r"auxiliary: shape \(3,\) given, \(4,\) needed"),
         (lambda: one.adapt([[0.5]], q[:, :3], np.eye(3), tolerance=0), r"quaternions: shape \(1, 3\) given"),
         (
             lambda: one.adapt([[0.5]], q, np.eye(2), tolerance=0),

@@ -1,6 +1,7 @@
 """What every solution must be, whichever way it was found."""
 
 import inspect
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -161,3 +162,21 @@ def test_adapting_changes_whether_outputs_are_solved_as_one(first):
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
     one, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
     np.testing.assert_allclose(one, other, atol=1e-10)
+
+
+@pytest.mark.parametrize("lambda_covariance", [None, 3.0])
+def test_adapting_copies_no_factor_and_gives_what_a_fit_of_all_points_gives(lambda_covariance):
+    inputs = np.random.default_rng(1).normal(size=(600, 2))
+    reference = Gaussians(np.sin(inputs), np.tile(0.01 * np.eye(2), (600, 1, 1)))
+    one = KMP.fit(inputs, reference, kernel=GaussianKernel(1.0), lambda_mean=1.0, lambda_covariance=lambda_covariance)
+    factor = one.solution.mean_factor
+    tracemalloc.start()
+    adapted = one.adapt(inputs[:3] + 0.01, reference[:3], tolerance=0.0).solution
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < factor.nbytes / 4
+    anew = Dense(adapted.hyperparameters, adapted.database)
+    np.testing.assert_allclose(adapted.weights, anew.weights, atol=1e-10)
+    for name in ("mean_factor", "covariance_factor"):
+        np.testing.assert_allclose(getattr(adapted, name), getattr(anew, name), atol=1e-10)
+    assert (adapted.mean_factor is adapted.covariance_factor) == (lambda_covariance is None)

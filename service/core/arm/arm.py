@@ -22,9 +22,8 @@ DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of
 SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
 SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the WAM's table
 
-# [1/s] of a small error's decay; at most so many times `acceleration_rate`, or joints swing
-POSITION_GAIN, POSITION_GAIN_SHARE = 50.0, 2.0
-TURN_GAIN, TURN_GAIN_SHARE = 10.0, 0.4
+POSITION_GAIN, TURN_GAIN = 50.0, 10.0  # [1/s] of small errors' decay; at most ...
+POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_rate`, or joints swing about the target
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets

@@ -1,0 +1,290 @@
+"""Every public call of the package, given what is wrong in each of its arguments, one at a time.
+
+It ends in a ValueError that names the argument, in words that are not NumPy's. What may be legal,
+such as huge numbers, may work instead.
+"""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+
+import kmp
+from kmp import (
+    KMP,
+    AffineMean,
+    CoordinateFrame,
+    Correlation,
+    GaussianKernel,
+    GaussianMixture,
+    Gaussians,
+    LinearConstraints,
+    LocalKMP,
+    OrientationKMP,
+    PeriodicKernel,
+    VelocityKernel,
+    orientation,
+)
+
+S = np.random.default_rng(0).normal(size=(6, 2))
+R = Gaussians(S, np.tile(0.01 * np.eye(2), (6, 1, 1)))
+K = GaussianKernel(1.0)
+ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
+LOW = KMP.fit(S, R, kernel=K, lambda_mean=1.0, representation="low_rank").adapt(S[:1], R[:1], tolerance=0.1)
+Q = np.tile([0.0, 0.0, 0.0, 1.0], (6, 1))
+ZETA = Gaussians(0.1 * S @ np.eye(2, 3), np.tile(0.01 * np.eye(3), (6, 1, 1)))
+TURNING = OrientationKMP(KMP.fit(S, ZETA, kernel=K, lambda_mean=1.0), Q[0])
+T = np.linspace(0, 1, 6)[:, None]
+SIX = Gaussians(np.hstack([ZETA.mean, ZETA.mean]), np.tile(0.01 * np.eye(6), (6, 1, 1)))
+IN_TIME = KMP.fit(T, SIX, kernel=VelocityKernel(1.0), lambda_mean=1.0).adapt(T[:1], SIX[:1], tolerance=0.1)
+TURNING_IN_TIME = OrientationKMP(IN_TIME, Q[0])
+FRAME = CoordinateFrame.at([0.0, 1.0])
+PAIRS = [(S, S + 0.1 * i) for i in range(2)]
+FRAMES = [(FRAME, CoordinateFrame.at([0.1 * i, 0.0])) for i in range(2)]
+MIXTURE = GaussianMixture.fit(np.hstack([S, S]), components=2, seed=0)
+NEUTRAL = Correlation.neutral(S[:2], width=1.0, outputs=2)
+LIMITS = LinearConstraints(S[:2], S[:2], np.full(2, -9.0))
+LEARN = {"components": 2, "seed": 0, "kernel": K, "lambda_mean": 1.0, "lambda_covariance": 1.0}
+LOCAL = LocalKMP.learn(PAIRS, FRAMES, S, **LEARN)
+LEARNED = kmp.learn(PAIRS, count=5, **LEARN)
+IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts": 2, "seed": 0}
+
+# What each public callable is rightly called with.
+RIGHT = {
+    Gaussians: {"mean": R.mean, "covariance": R.covariance},
+    R.affine: {"matrix": np.eye(2), "offset": np.zeros(2)},
+    Gaussians.concatenated: {"parts": [R, R]},
+    GaussianMixture: {"weights": np.ones(1), "means": np.zeros((1, 2)), "covariances": np.eye(2)[None]},
+    GaussianMixture.fit: {"samples": np.hstack([S, S]), "components": 2, "seed": 0, "regularization": 1e-6},
+    MIXTURE.regress: {"inputs": S},
+    MIXTURE.sample_inputs: {"count": 3, "dimensions": 2, "seed": 0},
+    GaussianKernel: {"ell": np.ones(2)},
+    PeriodicKernel: {"ell": 1.0, "period": 2.0},
+    VelocityKernel: {"ell": 1.0},
+    KMP.fit: {
+        "inputs": S,
+        "reference": R,
+        "kernel": K,
+        "lambda_mean": 1.0,
+        "lambda_covariance": 2.0,
+        "prior_mean": np.zeros(2),
+        "directions": np.zeros((6, 2)),
+        "representation": "low_rank",
+        "rank": 10,
+        "rank_tolerance": 1e-9,
+    },
+    ONE.adapt: {"inputs": S[:2], "desired": R[:2], "tolerance": 0.1, "directions": np.zeros((2, 2))},
+    ONE.adapt_jacobian: {"inputs": S[:1], "jacobians": np.eye(2)[None], "deviation": 0.1},
+    ONE.constrained: {"constraints": LIMITS},
+    ONE.refitted: {"reference": R},
+    KMP.from_arrays: {"arrays": LOW.to_arrays()},
+    ONE.mean: {"queries": S},
+    LOW.mean: {"queries": S[:1]},
+    ONE.predict: {"queries": S},
+    LOW.predict: {"queries": S[:1]},
+    ONE.predict_joint: {"queries": S},
+    ONE.sample: {"queries": S, "count": 2, "seed": 0},
+    ONE.predict_motion: {"query": S[0], "velocity": S[1], "acceleration": S[2]},
+    ONE.jacobian: {"query": S[0]},
+    ONE.jacobians: {"queries": S},
+    ONE.curvature: {"query": S[0], "direction": S[1]},
+    ONE.uncertainty: {"queries": S},
+    LinearConstraints: {"inputs": S, "normals": S, "bounds": S[:, 0], "directions": S},
+    LIMITS.joined: {"other": LIMITS},
+    Correlation: {"centres": S, "width": 1.0, "theta": S},
+    Correlation.neutral: {"centres": S, "width": 1.0, "outputs": 2},
+    NEUTRAL.__call__: {"inputs": S},
+    NEUTRAL.applied: {"primitive": ONE},
+    kmp.improve: {"primitive": ONE, "reward": lambda path: -float(path.sum()), "queries": S, **IMPROVE},
+    AffineMean: {"matrix": np.eye(2), "offset": np.zeros(2)},
+    CoordinateFrame: {"matrix": np.eye(2), "offset": np.zeros(2)},
+    CoordinateFrame.at: {"origin": np.zeros(2)},
+    CoordinateFrame.start_and_goal: {"path": S},
+    FRAME.local: {"points": S},
+    FRAME.localised: {"normals": R},
+    FRAME.placed: {"normals": R},
+    LocalKMP: {"primitives": LOCAL.primitives, "frames": FRAMES[0]},
+    LocalKMP.learn: {"demonstrations": PAIRS, "frames": FRAMES, "inputs": S, **LEARN, "regularization": 1e-6},
+    LOCAL.placed: {"frames": FRAMES[0]},
+    LOCAL.mean: {"queries": S},
+    LOCAL.predict: {"queries": S},
+    LOCAL.adapt: {"inputs": S[:1], "desired": R[:1], "tolerance": 0.1},
+    OrientationKMP: {"primitive": TURNING.primitive, "auxiliary": Q[0]},
+    TURNING.mean: {"queries": S},
+    TURNING.predict: {"queries": S},
+    TURNING.angular_velocity: {"query": S[0], "velocity": S[1]},
+    TURNING_IN_TIME.adapt: {
+        "inputs": T[:2],
+        "quaternions": Q[:2],
+        "covariance": 0.01 * np.eye(3),
+        "tolerance": 0.1,
+        "angular_velocities": np.zeros((2, 3)),
+        "velocity_covariance": np.eye(3),
+    },
+    orientation.continuous: {"quaternions": Q},
+    orientation.multiplied: {"a": Q, "b": Q},
+    orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
+    orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
+    orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
+    kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
+    kmp.learn: {"demonstrations": PAIRS, "count": 5, "velocity": False, "regularization": 1e-6, **LEARN},
+    kmp.save: {"path": "skill.npz", "value": ONE, "input_unit": "m", "output_unit": "m"},
+    kmp.load: {"path": "skill.npz"},
+    LEARNED.report: {"count": 3},
+}
+# Not here: `others` of a product, which are many; what is chosen as NumPy would; what is any truth.
+LEFT_OUT = {("product", "others"), ("take", "index"), ("__getitem__", "index"), ("predict_motion", "covariance")}
+MADE_BY_THE_PACKAGE = {"Improvement", "Learned", "MotionPrediction", "Score", "Stored", "Uncertainty", "KMP"}
+OF_THE_KERNEL = {"check", "coordinates", "variances", "values", "blocks", "row", "jacobian", "curvature"}
+
+OPTIONAL = {"lambda_covariance", "prior_mean", "directions", "angular_velocities", "velocity_covariance"}
+WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
+NO_NUMBERS = [
+    *(None, "text", b"bytes", object(), object, {}, {"a": 1.0}, {1.0}, [["a"]], [[1.0], [1.0, 2.0]], 1j, [1j]),
+    *(lambda: 0.0, np.array("1"), np.array([None]), np.datetime64("2020-01-01"), [{}], 10**400, [[[]]], slice(2)),
+]
+NO_SCALARS = [*NO_NUMBERS, np.nan, np.inf, -np.inf, -1.0, [1.0], [], np.ones(2), np.ones((1, 1)), [True]]
+NUMPYS = re.compile(
+    "broadcast|could not|ambiguous|inhomogeneous|ufunc|reshape|matmul|dimension mismatch|out of bounds|unpack|"
+    "core dimension|concatenat|index|iterable|has no attr|unsupported|convert|stack|Object arrays|not callable"
+)
+
+
+def wrong_arrays(array):
+    """What is no array of this shape, and what may be one that works."""
+    spoilt = np.array(array, dtype=float)
+    spoilt.flat[0] = np.inf
+    wrong = [*NO_NUMBERS, spoilt * 0, spoilt, -spoilt, array[None], array[..., None], 1.0, [], array * 1j]
+    wrong += [np.array(array, dtype=str), np.array(array, dtype=object), np.zeros((*array.shape, 0))]
+    other = [np.concatenate([array, array[..., :1]], axis=-1), array[..., :0], array[:0], array[:-1], array[0]]
+    huge = [1e308 * np.sign(array), 1e160 * array, 1e-308 * array, -array, 0 * array, array > 0, array.tolist()]
+    return wrong, [*other, *huge]
+
+
+def wrong_values(name, right):
+    """What is wrong for an argument like this, and what may be right."""
+    if name == "seed":
+        return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
+    if name in WHOLE:
+        return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
+    if name == "tolerance":
+        return [one for one in NO_SCALARS if one is not np.inf], [1e308, np.inf, 0, True]
+    if isinstance(right, float):
+        return [*NO_SCALARS, 0.0], [1e308, 1e-308, True, np.array(1.0), 1e-160]
+    if isinstance(right, np.ndarray):
+        return wrong_arrays(right)
+    objects = [*NO_NUMBERS, 1.0, -1, True, np.nan, S, [S], [], [None], R[:0], GaussianKernel, KMP]
+    if isinstance(right, Gaussians):
+        others = [R[:1], ZETA, ZETA[:1], [R], Gaussians.concatenated([R, R])]
+        return [one for one in objects if not isinstance(one, Gaussians)], [*others, R[:0]]
+    if name == "kernel":
+        return [*objects, GaussianKernel([1.0, 2.0, 3.0]), VelocityKernel(1.0), PeriodicKernel(1.0, 1.0), R], []
+    if name in {"path", "input_unit", "output_unit"}:
+        return [one for one in objects if not isinstance(one, (str, bytes))], []
+    if name == "value":
+        return [*NO_NUMBERS, 1.0, True, S, [], [ONE], KMP], []
+    if name == "arrays":
+        return [*objects, [("ell", 1.0)]], []
+    if name == "reward":
+        bad = (None, "text", np.nan, np.inf, 1j, S, [1.0, 2.0], object())
+        return [one for one in objects if not callable(one)] + [lambda path, one=one: one for one in bad], []
+    return [*objects, "sparse", ["dense"], np.array(["dense"]), FRAME, K, (FRAME,), (FRAME, R), R], []
+
+
+def calls():
+    """Each call (what, the argument, all arguments' names, how, whether it must fail)."""
+    for function, right in RIGHT.items():
+        for name, value in right.items():
+            wrong, other = wrong_values(name, value)
+            for one in wrong:
+                if function is GaussianKernel and isinstance(one, float):
+                    continue  # one for all inputs
+                if one is None and (name in OPTIONAL or (function is kmp.learn and name in {"kernel", "lambda_mean"})):
+                    continue
+                if name == "velocity" and one is True:
+                    continue
+                yield function, name, right, one, True
+            for one in other:
+                yield function, name, right, one, False
+
+
+def fault(function, name, right, value, must_fail):
+    """What is wrong with how this call ends; None if nothing."""
+    what = f"{getattr(function, '__qualname__', function)}({name}={str(value)[:60]!r})"
+    try:
+        function(**(right | {name: value}))
+    except ValueError as error:
+        said = str(error)
+        near = [*right, "lost in rounding", "to working precision"]  # what only shows with all else
+        named = any(re.search(rf"\b{one}\b", said) for one in ([name] if must_fail else near))
+        if not named:
+            return f"{what} does not name it: {said[:150]}"
+        return f"{what} speaks NumPy: {said[:150]}" if NUMPYS.search(said) else None
+    except OSError:
+        return None if name == "path" else f"{what} ends in an OSError"
+    except Exception as error:
+        return f"{what} ends in {type(error).__name__}: {str(error)[:150]}"
+    return f"{what} works" if must_fail else None
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_wrong_call_ends_in_a_value_error_that_names_the_argument(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kmp.save("skill.npz", ONE, input_unit="m", output_unit="m")
+    made = list(calls())
+    assert len(made) > 4000
+    faults = [said for one in made if (said := fault(*one))]
+    assert not faults, f"{len(faults)} of {len(made)}:\n" + "\n".join(faults)
+
+
+def test_each_right_call_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for function, right in RIGHT.items():
+        function(**right)
+
+
+def public():
+    """Each public callable of the package, by type and name, and its parameters."""
+    for name in kmp.__all__:
+        one = getattr(kmp, name)
+        if not inspect.isclass(one):
+            yield "", name, inspect.signature(one).parameters
+        elif not issubclass(one, Warning):
+            if name not in MADE_BY_THE_PACKAGE:
+                yield name, name, inspect.signature(one).parameters
+            for part, value in inspect.getmembers(one, callable):
+                if not part.startswith("_") and not (name.endswith("Kernel") and part in OF_THE_KERNEL):
+                    yield name, part, inspect.signature(value).parameters
+    for name, one in inspect.getmembers(orientation, inspect.isfunction):
+        if not name.startswith("_") and one.__module__ == orientation.__name__:
+            yield "", name, inspect.signature(one).parameters
+
+
+def test_every_argument_of_every_public_callable_is_among_them():
+    given = {(one.__name__, name) for one, right in RIGHT.items() for name in right}
+    lacking = [
+        (of, name, parameter)
+        for of, name, parameters in public()
+        for parameter in parameters
+        if parameter != "self" and not of.startswith(("Motion", "Stored")) and (name, parameter) not in given | LEFT_OUT
+    ]
+    assert lacking == []
+
+
+@pytest.mark.parametrize("primitive", [LOW, ONE.adapt(S[:1], R[:1], tolerance=0.1), IN_TIME], ids=str)
+def test_every_array_that_is_spoilt_is_named(primitive):
+    arrays, faults = primitive.to_arrays(), []
+    for name, array in ((name, array) for name, array in arrays.items() if name != "prior_mean"):
+        for value in [
+            None,
+            "text",
+            object(),
+            {},
+            np.full(array.shape, np.nan),
+            np.array(array, dtype=object),
+            array[None],
+        ]:
+            said = fault(lambda **given: KMP.from_arrays(arrays | given), name, {name: array}, value, True)
+            faults += [said] if said else []
+    assert not faults, "\n".join(faults)
