@@ -128,7 +128,7 @@ def test_one_that_does_not_go_with_the_kernel_is_refused(kernel, prior, says):
 
 
 def test_one_is_made_of_finite_numbers_that_go_together():
-    with pytest.raises(ValueError, match=r"prior_mean.matrix: shape \(2, 2\) given"):
+    with pytest.raises(ValueError, match=r"matrix of shape \(2, 2\) and offset of shape \(1,\) given"):
         AffineMean(np.eye(2), [0.0])
     with pytest.raises(ValueError, match="must be finite"):
         AffineMean([[np.nan]], [0.0])
