@@ -25,7 +25,7 @@ from service.core.setpoint.bounds import (
     stop_distance,
     tracker_gains,
 )
-from service.core.setpoint.setpoint import SetpointGenerator
+from service.core.setpoint.setpoint import SetpointGenerator, slow_down, waiting
 from service.core.skill.skill import Target
 from support.explained import Explained, margin
 from support.wam import STATE
@@ -151,6 +151,18 @@ def test_it_does_not_swing_by_itself() -> None:
     states, _ = driven([*jolt, *[at_rest(MIDDLE)] * 2000])
     assert np.abs(states[-200:, 0] - MIDDLE).max() < 1e-5
     assert np.abs(states[-200:, 1]).max() < 1e-4
+
+
+def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:
+    """Bounded for good: it used to creep on to its target."""
+    generator, state = Explained(Settings()), blank(STATE)
+    generator.begin(state, at_rest(MIDDLE))
+    target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
+    for _ in range(5000):
+        slow = slow_down(state["setpoint"], MIDDLE, 1.0, TOOL.max_speed)
+        generator.step(state, waiting(target, state["setpoint"], MIDDLE), BOX, FREE, slow)
+    assert not state["setpoint"][1].round(4).any()
+    assert 0.15 < state["setpoint"][0, 0] - MIDDLE[0] <= 0.201
 
 
 def test_a_setpoint_from_outside_the_workspace_only_comes_nearer() -> None:

@@ -4,15 +4,14 @@ whether hands are known and where the skill is sure.
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.contract import cdr
 from service.contract.records import Mode, Reason
+from service.core.decision.stuck import FOLLOW, HELD, WayOut, stuck
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
 
@@ -20,25 +19,11 @@ READY = 1  # an arm within its limits, and in nothing
 RETURNING = 2  # an arm on its way to that
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
-STUCK_M = 0.02  # [m] a tool nearer to its target is there
-STUCK_S = 0.8  # a tool that comes nearer by less than the next within so long is stuck
-PROGRESS = 0.08  # share of its distance ...
-FREED = 0.25  # ... or this, once it was
-PROGRESS_SPEED = 0.3  # or share of the tool's greatest speed, where that is less
-MOVED_M = 0.02  # [m] by which a target may move in that time
-ANOTHER_M = 0.04  # [m] a target so far from the one that it was stuck for may be reached
-WAY_RADPS = 1.2  # [rad/s] at most, of the busiest joint on a way out
-WAY_SHARE = 0.5  # at most, of a joint's greatest speed
-WAY_MPS = 0.4  # [m/s] at most, of the tool on it: nobody asked for this motion
-WAY_GAIN = 4.0  # [1/s] with which it comes to a posture of the way
-WAY_START = 0.3  # [rad] farther from where it begins, as the arm moved on meanwhile, a way is not gone
-WAY_NEAR = 0.02  # [rad] so near it goes on to the next
-WAY_S = 20.0  # that a way may take
 FREED_S = 1.0  # an arm that cannot get out of a thing stays as it is after so long
 GATE_EASE = 0.9  # of the threshold: what has been found far must come clearly nearer again
 
 # Plain numbers, as compiled functions and their callers need them.
-HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
+HOLD, FAULT = int(Mode.HOLD), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
@@ -48,7 +33,6 @@ STARTS_MEASURED = 2  # the arm appeared, where it is measured
 INSIDE = 64  # beside what the intake says: a part of the arm is inside of a thing ...
 ALONE = 128  # and that the hand that conducts the skill alone was seen, and the other never
 INSIDE_M = 0.01  # [m] ... by more than capsules are larger than links
-NOTICED, HELD = 1, 2  # of a tool that is stuck: it follows all the same; it holds, or is on a way out
 
 
 class Decision:
@@ -68,8 +52,7 @@ class Decision:
             fault_speed=float(settings.tool.fault_speed),
             max_speed=float(settings.tool.max_speed),
         )
-        self._way_mps = min(WAY_MPS, WAY_SHARE * settings.tool.max_speed)
-        self._way_speed = min(WAY_RADPS, WAY_SHARE * min(limits.velocity))
+        self._way_out = WayOut(settings)
         self.measured = (0.0, 0.0)
 
     def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
@@ -90,16 +73,11 @@ class Decision:
         """Velocities (J,) [rad/s] of an arm in a hold on its way into its limits, or on a way out
         of where it is stuck; None of any other. The arm's tasks are as in `Kinematics`.
         """
-        q, velocity = state["joints"][0], None
         if state["arm_ready"] == RETURNING and state["reason"] == NOT_READY and not state["operator_hold"]:
-            velocity = RETURN_RADPS * ((q < self._lower).astype(np.float64) - (q > self._upper))
-        elif state["reason"] == BLOCKED and state["way_next"] < state["way_count"]:
-            off = state["way"][state["way_next"]] - q
-            far = float(np.abs(off).max())
-            velocity = off * (min(self._way_speed, WAY_GAIN * far) / max(far, WAY_NEAR))
-            velocity /= max(1.0, float(np.linalg.norm(tasks[:3] @ velocity)) / self._way_mps)
-            state["way_next"] += far < WAY_NEAR
-        return velocity
+            q = state["joints"][0]
+            inward: Vector = (q < self._lower).astype(np.float64) - (q > self._upper)
+            return RETURN_RADPS * inward
+        return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def take(self, state: Record, event: Event) -> None:
         """A hold, resume, reset or fault that somebody asks for, or a way out that was found.
@@ -115,12 +93,8 @@ class Decision:
                 if state["mode"] == FAULT:
                     state["mode"], state["arm_ready"] = HOLD, 0
             case "way":
-                if state["stuck"] and state["mode"] != FAULT:
-                    path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, len(self._lower)))
-                    if np.abs(path[:1] - state["joints"][0]).max(initial=0.0) < WAY_START:
-                        count = state["way_count"] = len(path)
-                        state["way"][:count] = path
-                        state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
+                if state["mode"] != FAULT:
+                    self._way_out.take(state, event)
             case "fault":
                 if state["mode"] != FAULT:
                     state["mode"], state["reason"] = FAULT, Reason.SERVICE
@@ -165,7 +139,7 @@ def _step(
         ease = GATE_EASE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else NONE
     if reason == NONE:
-        state.stuck = _stuck(states, frames, heres, parameters)
+        state.stuck = stuck(states, frames, heres, parameters)
         reason = BLOCKED if state.stuck == HELD else NONE
     state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
     return starts, error, speed
@@ -209,31 +183,6 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.slow_tick = state.tick
     fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
     return 0, fault, error, speed
-
-
-@compiled
-def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
-    """Whether the tool comes no nearer to where it is to be: NOTICED or HELD; else 0."""
-    state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
-    gap = moved = 0.0
-    for i in range(3):
-        gap += (frame.target[i] - tool[i]) ** 2
-        moved += (frame.target[i] - state.stuck_target[i]) ** 2
-    gap, moved = math.sqrt(gap), math.sqrt(moved)
-    passed_s = (state.tick - state.stuck_tick) * given.period_s
-    if state.way_next < state.way_count and passed_s < WAY_S:
-        return HELD
-    if state.stuck == HELD and not state.way_count and moved < ANOTHER_M:
-        return HELD
-    state.way_next = state.way_count = 0
-    if state.stuck == NOTICED:
-        least = FREED * state.stuck_gap
-    else:
-        least = min(PROGRESS * state.stuck_gap, PROGRESS_SPEED * given.max_speed * STUCK_S)
-    if state.mode != FOLLOW or gap < STUCK_M or state.stuck_gap - gap > least or moved > MOVED_M:
-        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
-        return 0
-    return NOTICED if passed_s >= STUCK_S else 0
 
 
 @compiled
