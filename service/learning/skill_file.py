@@ -164,7 +164,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),
-            conductor=(0, 1)[int(arrays["conductor"])] if "conductor" in arrays else None,
+            conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
@@ -204,6 +204,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     for prefix in ("", TURN, GRIPPER):
         if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (prefix or _model(arrays) is not HandsKMP):
             yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
+    if (side := arrays.get("conductor", np.array(0)).tolist()) not in (0, 1):
+        yield f"conductor is {side!r}: 0 for the left hand or 1 for the right one accepted"
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"

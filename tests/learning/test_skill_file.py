@@ -136,6 +136,7 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill)
         ({"format": np.array(2), "figures": np.array("{")}, "figures is no JSON"),
         ({"format": np.array([1, 2])}, "x.npz"),
         ({"format": np.array("new")}, "x.npz"),
+        ({"conductor": np.array(-1)}, "conductor is -1: 0 for the left hand or 1 for the right one accepted"),
         ({"box": None}, "box"),
         ({"base_inputs": np.zeros(3)}, "inputs"),
         ({"base_inputs": np.zeros((200, 2)), "via_inputs": np.zeros((0, 2))}, "2 inputs and 3 outputs, 6 and 3 needed"),
