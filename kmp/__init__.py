@@ -27,6 +27,8 @@ from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
+__version__ = "0.1.0"
+
 __all__ = [
     "KMP",
     "AffineMean",

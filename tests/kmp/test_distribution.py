@@ -1,6 +1,7 @@
 """kmp as a distribution of its own: what it needs and holds, and that it serves without Numba."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -52,6 +53,20 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
     assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scikit-learn>=1.6", "scipy>=1.14"}
     assert any(line.startswith("numba") and "extra == 'fast'" in line for line in needed)
     assert wheel.stat().st_size < 250_000
+
+
+def test_its_wheel_has_the_version_that_it_says_and_the_projects_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        texts = {name.split("/", 1)[1]: archive.read(name).decode() for name in archive.namelist() if "dist-i" in name}
+    assert f"\nVersion: {kmp.__version__}\n" in texts["METADATA"]
+    assert "\nLicense-Expression: MIT\n" in texts["METADATA"]
+    assert texts["licenses/LICENSE"] == (ROOT / "LICENSE").read_text()
+
+
+def test_its_changes_have_a_page_that_begins_with_this_version():
+    [newest, *_] = re.findall(r"^## (.*)$", (ROOT / "kmp" / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert kmp.__version__ in newest
+    assert "](kmp/CHANGELOG.md)" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_it_needs_what_the_project_needs_of_the_same():
