@@ -51,7 +51,8 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
     assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "kmp").rglob("*.py")} | {"kmp/py.typed"}
     needed = {line.removeprefix("Requires-Dist: ") for line in metadata.splitlines() if line.startswith("Requires-D")}
     assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scikit-learn>=1.6", "scipy>=1.14"}
-    assert any(line.startswith("numba") and "extra == 'fast'" in line for line in needed)
+    for name, extra in (("numba", "fast"), ("matplotlib", "plot")):
+        assert any(line.startswith(name) and f"extra == '{extra}'" in line for line in needed)
     assert wheel.stat().st_size < 250_000
 
 
@@ -71,8 +72,10 @@ def test_its_changes_have_a_page_that_begins_with_this_version():
 
 def test_it_needs_what_the_project_needs_of_the_same():
     whole, alone = (tomllib.loads((ROOT / path).read_text()) for path in ("pyproject.toml", "kmp/pyproject.toml"))
-    extra = alone["project"]["optional-dependencies"]["fast"]
-    assert {*alone["project"]["dependencies"], *extra} <= set(whole["project"]["dependencies"])
+    extras = alone["project"]["optional-dependencies"]
+    assert {*alone["project"]["dependencies"], *extras["fast"], *extras["plot"]} <= set(
+        whole["project"]["dependencies"]
+    )
     assert alone["project"]["requires-python"] == whole["project"]["requires-python"]
 
 
