@@ -15,6 +15,7 @@ from kmp.affine_mean import AffineMean
 from kmp.checks import RankReached, ViaPointMissed
 from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement, improve
+from kmp.gaussian_process import gaussian_process_reference
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
@@ -50,6 +51,7 @@ __all__ = [
     "Uncertainty",
     "VelocityKernel",
     "ViaPointMissed",
+    "gaussian_process_reference",
     "improve",
     "learn",
     "load",

@@ -128,6 +128,7 @@ RIGHT = {
     orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
     orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
     orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
+    kmp.gaussian_process_reference: {"demonstrations": PAIRS, "inputs": S, "count": 12, "regularization": 1e-6},
     kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
     kmp.learn: {"demonstrations": PAIRS, "count": 5, "velocity": False, "regularization": 1e-6, **LEARN},
     kmp.save: {"path": "skill.npz", "value": ONE, "input_unit": "m", "output_unit": "m"},
