@@ -61,6 +61,7 @@ def test_its_wheel_has_the_version_that_it_says_and_the_projects_licence(wheel):
         texts = {name.split("/", 1)[1]: archive.read(name).decode() for name in archive.namelist() if "dist-i" in name}
     assert f"\nVersion: {kmp.__version__}\n" in texts["METADATA"]
     assert "\nLicense-Expression: MIT\n" in texts["METADATA"]
+    assert [link for link in re.findall(r"\]\(([^)\s]+)\)", texts["METADATA"]) if "://" not in link] == []
     assert texts["licenses/LICENSE"] == (ROOT / "LICENSE").read_text()
 
 
