@@ -33,8 +33,9 @@ GROUPS = {
         "network",
         "ros2",
         "access",
+        "coming-from",
     ),
-    "Reference": ("settings", "wire", "incidents", "glossary"),
+    "Reference": ("settings", "wire", "incidents", "library", "glossary"),
     "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments", "evidence"),
 }
 

@@ -15,6 +15,7 @@ from kmp.affine_mean import AffineMean
 from kmp.checks import RankReached, ViaPointMissed
 from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement, improve
+from kmp.gaussian_process import gaussian_process_reference
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
@@ -26,6 +27,8 @@ from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
+
+__version__ = "0.1.0"
 
 __all__ = [
     "KMP",
@@ -48,6 +51,7 @@ __all__ = [
     "Uncertainty",
     "VelocityKernel",
     "ViaPointMissed",
+    "gaussian_process_reference",
     "improve",
     "learn",
     "load",

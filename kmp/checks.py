@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sized
+from collections.abc import Sequence, Sized
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -139,3 +139,16 @@ def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
     of = f" of shape {demonstration.shape}" if isinstance(demonstration, np.ndarray) else ""
     needed = "a pair needed: inputs (T, I) and outputs (T, O)"
     raise ValueError(f"{name}: {type(demonstration).__name__}{of} given, {needed}.")
+
+
+def checked_demonstrations(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:
+    """Inputs (T, I) and outputs (T, O) of each. Raises ValueError if one has no sample."""
+    data: list[tuple[Array, Array]] = []
+    for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):
+        inputs, outputs = pair(f"demonstrations[{h}]", demonstration)
+        i, o = (data[0][0].shape[1], data[0][1].shape[1]) if data else ("I", "O")
+        s = numbers(f"demonstrations[{h}] inputs", inputs, "T", i)
+        data.append((s, numbers(f"demonstrations[{h}] outputs", outputs, len(s), o)))
+        if len(s) == 0:
+            raise ValueError(f"demonstrations[{h}]: no sample given, at least 1 needed.")
+    return data

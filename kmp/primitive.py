@@ -24,13 +24,14 @@ from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
+from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Predictor
 from kmp.solution import Solution, mean_of
 from kmp.solving import solved
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KMP(Predictor):
+class KMP(Predictor, Plotted):
     """A skill: a reference database, the via-points in it, and its solution.
 
     Made by `fit`, `adapt` and `from_arrays`. N points in all, I inputs, O outputs. Immutable, so
@@ -226,6 +227,14 @@ class KMP(Predictor):
             Gaussians.concatenated([before.points, desired]),
         )
         return KMP(self.solution.adapted(changes).solved(), changes, self.base)
+
+    def to_plot(self) -> Shown:
+        """Its references and via-points that are values."""
+        known, count = self.solution.database, len(self.inputs) - len(self.via_inputs)
+        values = known.functionals.values
+        before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
+        references, via = (Points(self.inputs[part], known.reference.take(part)) for part in (before, taught))
+        return Shown(references, via, self.kernel.channels, self.kernel.period)
 
     @property
     def _count(self) -> int:

@@ -18,6 +18,7 @@ from kmp.hyperparameters import checked_kernel
 from kmp.immutable import Immutable
 from kmp.kernel import Kernel
 from kmp.linear_algebra import symmetric
+from kmp.plot import Plotted, Points, Shown
 from kmp.primitive import KMP, checked_primitive
 
 
@@ -129,7 +130,7 @@ def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LocalKMP(Immutable):
+class LocalKMP(Immutable, Plotted):
     """A skill in F coordinate frames at once: a primitive in each, and where the frames are now.
 
     From `learn`, for the frames of the last demonstration; `placed` moves it. Each frame's
@@ -237,3 +238,14 @@ class LocalKMP(Immutable):
         pairs = zip(self.frames, self.primitives, strict=True)
         adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)
         return LocalKMP(tuple(adapted), self.frames)
+
+    def to_plot(self) -> Shown:
+        """The references of all frames and the via-points, where the frames are now."""
+        each = [one.to_plot() for one in self.primitives]
+        placed = [
+            Points(known.references.inputs, frame.placed(known.references.normals))
+            for frame, known in zip(self.frames, each, strict=True)
+        ]
+        inputs = np.concatenate([points.inputs for points in placed])
+        known, via = Points(inputs, Gaussians.concatenated([points.normals for points in placed])), each[0].via_points
+        return each[0]._replace(references=known, via_points=Points(via.inputs, self.frames[0].placed(via.normals)))

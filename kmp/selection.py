@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_kind, numbers, pair, parts_of, positive, whole
+from kmp.checks import Array, check_kind, checked_demonstrations, positive, whole
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.hyperparameters import checked_kernel
@@ -153,7 +153,7 @@ def learn(
     Raises ValueError if shapes do not agree, a number is not finite, a parameter is out of its
     range, or there are too few samples for the components, or demonstrations for a choice.
     """
-    data = _checked(demonstrations)
+    data = checked_demonstrations(demonstrations)
     for name, value in (("lambda_mean", lambda_mean), ("lambda_covariance", lambda_covariance)):
         if value is not None:
             positive(name, value)
@@ -256,15 +256,3 @@ def _negative_log_likelihood(residual: Array, covariance: Array) -> float:
     white = np.linalg.solve(root, residual[:, :, None])[:, :, 0]
     log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     return float(0.5 * (log_det + (white**2).sum(axis=1) + residual.shape[1] * np.log(2 * np.pi)).mean())
-
-
-def _checked(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:
-    data: list[tuple[Array, Array]] = []
-    for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):
-        inputs, outputs = pair(f"demonstrations[{h}]", demonstration)
-        i, o = (data[0][0].shape[1], data[0][1].shape[1]) if data else ("I", "O")
-        s = numbers(f"demonstrations[{h}] inputs", inputs, "T", i)
-        data.append((s, numbers(f"demonstrations[{h}] outputs", outputs, len(s), o)))
-        if len(s) == 0:
-            raise ValueError(f"demonstrations[{h}]: no sample given, at least 1 needed.")
-    return data

@@ -141,7 +141,7 @@ def test_an_entry_point_asks_for_one_blas_thread_before_anything_else(path: Path
 def test_the_mathematics_imports_nothing_but_mathematics() -> None:
     allowed = {"numpy", "scipy", "numba", "sklearn", "threadpoolctl", "kmp", *sys.stdlib_module_names}
     for path in (ROOT / "kmp").rglob("*.py"):
-        assert imported(path) <= allowed, named(path)
+        assert imported(path) <= allowed | ({"matplotlib"} if path.name == "plot.py" else set()), named(path)
 
 
 def test_a_module_begins_with_what_it_is() -> None:

@@ -1,5 +1,5 @@
-"""The documentation: a site can be built of it, no link in it leads nowhere, and the page on
-settings is that of the settings.
+"""The documentation: a site can be built of it, no link in it leads nowhere, and the pages that
+programs write are those of the code.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import kmp
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -19,9 +20,9 @@ PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
-def settings_page() -> str:
-    """What docs/settings_page.py writes."""
-    spec = importlib.util.spec_from_file_location("settings_page", DOCS / "settings_page.py")
+def written_by(name: str) -> str:
+    """What a program of the documentation writes."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -31,11 +32,33 @@ def settings_page() -> str:
 
 def test_the_page_on_settings_is_that_of_the_settings() -> None:
     written = (DOCS / "settings.md").read_text(encoding="utf-8")
-    assert written == settings_page(), "run `python docs/settings_page.py`"
+    assert written == written_by("settings_page"), "run `python docs/settings_page.py`"
+
+
+def test_the_page_on_the_library_is_that_of_its_docstrings_and_tells_all_that_it_offers() -> None:
+    written = (DOCS / "library.md").read_text(encoding="utf-8")
+    assert written == written_by("library_page"), "run `python docs/library_page.py`"
+    assert set(kmp.__all__) <= set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
+    for called in ("KMP.predict(queries)", "KMP.plot(", "LocalKMP.placed(frames)", "Gaussians.product(*others)"):
+        assert called in written
+
+
+def test_what_users_of_other_libraries_are_told_of_is_there_and_runs() -> None:
+    text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
+    cells = [line.strip("| ").split("|")[-1] for line in text.splitlines() if line.startswith("| ")]
+    names = {name for cell in cells for name in re.findall(r"`([A-Za-z]\w*(?:\.\w+)*)[`(]", cell)}
+    assert len(names) > 20
+    for name in names:
+        found: object = kmp
+        for part in name.removeprefix("kmp.").split("."):
+            assert hasattr(found, part), name
+            found = getattr(found, part)
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, {})
 
 
 def test_each_setting_has_words_or_a_unit_beside_it_in_the_source() -> None:
-    rows = [line for line in settings_page().splitlines() if line.startswith("| `")]
+    rows = [line for line in written_by("settings_page").splitlines() if line.startswith("| `")]
     assert len(rows) > 40
     assert [row for row in rows if row.endswith("|  |")] == []
 

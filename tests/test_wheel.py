@@ -34,7 +34,7 @@ def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(
     assert sources <= held
     assert {"service/arms/wam.urdf", "service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
     assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"kmp", "service", "sim"}
-    assert "kmp/pyproject.toml" not in held
+    assert {name for name in held if name.startswith("kmp/") and not name.endswith(".py")} == {"kmp/py.typed"}
 
 
 def test_it_does_without_the_experiments(wheel: Path) -> None:

@@ -1,6 +1,7 @@
 """kmp as a distribution of its own: what it needs and holds, and that it serves without Numba."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -50,14 +51,32 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
     assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "kmp").rglob("*.py")} | {"kmp/py.typed"}
     needed = {line.removeprefix("Requires-Dist: ") for line in metadata.splitlines() if line.startswith("Requires-D")}
     assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scikit-learn>=1.6", "scipy>=1.14"}
-    assert any(line.startswith("numba") and "extra == 'fast'" in line for line in needed)
+    for name, extra in (("numba", "fast"), ("matplotlib", "plot")):
+        assert any(line.startswith(name) and f"extra == '{extra}'" in line for line in needed)
     assert wheel.stat().st_size < 250_000
+
+
+def test_its_wheel_has_the_version_that_it_says_and_the_projects_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        texts = {name.split("/", 1)[1]: archive.read(name).decode() for name in archive.namelist() if "dist-i" in name}
+    assert f"\nVersion: {kmp.__version__}\n" in texts["METADATA"]
+    assert "\nLicense-Expression: MIT\n" in texts["METADATA"]
+    assert [link for link in re.findall(r"\]\(([^)\s]+)\)", texts["METADATA"]) if "://" not in link] == []
+    assert texts["licenses/LICENSE"] == (ROOT / "LICENSE").read_text()
+
+
+def test_its_changes_have_a_page_that_begins_with_this_version():
+    [newest, *_] = re.findall(r"^## (.*)$", (ROOT / "kmp" / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert kmp.__version__ in newest
+    assert "](kmp/CHANGELOG.md)" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_it_needs_what_the_project_needs_of_the_same():
     whole, alone = (tomllib.loads((ROOT / path).read_text()) for path in ("pyproject.toml", "kmp/pyproject.toml"))
-    extra = alone["project"]["optional-dependencies"]["fast"]
-    assert {*alone["project"]["dependencies"], *extra} <= set(whole["project"]["dependencies"])
+    extras = alone["project"]["optional-dependencies"]
+    assert {*alone["project"]["dependencies"], *extras["fast"], *extras["plot"]} <= set(
+        whole["project"]["dependencies"]
+    )
     assert alone["project"]["requires-python"] == whole["project"]["requires-python"]
 
 

@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import kmp
 from kmp import (
@@ -127,11 +128,21 @@ RIGHT = {
     orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
     orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
     orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
+    kmp.gaussian_process_reference: {"demonstrations": PAIRS, "inputs": S, "count": 12, "regularization": 1e-6},
     kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
     kmp.learn: {"demonstrations": PAIRS, "count": 5, "velocity": False, "regularization": 1e-6, **LEARN},
     kmp.save: {"path": "skill.npz", "value": ONE, "input_unit": "m", "output_unit": "m"},
     kmp.load: {"path": "skill.npz"},
     LEARNED.report: {"count": 3},
+    ONE.plot: {
+        "queries": S,
+        "plane": (0, 1),
+        "axes": Figure().subplots(),
+        "label": "mean",
+        "outputs": ["x", "y"],
+        "input_unit": "s",
+        "output_unit": "m",
+    },
 }
 # Not here: `others` of a product, which are many; what is chosen as NumPy would; what is any truth.
 LEFT_OUT = {("product", "others"), ("take", "index"), ("__getitem__", "index"), ("predict_motion", "covariance")}
@@ -180,7 +191,7 @@ def wrong_values(name, right):
         return [one for one in objects if not isinstance(one, Gaussians)], [*others, R[:0]]
     if name == "kernel":
         return [*objects, GaussianKernel([1.0, 2.0, 3.0]), VelocityKernel(1.0), PeriodicKernel(1.0, 1.0), R], []
-    if name in {"path", "input_unit", "output_unit"}:
+    if name in {"path", "input_unit", "output_unit", "label"}:
         return [one for one in objects if not isinstance(one, (str, bytes))], []
     if name == "value":
         return [*NO_NUMBERS, 1.0, True, S, [], [ONE], KMP], []
@@ -200,7 +211,11 @@ def calls():
             for one in wrong:
                 if function is GaussianKernel and isinstance(one, float):
                     continue  # one for all inputs
-                if one is None and (name in OPTIONAL or (function is kmp.learn and name in {"kernel", "lambda_mean"})):
+                if one is None and (
+                    name in OPTIONAL
+                    or function == ONE.plot
+                    or (function is kmp.learn and name in {"kernel", "lambda_mean"})
+                ):
                     continue
                 if name == "velocity" and one is True:
                     continue

@@ -1,0 +1,196 @@
+"""What a primitive predicts, drawn by Matplotlib: over its input, or one output over another."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kmp.checks import Array, check_kind, numbers, parts_of, whole
+from kmp.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.path import Path
+
+_QUERIES = 200  # along the input, where none are given
+_REGIONS = ((2, 0.18, "2 deviations"), (1, 0.35, "1 deviation"))  # times, opacity; from back to front
+_REFERENCE: dict[str, Any] = {"color": "0.55", "markersize": 3, "linestyle": "", "marker": ".", "zorder": 3}
+_VIA_POINT: dict[str, Any] = {"color": "0.1", "markersize": 5, "linestyle": "", "marker": "o", "zorder": 5}
+_CIRCLE = np.linspace(0, 2 * np.pi, 49)
+
+
+class Points(NamedTuple):
+    """Inputs (N, I), and a normal at each."""
+
+    inputs: Array
+    normals: Gaussians
+
+
+class Shown(NamedTuple):
+    """What is drawn beside the predictions, and what the kernel has: its channels, its period."""
+
+    references: Points
+    via_points: Points
+    channels: int
+    period: float | None
+
+
+class Plotted:
+    """Primitives that can be drawn: `KMP` and `LocalKMP` inherit it."""
+
+    @abstractmethod
+    def predict(self, queries: ArrayLike) -> Gaussians:
+        """M normals at queries (M, I)."""
+
+    @abstractmethod
+    def to_plot(self) -> Shown:
+        """What is drawn beside the predictions."""
+
+    def plot(
+        self,
+        queries: ArrayLike | None = None,
+        *,
+        plane: Sequence[int] | None = None,
+        axes: Axes | Sequence[Axes] | NDArray[np.object_] | None = None,
+        label: str = "mean",
+        outputs: Sequence[str] | None = None,
+        input_unit: str = "",
+        output_unit: str = "",
+    ) -> list[Axes]:
+        """Draws the predictions at queries (M, I) with Matplotlib, the extra `plot`.
+
+        The mean, the regions of 1 and 2 deviations, the references, and the via-points with 2
+        deviations. Points that are derivatives are left out. Over the input, one axes an output;
+        with `plane` (i, j) output j over output i in one, where the regions are the ellipses of all
+        queries. A single input needs no queries: they go from the first reference to the last, or
+        once round. Of more inputs a path is needed, and without `plane` its points are counted.
+
+        `axes` are drawn into, and keep what their axes are called, else new ones of pyplot; they
+        are returned. `label` is the mean's in the legend, `outputs` (O,) are the outputs' names,
+        units are written beside them.
+
+        Raises ModuleNotFoundError without Matplotlib, and ValueError if the shape of the queries is
+        another, a number is not finite, or there are other numbers of axes, names or outputs.
+        """
+        try:
+            from matplotlib import pyplot as plt
+            from matplotlib.axes import Axes
+        except ModuleNotFoundError as error:
+            what = "plot draws with Matplotlib, which is not installed: pip install 'kmp[plot]'"
+            raise ModuleNotFoundError(what, name=error.name) from None
+        for name, text in (("label", label), ("input_unit", input_unit), ("output_unit", output_unit)):
+            check_kind(name, text, str, "a text")
+        shown = self.to_plot()
+        s = _along(shown) if queries is None else numbers("queries", queries, "M", shown.references.inputs.shape[1])
+        titles = _titles(outputs, shown, input_unit, output_unit)
+        chosen = None if plane is None else [whole("plane", i, least=0, most=len(titles) - 1) for i in _two(plane)]
+        wanted = len(titles) if chosen is None else 1
+        if axes is None:
+            size = (6.4, 1.0 + 1.9 * wanted) if chosen is None else (6.4, 5.0)
+            axes = plt.subplots(wanted, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")[1]
+        into: list[Any] = [axes]
+        if isinstance(axes, (list, tuple, np.ndarray)):
+            into = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(into) != wanted:
+            raise ValueError(f"axes: {len(into)} given, {wanted} needed.")
+        for i, one in enumerate(into):
+            check_kind(f"axes[{i}]", one, Axes, "pyplot.subplots makes them")
+        found = self.predict(s)
+        if chosen is None:
+            for i, one in enumerate(into):
+                _draw_over_input(one, s, found, shown, i, label)
+                one.set_ylabel(one.get_ylabel() or titles[i])
+            title = _named("input", input_unit) if s.shape[1] == 1 else "query"
+            into[-1].set_xlabel(into[-1].get_xlabel() or title)
+        else:
+            _draw_plane(into[0], found, shown, chosen, label)
+            into[0].set_xlabel(into[0].get_xlabel() or titles[chosen[0]])
+            into[0].set_ylabel(into[0].get_ylabel() or titles[chosen[1]])
+        _add_legend(into[0])
+        return into
+
+
+def _two(plane: Sequence[int]) -> list[int]:
+    if len(given := parts_of("plane", plane)) != 2:
+        raise ValueError(f"plane: {given} given, the numbers of two outputs needed.")
+    return given
+
+
+def _along(shown: Shown) -> Array:
+    known = shown.references.inputs
+    if known.shape[1] != 1:
+        raise ValueError(f"queries: none given, a path (M, {known.shape[1]}) needed.")
+    low, high = (known.min(), known.max()) if shown.period is None else (0.0, shown.period)
+    return np.linspace(low, high, _QUERIES)[:, None]
+
+
+def _named(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _titles(outputs: Sequence[str] | None, shown: Shown, input_unit: str, unit: str) -> list[str]:
+    """What stands beside each output's axis; those of the second channel are rates."""
+    count = shown.references.normals.outputs
+    values = count // shown.channels
+    names = [f"output {i}" if i < values else f"rate of output {i - values}" for i in range(count)]
+    if outputs is not None:
+        names = parts_of("outputs", outputs, str, "a name")
+    if len(names) != count:
+        raise ValueError(f"outputs: {len(names)} names given, {count} needed.")
+    rate = f"{unit}/{input_unit}" if unit and input_unit else ""
+    return [_named(name, unit if i < values else rate) for i, name in enumerate(names)]
+
+
+def _draw_over_input(axes: Axes, s: Array, found: Gaussians, shown: Shown, i: int, label: str) -> None:
+    alone = s.shape[1] == 1
+    at, mean, deviation = s[:, 0] if alone else np.arange(len(s)), found.mean[:, i], np.sqrt(found.covariance[:, i, i])
+    [line] = axes.plot(at, mean, label=label, zorder=4)
+    for times, opacity, said in _REGIONS:
+        style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
+        axes.fill_between(at, mean - times * deviation, mean + times * deviation, label=said, **style)
+    if alone:  # else no axis tells where they are
+        known, via = shown.references, shown.via_points
+        axes.plot(known.inputs[:, 0], known.normals.mean[:, i], label="reference", **_REFERENCE)
+        if len(via.normals):
+            both = 2 * np.sqrt(via.normals.covariance[:, i, i])
+            axes.errorbar(via.inputs[:, 0], via.normals.mean[:, i], both, label="via-point", capsize=3, **_VIA_POINT)
+
+
+def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], label: str) -> None:
+    from matplotlib.patches import PathPatch
+
+    [line] = axes.plot(*found.mean[:, plane].T, label=label, zorder=4)
+    for times, opacity, said in _REGIONS:
+        style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
+        axes.add_patch(PathPatch(_ellipses(found, plane, times), label=said, **style))
+    via = shown.via_points.normals
+    axes.plot(*shown.references.normals.mean[:, plane].T, label="reference", **_REFERENCE)
+    if len(via):
+        axes.plot(*via.mean[:, plane].T, label="via-point", **_VIA_POINT)
+        axes.add_patch(PathPatch(_ellipses(via, plane, 2), fill=False, edgecolor=_VIA_POINT["color"], zorder=5))
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _ellipses(normals: Gaussians, plane: list[int], times: int) -> Path:
+    """All ellipses as one path, so that what several cover is as opaque as what one does."""
+    from matplotlib.path import Path
+
+    values, vectors = np.linalg.eigh(normals.covariance[:, plane][:, :, plane])
+    vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None] ** np.array([1, 0])  # all one way round
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    around = normals.mean[:, None, plane] + times * (np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)], 1) @ root.mT)
+    return Path.make_compound_path(*(Path(one, closed=True) for one in around))
+
+
+def _add_legend(axes: Axes) -> None:
+    """Above the axes; what was drawn twice is named once."""
+    handles, labels = axes.get_legend_handles_labels()
+    named = dict(zip(reversed(labels), reversed(handles), strict=True))
+    look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}
+    order = sorted(named, key=labels.index)
+    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=6, **look)
