@@ -33,7 +33,7 @@ LEFT, RIGHT, TOOL = (
     "#009E73",
 )  # as in the paper: the left hand red, the right one blue, the robot green
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#882255")
+SERIES = ("#D55E00", "#0072B2", "#009E73")
 DPI, COLOURS = 110, 256
 
 
@@ -97,6 +97,11 @@ class Results:
         path.write_text(json.dumps(_plain(whole), indent=2) + "\n", encoding="utf-8")
         self.say(f"{path}")
         return path
+
+    def measured(self) -> dict[str, Any]:
+        """The numbers in the experiment's JSON, which an earlier run left."""
+        found: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
+        return found
 
     def recording(self) -> rr.RecordingStream:
         """A Rerun stream into the experiment's .rrd file; `disconnect` ends it."""
