@@ -320,9 +320,15 @@ SOURCES: dict[str, list[Source]] = {
     "`separation`": [
         of("separation/scenes"),
         of("separation/rate_hz"),
-        of("separation/random/closest_mm/least"),
         of("separation/scenes"),
         of("separation/thrust/fastest_hand"),
+    ],
+    "All distances": [
+        of("separation/shown/random/scenes"),
+        *(of(f"separation/shown/{kind}/closest_of_capsules_mm") for kind in ("random", "thrust")),
+        of("separation/shown/random/closest_of_shapes_mm"),
+        of("separation/scenes"),
+        of("separation/random/closest_of_shapes_mm/least"),
     ],
     "In 91 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
@@ -330,7 +336,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/thrust/excess_after_reaction"),
         of("separation/thrust/excess_lasts_s"),
         of("separation/thrust/overlaps"),
-        of("separation/thrust/closest_mm/least", -1),
+        of("separation/thrust/closest_of_shapes_mm/least", -1),
         of("separation/thrust/pushed_mm"),
         of("separation/scenes"),
     ],

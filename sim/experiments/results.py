@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import sys
 import time
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ LEFT, RIGHT, TOOL = (
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
 SERIES = ("#D55E00", "#0072B2", "#009E73")
 DPI, COLOURS = 110, 256
+ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
 
 
 class ExperimentError(ExplainedError):
@@ -94,7 +96,9 @@ class Results:
             "seconds": round(time.monotonic() - self.began_s, 1),
             **numbers,
         }
-        path.write_text(json.dumps(_plain(whole), indent=2) + "\n", encoding="utf-8")
+        text = json.dumps(_plain(whole), indent=2)
+        text = ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
+        path.write_text(text + "\n", encoding="utf-8")
         self.say(f"{path}")
         return path
 
