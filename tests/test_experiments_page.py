@@ -204,11 +204,15 @@ SOURCES: dict[str, list[Source]] = {
     "![Success, path": [len(result("people")["methods"]) - 1],  # without the teacher
     "| modelled": elsewhere("model"),
     "| recorded": elsewhere("recorded"),
-    "On a grid": [
+    "The paper's Table I": [
         *("five", "six"),
         of("promp/dimensions/22/functions"),
-        "six",
+        len({one["method"] for one in result("promp")["dimensions"] if one["error"] is None}),
+        *("six", "1"),
+    ],
+    "Errors are": [
         of("promp/dimensions/20/functions"),
+        "six",
         at_six("ProMP, at 200 samples"),
         at_six("kernel ridge, 200 samples"),
         "three",
