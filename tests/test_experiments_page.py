@@ -240,9 +240,12 @@ SOURCES: dict[str, list[Source]] = {
         *("4", "5"),
         min(learned_misses()),
         max(learned_misses()),
+        of("hands/reproduction/periods_skipped_by_bench"),
         most("hands/moved_cm", least=True),
         most("hands/moved_cm"),
         AtMost(taught_misses()),
+        of("hands/adaptation/periods_skipped_by_bench"),
+        of("hands/evidence_is_periods_skipped_at_most"),
     ],
     "Some numbers of a skill": [
         *("10", "40", "8"),
@@ -407,6 +410,21 @@ def test_each_number_is_a_result_to_the_digits_printed_or_a_setting_named_here(
             found += wrong(block, [one for key in keys for one in sources[key]])
     assert found == []
     assert sorted(used) == sorted(sources), "each of the paragraphs is there once"
+
+
+def test_what_is_no_evidence_by_its_own_rule_is_called_so() -> None:
+    runs = {name: result("hands")[name] for name in ("reproduction", "nominal", "adaptation")}
+    limit = result("hands")["evidence_is_periods_skipped_at_most"]
+    assert limit == 25
+    for one in runs.values():
+        assert one["evidence"] == (one["periods_skipped_by_bench"] <= limit)
+    (row,) = (block for block in blocks("docs/experiments.md") if block.startswith("| `hands`"))
+    (told_of,) = (block for block in blocks("docs/experiments.md") if block.startswith("`hands`"))
+    assert ("no evidence" in row) != runs["adaptation"]["evidence"]
+    sentences = {"reproduction": "As learned", "adaptation": "Taught new ones"}
+    for name, begins in sentences.items():
+        sentence = told_of[told_of.index(begins) :].partition(". ")[0]
+        assert ("no evidence" in sentence) != runs[name]["evidence"], sentence
 
 
 def test_a_number_that_is_none_of_the_results_is_found() -> None:

@@ -24,6 +24,7 @@ pytest.importorskip(
 from kmp import GaussianMixture
 from sim.experiments import rivals
 from sim.experiments.__main__ import ABOUT, main
+from sim.experiments.hands import is_evidence
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array, ExperimentError
 from sim.experiments.scenes import draw
@@ -145,6 +146,8 @@ class TestExperiments:
     def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
         found = numbers("hands", tmp_path)
         assert found["figures"] == ["hands-stages.png", "hands.png"]
+        assert is_evidence(found["evidence_is_periods_skipped_at_most"])
+        assert not is_evidence(found["evidence_is_periods_skipped_at_most"] + 1)
         worth = {name: one["error_median_mm"] for name, one in found["beside_the_paper"].items()}
         assert min(worth, key=lambda name: worth[name]) == "ours"
         assert worth["one point a place"] > 3 * worth["ours"]
