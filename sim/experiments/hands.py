@@ -32,7 +32,7 @@ MOVING_M_S = 0.05  # a hand this fast has begun
 ATTEMPTS = 3
 SKIPPED = 25  # a run in which the bench skipped more periods is no evidence: the machine was too busy for real time
 SHOWN_HZ, SERVICE_HZ = 20, 500  # of the ways in the figure, and of the recordings that they are from
-EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.20), (640, 460)
+EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.24), (640, 480)
 THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
 DRAWN = {"reproduction": "dotted: as learned", "adaptation": "solid: adapted"}
 EVENTS = TaskEvents.__struct_fields__
@@ -241,7 +241,8 @@ def _draw_stages(results: Results) -> None:
         axes.set_title(title, loc="left")
         axes.set_axis_off()
     for at, name in zip(pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True):
-        grid[0, 0].annotate(name, at, at + np.array([25, -38]), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
+        aside = (-35, 45) if name == "solder" else (25, -38)  # the iron stands behind it
+        grid[0, 0].annotate(name, at, at + np.array(aside), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
     handles = [
         plt.Line2D([], [], color=c, label=n)
         for c, n in ((LEFT, "way of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
