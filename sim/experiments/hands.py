@@ -82,7 +82,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         **{name: _numbers(ran) for name, (ran, _) in found.items() if ran is not None},
         "beside_the_paper": differences(options.share),
         "shown": {
-            name: {part: line.round(3) for part, line in traces._asdict().items()}
+            name: {part: line.round(3).T for part, line in traces._asdict().items()}
             for name, (_, traces) in found.items()
             if name in DRAWN
         },
@@ -139,7 +139,7 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the ways of hands and tool. That of the stages shows more than the numbers."""
     runs = {
-        name: Traces(*(np.array(shown[part]) for part in Traces._fields)) for name, shown in numbers["shown"].items()
+        name: Traces(*(np.array(shown[part]).T for part in Traces._fields)) for name, shown in numbers["shown"].items()
     }
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.8), subplot_kw={"projection": "3d"})

@@ -48,7 +48,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "shown": {
             "time_s": runs["ours"].time_s[shown].round(3),
             "progress_s": progress["ours"][shown].round(3),
-            **{name: one.tool[shown].round(4) for name, one in runs.items()},
+            **{name: one.tool[shown].round(4).T for name, one in runs.items()},
         },
     }
     draw_numbers(results, numbers)
@@ -110,7 +110,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
     figure, (top, middle, bottom) = plt.subplots(3, 1, figsize=(9, 7.8), height_ratios=(1, 1.7, 1.6))
-    t, script_s, ours, promp = (np.array(numbers["shown"][key]) for key in ("time_s", "progress_s", "ours", "promp"))
+    t, script_s, ours, promp = (np.array(numbers["shown"][key]).T for key in ("time_s", "progress_s", "ours", "promp"))
     top.plot(t, script_s, color="black")
     top.set(ylabel="progress of\nthe hands [s]")
     for axis, name in enumerate("xyz"):
