@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 from service.contract.explain import ExplainedError
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
@@ -78,8 +79,23 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1"
     )
+    p.add_argument(
+        "--redraw",
+        action="store_true",
+        help="draw the figures of the numbers in DIR/NAME.json again, without measuring anew",
+    )
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
+
+
+def redraw(results: Results, experiment: ModuleType) -> None:
+    """Draws an experiment's figures of the numbers in its JSON again.
+
+    Raises ExperimentError if its figures show more than its numbers.
+    """
+    if not hasattr(experiment, "draw_numbers"):
+        raise ExperimentError(f"the figures of {results.name} show more than its numbers: run it without --redraw")
+    experiment.draw_numbers(results, results.measured())
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -97,7 +113,11 @@ def main(arguments: list[str] | None = None) -> int:
             began = time.monotonic()
             results = Results(args.output, name, said=not args.quiet)
             results.say(ABOUT[name])
-            numbers = importlib.import_module(f"sim.experiments.{name}").run(results, options)
+            experiment = importlib.import_module(f"sim.experiments.{name}")
+            if args.redraw:
+                redraw(results, experiment)
+                continue
+            numbers = experiment.run(results, options)
             print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
     except (ExplainedError, ExperimentError, FaultError, PartError, OSError) as error:
         print(f"python -m sim.experiments: {error}", file=sys.stderr)

@@ -47,7 +47,6 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         results.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
     floor = _floor_mm(known, held_out)
     success = 100 * (events <= 1000 * GRASP_DISTANCE).all(axis=3).mean(axis=2)
-    _draw(results, counts, {"as learned": reproduction, "with the three places taught": taught}, events, floor)
     stream = results.recording()
     for name, values, colour in (("reproduction_mm", reproduction, OTHER), ("success_percent", success, TOOL)):
         stream.log(f"/{name}", rr.SeriesLines(colors=[rgb(colour)], names=[name]), static=True)
@@ -55,7 +54,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             stream.set_time("demonstrations", sequence=count)
             stream.log(f"/{name}", rr.Scalars(float(values[count - 1].mean())))
     stream.disconnect()
-    return {
+    worst = events.max(axis=3).reshape(most, -1)
+    numbers = {
         "draws": draws,
         "held_out": HELD_OUT,
         "scenes": SCENES,
@@ -65,13 +65,20 @@ def run(results: Results, options: Options) -> dict[str, Any]:
                 "reproduction_rms_mm": float(reproduction[count - 1].mean()),
                 "taught_rms_mm": float(taught[count - 1].mean()),
                 "reproduction_std_mm": float(reproduction[count - 1].std()),
+                "taught_std_mm": float(taught[count - 1].std()),
                 "events_median_mm": float(np.median(events[count - 1])),
                 "events_p95_mm": float(np.percentile(events[count - 1], 95)),
+                "largest_event": {
+                    name: float(np.percentile(worst[count - 1], share))
+                    for name, share in (("median_mm", 50), ("p95_mm", 95), ("most_mm", 100))
+                },
                 "success_percent": float(success[count - 1].mean()),
             }
             for count in counts
         },
     }
+    draw_numbers(results, numbers)
+    return numbers
 
 
 def _reproduction_mm(skill: Skill, held_out: list[Demonstration]) -> float:
@@ -98,19 +105,30 @@ def _events_mm(skill: StoredSkill, number: int) -> Array:
     return np.asarray(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
 
 
-def _draw(results: Results, counts: list[int], errors: dict[str, Array], events: Array, floor: float) -> None:
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
-    for (label, values), style, colour in zip(errors.items(), ("o-", "s--"), (OTHER, TOOL), strict=True):
-        left.errorbar(counts, values.mean(axis=1), values.std(axis=1), fmt=style, color=colour, capsize=3, label=label)
-    left.axhline(floor, color=REFERENCE, ls="--", label="the demonstrations' own scatter")
-    left.set(xlabel="demonstrations", ylabel="rms error on held-out demonstrations [mm]", xticks=counts, ylim=(0, None))
+    counts, rows = [int(count) for count in numbers["by_count"]], list(numbers["by_count"].values())
+    for name, label, style, colour in (
+        ("reproduction", "as learned", "o-", OTHER),
+        ("taught", "with the three places taught", "s--", TOOL),
+    ):
+        mean, std = ([row[f"{name}_{what}_mm"] for row in rows] for what in ("rms", "std"))
+        left.errorbar(counts, mean, std, fmt=style, color=colour, capsize=3, label=label)
+    left.axhline(numbers["floor_mm"], color=REFERENCE, ls="--", label="the demonstrations' own scatter")
+    left.set(
+        xlabel="demonstrations", ylabel="rms error on held-out\ndemonstrations [mm]", xticks=counts, ylim=(0, None)
+    )
     left.legend(frameon=False)
-    worst = events.max(axis=3).reshape(len(counts), -1)
-    for share, style, label in ((50, "o-", "median"), (95, "s--", "95th percentile"), (100, "^:", "largest")):
-        right.plot(counts, np.percentile(worst, share, axis=1), style, color=TOOL, label=label)
+    for name, style, label in (
+        ("median", "o-", "median"),
+        ("p95", "s--", "95th percentile"),
+        ("most", "^:", "largest"),
+    ):
+        right.plot(counts, [row["largest_event"][f"{name}_mm"] for row in rows], style, color=TOOL, label=label)
     right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
-    right.set(xlabel="demonstrations", ylabel="largest error of the three events [mm]", xticks=counts, ylim=(0, 33))
-    right.set_title(f"new places up to 15 cm away, taught: {SCENES} scenes", fontsize=9)
-    right.legend(frameon=False, loc=(0.55, 0.68))
+    right.set(xlabel="demonstrations", ylabel="largest error of the\nthree events [mm]", xticks=counts, ylim=(0, 33))
+    right.set_title(f"new places up to 15 cm away, taught: {numbers['scenes']} scenes", fontsize=9)
+    right.legend(frameon=False, loc=(0.55, 0.66))
     results.figure(figure)

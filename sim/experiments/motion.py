@@ -23,7 +23,7 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.shipped import recordings
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
-from sim.experiments.linear_floor import Floor, best_linear
+from sim.experiments.linear_floor import best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.open_loop import targets
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
@@ -197,14 +197,15 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
         for group, rate_hz in FLOOR_GROUPS.items()
     }
-    _draw(results, table, floors)
     _record(results, hands[1], by_name["ours"](hands[1]))
-    return {
+    numbers = {
         "hands": "recorded" if options.hands else "modelled",
         "by_follower": table,
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
     }
+    draw_numbers(results, numbers)
+    return numbers
 
 
 def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
@@ -242,9 +243,11 @@ def _line(groups: dict[str, dict[str, float]]) -> str:
     return "; ".join(parts)
 
 
-def _draw(results: Results, table: dict[str, dict[str, dict[str, float]]], floors: dict[str, list[Floor]]) -> None:
-    """Error against jerk, for every follower and the best linear filters."""
-    plt = pyplot()
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers: error against jerk, for every follower and the best
+    linear filters.
+    """
+    plt, table, floors = pyplot(), numbers["by_follower"], numbers["best_linear_filter"]
     figure, axes = plt.subplots(1, len(floors), figsize=(10, 4.2), layout="constrained")
     styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
     for panel, (group, floor) in zip(axes, floors.items(), strict=True):
@@ -257,8 +260,8 @@ def _draw(results: Results, table: dict[str, dict[str, dict[str, float]]], floor
                 chosen = rows["ours"]
                 panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
         panel.plot(
-            [row.jerk_ratio for row in floor],
-            [row.error_rms_mm for row in floor],
+            [row["jerk_ratio"] for row in floor],
+            [row["error_rms_mm"] for row in floor],
             "k--",
             lw=1,
             label="best linear filter, without limits and arm",

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
 from sim.experiments.recorded_people import recorded_people
-from sim.experiments.results import SERIES, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
 from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
 from sim.experiments.trials import (
     FAST_MPS,
@@ -199,7 +199,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             if not task.kind and task.method != TEACHER and group == "tuning"
         },
     }
-    draw(results, numbers)
+    draw_numbers(results, numbers)
     return numbers
 
 
@@ -285,13 +285,13 @@ def line(rows: Sequence[Outcome]) -> str:
     )
 
 
-def draw(results: Results, numbers: dict[str, Any]) -> None:
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     found = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
     labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
-    colours = {**dict(zip(METHODS, SERIES, strict=False)), TEACHER: "#444444"}
+    colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
     bars = (
         ("success", 100.0, "success [%]\n(dark: on the teacher's way all through)"),
         ("path_rms_mm", 1.0, "target off the teacher's tool,\nrms [mm]"),
@@ -312,11 +312,23 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
         ax.invert_yaxis()
     levels = 100 * np.array(LEVELS)
     axes[3].plot((0, 100), (0, 100), "--", color="black", lw=0.8)
-    for method, one in found.items():
+    at = 104.0
+    for method, one in sorted(found.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]):
         if method != TEACHER:
-            axes[3].plot(levels, 100 * np.array(one["coverage"]), "o-", ms=3, color=colours[method])
+            inside = 100 * np.array(one["coverage"])
+            axes[3].plot(levels, inside, "o-", ms=3, lw=1.2, color=colours[method], zorder=3 if method == "ours" else 2)
+            at = min(at - 4.5, inside[-1])  # below the one before it
+            axes[3].annotate(
+                labels[method].partition(",\n")[0].partition(":")[0].replace("\n", " "),
+                (levels[-1], inside[-1]),
+                (106, at),
+                va="center",
+                fontsize=7.5,
+                color=colours[method],
+                annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colours[method], "relpos": (0, 0.5), "shrinkB": 2},
+            )
     axes[3].set(xlabel="region said to hold [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
-    axes[3].set_title("coloured as the bars", fontsize=8)
     people, scenes = numbers["people"], numbers["scenes_of_each"]
     figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % over people")
     results.figure(figure)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from sim.script import PAUSE_RAMP_S, HandScript, Pause
 
 STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
 SEED, RATE_HZ = 11, 500
+STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # of the hands, in the pause
 SETTLED_S = 0.3  # after the hands have stopped
+SHOWN_HZ = 20  # of what the figure shows
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -33,10 +36,29 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         runs[name] = rehearse(script, adapt(scene), rate_hz=rate_hz, keep=True)
         progress[name] = np.array([script.clock.at(t)[0] for t in runs[name].time_s])
         results.say(f"{name}: {runs[name].errors_mm} mm")
-    _draw(results, runs, progress["ours"])
     _record(results, runs, progress["ours"])
-    numbers = {name: _measured(one, progress[name]) for name, one in runs.items()}
-    return {"pause": STOP._asdict(), "back": BACK._asdict(), "tremor_mm": 1000 * TREMOR_M, **numbers}
+    shown = slice(int(np.argmax(runs["ours"].time_s > 0)), None, round(rate_hz / SHOWN_HZ))
+    numbers = {
+        "pause": STOP._asdict(),
+        "back": BACK._asdict(),
+        "tremor_mm": 1000 * TREMOR_M,
+        "tremor_in_space_rms_mm": 1000 * TREMOR_M * math.sqrt(3),
+        "hand_from_its_place_in_the_pause_mm": _from_its_place_mm(runs["ours"], scene),
+        **{name: _measured(one, progress[name]) for name, one in runs.items()},
+        "shown": {
+            "time_s": runs["ours"].time_s[shown].round(3),
+            "progress_s": progress["ours"][shown].round(3),
+            **{name: one.tool[shown].round(4).T for name, one in runs.items()},
+        },
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _from_its_place_mm(one: Rehearsed, scene: Scene) -> float:
+    """How far the left hand stands from where it takes the board, while the hands pause."""
+    at = int(np.searchsorted(one.time_s, STOPPED_S[0]))
+    return float(1000 * np.linalg.norm(one.hands[at, 0] - scene.handover))
 
 
 def _passes(time_s: Array, script_s: Array) -> tuple[Any, Any, Any]:
@@ -61,47 +83,40 @@ def _measured(one: Rehearsed, script_s: Array) -> dict[str, Any]:
         max(script_s[w].min() for w in (forth, back, again)), min(script_s[w].max() for w in (forth, back, again)), 500
     )
     way = along(forth, at)
-    paused = (one.time_s > STOP.at_s + PAUSE_RAMP_S + SETTLED_S) & (
-        one.time_s < STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S
-    )
-    resting = one.tool[paused]
+    stopped = one.tool[slice(*np.searchsorted(one.time_s, STOPPED_S))]
+    paused = (one.time_s > STOPPED_S[0] + SETTLED_S) & (one.time_s < STOPPED_S[1])
+    resting, when = one.tool[paused], one.time_s[paused]
     third = np.array_split(resting, 3)
+    drift = np.polynomial.polynomial.polyfit(when, resting, 1)
+    beside_drift = resting - np.polynomial.polynomial.polyval(when, drift).T
 
-    def rms(line: Array) -> float:
-        return float(1000 * np.sqrt(np.mean(np.sum((line - way) ** 2, axis=1))))
+    def spread(offsets: Array) -> float:
+        return float(1000 * np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
 
     return {
-        "back_against_forth_rms_mm": rms(along(back, at)),
-        "again_against_forth_rms_mm": rms(along(again, at)),
+        "back_against_forth_rms_mm": spread(along(back, at) - way),
+        "again_against_forth_rms_mm": spread(along(again, at) - way),
         "way_gone_back_mm": float(1000 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
         "drift_in_the_pause_mm": float(1000 * np.linalg.norm(third[-1].mean(axis=0) - third[0].mean(axis=0))),
-        "tremor_of_the_tool_in_the_pause_rms_mm": float(
-            1000 * np.sqrt(np.mean(np.sum((resting - resting.mean(axis=0)) ** 2, axis=1)))
-        ),
+        "goes_on_in_the_pause_mm": float(1000 * np.linalg.norm(stopped[-1] - stopped[0])),
+        "tremor_of_the_tool_in_the_pause_rms_mm": spread(resting - resting.mean(axis=0)),
+        "tremor_beside_its_drift_rms_mm": spread(beside_drift),
         "errors_mm": one.errors_mm,
         "success": one.events.success,
     }
 
 
-def _draw(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None:
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
     plt = pyplot()
-    figure, (top, middle, bottom) = plt.subplots(3, 1, figsize=(9, 7.5), height_ratios=(1, 1.6, 1.6))
-    ours, other = runs["ours"], runs["promp"]
-    on = ours.time_s > 0
-    t = ours.time_s[on]
-    top.plot(t, script_s[on], color="black")
+    figure, (top, middle, bottom) = plt.subplots(3, 1, figsize=(9, 7.8), height_ratios=(1, 1.7, 1.6))
+    t, script_s, ours, promp = (np.array(numbers["shown"][key]).T for key in ("time_s", "progress_s", "ours", "promp"))
+    top.plot(t, script_s, color="black")
     top.set(ylabel="progress of\nthe hands [s]")
     for axis, name in enumerate("xyz"):
-        middle.plot(t, ours.tool[on, axis], color=SERIES[axis], label=f"{name}, ours")
-        middle.plot(
-            other.time_s[other.time_s > 0],
-            other.tool[other.time_s > 0, axis],
-            "--",
-            lw=1.1,
-            color=SERIES[axis],
-            label=f"{name}, ProMP over time",
-        )
-    middle.set(ylabel="tool [m]", xlabel="time [s]")
+        middle.plot(t, ours[:, axis], color=SERIES[axis], label=f"{name}, ours")
+        middle.plot(t, promp[:, axis], "--", lw=1.1, color=SERIES[axis], label=f"{name}, ProMP over time")
+    middle.set(ylabel="tool [m]", xlabel="time [s]", ylim=(-0.35, 1.0))
     middle.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, frameon=False, fontsize=8)
     for axes in (top, middle):
         axes.axvspan(STOP.at_s, STOP.at_s + STOP.lasts_s, color=REFERENCE, alpha=0.2, lw=0)
@@ -109,19 +124,36 @@ def _draw(results: Results, runs: dict[str, Rehearsed], script_s: Array) -> None
         axes.set_xlim(0, t[-1])
     top.text(STOP.at_s + STOP.lasts_s / 2, script_s.max(), "the hands pause", ha="center", va="top", fontsize=8)
     top.text(BACK.at_s + BACK.lasts_s / 2, 0.2, "they go back", ha="center", va="bottom", fontsize=8)
+    shakes, goes_on = (
+        [numbers[who][key] for who in ("ours", "promp")]
+        for key in ("tremor_of_the_tool_in_the_pause_rms_mm", "goes_on_in_the_pause_mm")
+    )
+    middle.text(
+        STOP.at_s + 0.1,
+        0.97,
+        f"while they stand,\nthe tool goes on by {goes_on[0]:.0f} mm (ProMP {goes_on[1]:.0f})\n"
+        f"and is {shakes[0]:.1f} mm rms off its mean (ProMP {shakes[1]:.1f})",
+        va="top",
+        fontsize=8,
+    )
     for which, style, label in zip(
-        _passes(ours.time_s, script_s), ("-", "--", ":"), ("forth", "back", "forth again"), strict=True
+        _passes(t, script_s), ("-", "--", ":"), ("forth", "back", "forth again"), strict=True
     ):
         order = np.argsort(script_s[which])
         for axis in range(3):
-            bottom.plot(
-                script_s[which][order],
-                ours.tool[which][order, axis],
-                style,
-                color=SERIES[axis],
-                lw=1.8,
-                label=label if axis == 2 else None,
-            )
+            at, width = (script_s[which][order], ours[which][order, axis]), 2.6 if style == ":" else 1.6
+            colour = "black" if style == ":" else SERIES[axis]
+            bottom.plot(*at, style, color=colour, lw=width, label=label if axis == 2 else None)
+    for axis, name in enumerate("xyz"):
+        bottom.annotate(
+            name,
+            (0.965, ours[np.argmin(np.abs(t - BACK.at_s)), axis]),
+            (4, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            color=SERIES[axis],
+            va="center",
+        )
     bottom.set(
         ylabel="tool, ours [m]", xlabel="progress of the hands [s]; the tool is behind them by its lag, either way"
     )

@@ -20,6 +20,7 @@ from sim.experiments.writing import DURATION_S, TIMES
 BASES = 20  # for each of x and y
 COLUMNS = 5  # of the figure
 STYLES = (("o-", ADAPTED), ("x-", DESIRED), ("v--", "#009E73"), ("s:", "#56B4E9"), ("^--", OTHER), ("D-.", "black"))
+FAINT = "#595959"
 VIA_VARIANCE = 1e-6  # [cm²] as for KMP
 
 DIMENSIONS = (1, 2, 3, 6)
@@ -55,7 +56,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, seed) for seed in range(functions)])]
     results.say("dimensions done")
     numbers["dimensions"] = [one._asdict() for one in dimensions]
-    _draw_dimensions(results, dimensions)
+    draw_numbers(results, numbers)
     return numbers
 
 
@@ -140,7 +141,7 @@ def _summary(rows: list[Compared]) -> dict[str, Any]:
 
 class Grown(NamedTuple):
     """A method at one number of input dimensions: free numbers, bytes of its largest matrix,
-    seconds, error in shares of the output's deviation.
+    seconds, rms error as a share of the output's rms deviation from its mean along what is tried.
     """
 
     method: str
@@ -297,32 +298,42 @@ def _draw_letters(results: Results, sets: dict[str, Drawn]) -> None:
     results.figure(figure)
 
 
-def _draw_dimensions(results: Results, rows: list[Grown]) -> None:
-    plt = pyplot()
-    figure, (functions, seconds, error) = plt.subplots(1, 3, figsize=(10, 3.4))
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of what the dimensions cost. The letters' shows more than the numbers."""
+    plt, rows = pyplot(), [Grown(**one) for one in numbers["dimensions"]]
+    figure, (functions, seconds, error) = plt.subplots(1, 3, figsize=(10.5, 3.9))
     methods = list(dict.fromkeys(one.method for one in rows))
-    styles = dict(zip(methods, STYLES, strict=True))
-    for method in methods:
+    for method, (style, colour) in zip(methods, STYLES, strict=True):
         mine = [one for one in rows if one.method == method]
-        style, colour = styles[method]
         functions.plot([one.inputs for one in mine], [one.functions for one in mine], style, color=colour, label=method)
-        possible = [one for one in mine if one.seconds is not None]
-        seconds.plot([one.inputs for one in possible], [one.seconds for one in possible], style, color=colour)
-        error.plot(
-            [one.inputs for one in possible],
-            [100 * one.error for one in possible if one.error is not None],
-            style,
-            color=colour,
-        )
+        possible = [one for one in mine if one.seconds is not None and one.error is not None]
+        inputs = [one.inputs for one in possible]
+        seconds.plot(inputs, [one.seconds for one in possible], style, color=colour)
+        error.plot(inputs, [100 * one.error for one in possible if one.error is not None], style, color=colour)
+        if len(possible) < len(mine):
+            last = possible[-1]
+            for axes, value in ((seconds, last.seconds), (error, 100 * (last.error or 0.0))):
+                axes.plot(last.inputs, value, "o", ms=13, mfc="none", mec=colour, mew=1)
     at = (MOST_BYTES / 8) ** 0.5 / OUTPUTS
-    functions.axhline(at, color=REFERENCE, lw=0.8)
-    functions.text(0.9, at * 1.5, "above: more than 1 GiB\nfor their covariance", fontsize=7.5, color=REFERENCE)
-    functions.set(yscale="log", ylabel="basis functions, or reference points")
+    functions.axhline(at, color=FAINT, lw=0.8)
+    functions.text(
+        0.9, at * 1.4, "above: more than 1 GiB\nfor their covariance,\nwhich is not made", fontsize=7.5, color=FAINT
+    )
+    functions.text(6, 165, "three at 200", fontsize=7.5, color=FAINT, ha="right", va="top")
+    functions.set(yscale="log", ylim=(2, 3e6), ylabel="basis functions, or reference points")
     seconds.set(yscale="log", ylabel="time to learn [s]")
-    error.set(yscale="log", ylabel="error along a held-out demonstration\n[% of the output's deviation]")
+    error.set(
+        yscale="log",
+        ylabel="rms error along a held-out demonstration\n[% of the output's rms deviation there]",
+    )
     for axes in (functions, seconds, error):
         axes.set(xlabel="input dimensions", xticks=DIMENSIONS)
-    figure.legend(*functions.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    error.yaxis.set_major_formatter("{x:g}")
+    figure.suptitle(
+        "ringed: where a line ends, as with six inputs it has more functions than the line at the left allows",
+        fontsize=9,
+    )
+    figure.legend(*functions.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure, "dimensions")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import sys
 import time
 from dataclasses import dataclass, field
@@ -33,8 +34,9 @@ LEFT, RIGHT, TOOL = (
     "#009E73",
 )  # as in the paper: the left hand red, the right one blue, the robot green
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#882255")
+SERIES = ("#D55E00", "#0072B2", "#009E73")
 DPI, COLOURS = 110, 256
+ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
 
 
 class ExperimentError(ExplainedError):
@@ -94,9 +96,16 @@ class Results:
             "seconds": round(time.monotonic() - self.began_s, 1),
             **numbers,
         }
-        path.write_text(json.dumps(_plain(whole), indent=2) + "\n", encoding="utf-8")
+        text = json.dumps(_plain(whole), indent=2)
+        text = ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
+        path.write_text(text + "\n", encoding="utf-8")
         self.say(f"{path}")
         return path
+
+    def measured(self) -> dict[str, Any]:
+        """The numbers in the experiment's JSON, which an earlier run left."""
+        found: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
+        return found
 
     def recording(self) -> rr.RecordingStream:
         """A Rerun stream into the experiment's .rrd file; `disconnect` ends it."""

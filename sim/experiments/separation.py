@@ -25,7 +25,7 @@ from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
-from sim.experiments.results import ADAPTED, OTHER, REFERENCE, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
@@ -36,6 +36,7 @@ REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
+SHOWN_SCENES, SHOWN_TICKS = 5, 10  # of the figure: the first scenes, and every so many ticks of them
 HURRY = 0.05  # [m/s] by which a hand is faster than was assumed
 UNHEEDED_EVERY = 4  # scenes: only to tell what it costs to heed anyone
 
@@ -105,7 +106,8 @@ class Outcome(NamedTuple):
     errors_mm: tuple[float, float, float]
     times_s: tuple[float, float, float]  # of the events
     away_s: float  # that a hand was thrust in the way
-    closest_mm: float  # of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    shapes_mm: float  # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    capsules_mm: float  # the same of the capsules that the rule takes for them, which are wider
     pushed_mm: float  # that a part of the arm went toward a hand that it touched
     excess_at_once: float  # [m/s] over the rule, the most
     excess_after_reaction: float  # over the most that the rule allowed within the reaction time
@@ -172,6 +174,7 @@ def _judged(
         tuple(getattr(done.events, name).time_s for name in TaskEvents.__struct_fields__),
         away_s,
         1000 * min(map(min, clearances)),
+        1000 * float(distance[began].min()),
         1000 * float(pushed.max()),
         float((speed - allowed)[began].max()),
         float(np.where(assumed, over, -1.0)[began].max()),
@@ -181,7 +184,7 @@ def _judged(
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
         1000 * float(own.min()),
         1000 * float(table.min()),
-        picked[began][::10],
+        picked[began][::SHOWN_TICKS],
     )
 
 
@@ -266,9 +269,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         found[one.kind].append(one)
         if len(found[one.kind]) % max(1, count // 5) == 0:
             results.say(f"{one.kind}: {_summary(found[one.kind])}")
-    _draw(results, found)
     _record(results, found)
-    return {
+    numbers = {
         "scenes": count,
         "rate_hz": RATE_HZ,
         "slip_m_per_s": SLIP,
@@ -279,14 +281,28 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
         },
         "failed_scenes": {kind: [one.number for one in rows if not one.success] for kind, rows in found.items()},
+        "shown": {kind: _shown([one for one in rows if one.number < SHOWN_SCENES]) for kind, rows in found.items()},
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _shown(rows: list[Outcome]) -> dict[str, Any]:
+    """What the figure shows of some scenes: points at distances [mm] and speeds [mm/s]."""
+    near = np.concatenate([one.near for one in rows])
+    return {
+        "scenes": len(rows),
+        "closest_of_capsules_mm": min(one.capsules_mm for one in rows),
+        "closest_of_shapes_mm": min(one.shapes_mm for one in rows),
+        "points": np.round(1000 * near[near[:, 0] < SHOWN_M]).astype(int).T,
     }
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:
-    closest = np.array([one.closest_mm for one in rows])
+    closest = np.array([one.shapes_mm for one in rows])
     return {
         "successes": sum(one.success for one in rows),
-        "closest_mm": {"least": closest.min(), "median": float(np.median(closest))},
+        "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
         "overlaps": int((closest < 0).sum()),
         "pushed_mm": max(one.pushed_mm for one in rows),
         "excess_at_once": max(one.excess_at_once for one in rows),
@@ -320,31 +336,36 @@ def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, A
     return {"away": away, "mean": float(late.mean()), "least": float(late.min()), "most": float(late.max())}
 
 
-def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
     plt, people = pyplot(), Settings().people
     reaction_s = (Settings().hands.stale_ms + people.reaction_ms) / 1000
-    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), sharey=True)
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), sharey=True)
     titles = ("random scenes", "a hand thrust in the way", "random scenes, nobody heeded")
-    colours = (OTHER, ADAPTED, REFERENCE)
+    colours = (OTHER, ADAPTED, "#595959")
     for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
-        near = np.concatenate([one.near for one in found[kind]])
-        near = near[near[:, 0] < SHOWN_M]
-        ax.scatter(1000 * near[:, 0], near[:, 1], s=2, alpha=0.25, color=colour, lw=0, rasterized=True)
-        distances = np.linspace(-0.05, SHOWN_M, 200)
+        shown = numbers["shown"][kind]
+        distance_mm, speed_mm_s = np.array(shown["points"])
+        ax.scatter(distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True)
+        distances = np.linspace(-0.1, SHOWN_M, 200)
         for hand, style in ((0.0, "-"), (0.5, "--")):
             rule = [allowed_speed(d, hand, people.brake, reaction_s, people.clearance) for d in distances]
             ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
+        closest = shown["closest_of_capsules_mm"]
+        ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"the nearest: {closest:.0f} mm")
         ax.axvline(0, color="black", lw=0.6)
-        ax.set(title=title, xlabel="distance of a part of the arm from a hand [mm]", xlim=(-60, 1000 * SHOWN_M))
-    axes[0].set(ylabel="speed toward the hand [m/s]", ylim=(-0.6, 0.9))
-    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
+        ax.set_title(f"{title} ({shown['scenes']} shown)", fontsize=9)
+        ax.set(xlim=(-100, 1000 * SHOWN_M), ylim=(-0.6, 0.9))
+        ax.legend(frameon=False, fontsize=7.5, loc="lower right")
+    axes[0].set(ylabel="speed toward the hand [m/s]")
+    axes[1].set(xlabel="distance between the rule's capsules of a part of the arm and of a hand [mm]")
     results.figure(figure)
 
 
 def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
     stream = results.recording()
     for kind, rows in found.items():
-        for name in ("closest_mm", "excess_after_reaction"):
+        for name in ("capsules_mm", "shapes_mm", "excess_after_reaction"):
             values: Array = np.array([getattr(one, name) for one in rows])
             times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]
             stream.send_columns(f"/{name}/{kind}", times, rr.Scalars.columns(scalars=values))

@@ -17,7 +17,7 @@ from sim.bench import TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse
-from sim.experiments.results import SERIES, Array, Options, Results, pyplot, rgb
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
 from sim.experiments.skills import LookUp, NoDemonstrations
 from sim.experiments.workers import shared_out
@@ -38,6 +38,7 @@ METHODS = {
     "gmr": "GMR alone",
 }
 NAMES = TaskEvents.__struct_fields__
+LEAST_MM = 1e-3  # to what errors are rounded: the least that a logarithmic axis shows
 
 
 class Outcome(NamedTuple):
@@ -106,9 +107,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             }
         )
         results.say(f"scene {number} over Zenoh in real time: {in_real_time[-1]}")
-    _draw(results, found)
     _record(results, found)
-    return {
+    numbers = {
         "scenes": count,
         "rate_hz": {"ours": OURS_HZ, "rivals": RIVALS_HZ},
         "within_mm": 1000 * GRASP_DISTANCE,
@@ -118,6 +118,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "in_real_time": in_real_time,
         "errors_mm_by_scene": {method: [one.errors_mm for one in rows] for method, rows in found.items()},
     }
+    draw_numbers(results, numbers)
+    return numbers
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:
@@ -147,58 +149,53 @@ def wilson(successes: int, of: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / (1 + z * z / of)), min(1.0, (middle + half) / (1 + z * z / of))
 
 
-def _draw(results: Results, found: dict[str, list[Outcome]]) -> None:
-    plt = pyplot()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 5.0), width_ratios=(1, 1.7))
-    for i, rows in enumerate(found.values()):
-        rate = 100 * sum(one.success for one in rows) / len(rows)
-        low, high = (100 * bound for bound in wilson(round(rate * len(rows) / 100), len(rows)))
-        left.barh(i, rate, color=SERIES[i], height=0.6)
-        left.plot((low, high), (i, i), color="black", lw=1.2)
-        left.text(max(rate, high) + 1.5, i, f"{rate:.0f}", va="center")
-    left.set(xlim=(0, 112), xticks=range(0, 101, 25), xlabel="scenes in which all three events succeeded [%]")
-    left.set_yticks(range(len(found)), list(METHODS.values()))
-    left.invert_yaxis()
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers: a row a method."""
+    plt, found = pyplot(), numbers["methods"]
+    figure, (rates, *events) = plt.subplots(1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1))
     random = np.random.default_rng(0)
-    for i, (method, rows) in enumerate(found.items()):
-        errors = np.array([one.errors_mm for one in rows])
-        for event in range(3):
-            at = event + (i - (len(found) - 1) / 2) * 0.8 / len(found)
-            right.scatter(
-                at + random.uniform(-0.03, 0.03, len(rows)), errors[:, event], s=5, color=SERIES[i], alpha=0.5, lw=0
-            )
-            right.plot((at - 0.04, at + 0.04), [np.median(errors[:, event])] * 2, color="black", lw=1.5)
-        right.scatter([], [], s=18, color=SERIES[i], label=METHODS[method].replace("\n", " "))
-    right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
-    right.text(2.46, 1000 * GRASP_DISTANCE * 1.06, "30 mm", ha="right", va="bottom", fontsize=8)
-    right.set(
-        yscale="log",
-        ylabel="smallest distance at the event [mm]",
-        xlim=(-0.5, 2.5),
-        xlabel="dots: scenes; bars: medians",
+    for i, (method, one) in enumerate(found.items()):
+        colour = ADAPTED if method == "ours" else OTHER
+        rate, (low, high) = 100 * one["successes"] / one["of"], one["rate_95_percent_interval"]
+        rates.barh(i, rate, color=colour, height=0.6)
+        rates.plot((100 * low, 100 * high), (i, i), color="black", lw=1.2)
+        rates.text(max(rate, 100 * high) + 2, i, f"{rate:.0f}", va="center")
+        errors = np.array(numbers["errors_mm_by_scene"][method])
+        for axes, name, error in zip(events, NAMES, errors.T, strict=True):
+            at = i + random.uniform(-0.25, 0.25, len(error))
+            axes.scatter(np.maximum(error, LEAST_MM), at, s=5, color=colour, alpha=0.5, lw=0)
+            axes.plot([max(one[f"{name}_mm"]["median"], LEAST_MM)] * 2, (i - 0.38, i + 0.38), color="black", lw=1.6)
+    rates.set(xlim=(0, 116), xticks=range(0, 101, 25), xlabel="scenes in which all three\nevents succeeded [%]")
+    rates.set_yticks(range(len(found)), [METHODS[method] for method in found])
+    rates.invert_yaxis()
+    titles = (
+        "board handed over:\ntool to left hand",
+        "glass grasped:\ntool to handle",
+        "glass carried:\ntool to place",
     )
-    right.set_xticks(
-        range(3),
-        [
-            "board handed over:\ntool to left hand",
-            "glass grasped:\ntool to handle",
-            "glass carried:\ntool to its place",
-        ],
+    for axes, title in zip(events, titles, strict=True):
+        axes.axvline(numbers["within_mm"], color="black", ls="--", lw=0.8)
+        axes.set(xscale="log", xlim=(0.7 * LEAST_MM, 1500), xticks=[1e-3, 0.1, 10, 1000])
+        axes.set_xticklabels(["0.001", "0.1", "10", "1000"])
+        axes.set_title(title, fontsize=9)
+        axes.minorticks_off()
+    events[1].set_xlabel(
+        f"smallest distance at the event [mm]\ndots: scenes; bars: medians; dashed: within {numbers['within_mm']:g} mm"
     )
-    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     figure.suptitle(
-        f"{len(next(iter(found.values())))} random scenes: places up to 15 cm away, "
-        "hands 0.5 to 2 times as fast, pauses, going back"
+        f"{numbers['scenes']} random scenes: places up to 15 cm away, hands 0.5 to 2 times as fast, pauses, going back",
+        fontsize=10,
     )
     results.figure(figure)
 
 
 def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
     stream = results.recording()
-    for i, (method, rows) in enumerate(found.items()):
+    for method, rows in found.items():
+        colour = ADAPTED if method == "ours" else OTHER
         for event, name in enumerate(NAMES):
             values: Array = np.array([one.errors_mm[event] for one in rows])
-            stream.log(f"/{name}/{method}", rr.SeriesPoints(colors=[rgb(SERIES[i])], names=[method]), static=True)
+            stream.log(f"/{name}/{method}", rr.SeriesPoints(colors=[rgb(colour)], names=[method]), static=True)
             times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]
             stream.send_columns(f"/{name}/{method}", times, rr.Scalars.columns(scalars=values))
     stream.disconnect()

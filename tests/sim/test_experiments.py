@@ -4,7 +4,9 @@ out what it claims.
 
 from __future__ import annotations
 
+import importlib
 import json
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
 pytest.importorskip(
@@ -21,14 +24,17 @@ pytest.importorskip(
 from kmp import GaussianMixture
 from sim.experiments import rivals
 from sim.experiments.__main__ import ABOUT, main
+from sim.experiments.hands import is_evidence
 from sim.experiments.rehearsal import demonstrated
-from sim.experiments.results import ExperimentError
+from sim.experiments.results import Array, ExperimentError
 from sim.experiments.scenes import draw
 from sim.experiments.statistics import wilson
 from sim.experiments.writing import recorded, write
 from sim.scene import MOST_MOVED, Scene
+from support.paths import ROOT
 
 pytestmark = pytest.mark.timeout(300)
+SHIPPED = ROOT / "recordings" / "experiments"
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +146,8 @@ class TestExperiments:
     def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
         found = numbers("hands", tmp_path)
         assert found["figures"] == ["hands-stages.png", "hands.png"]
+        assert is_evidence(found["evidence_is_periods_skipped_at_most"])
+        assert not is_evidence(found["evidence_is_periods_skipped_at_most"] + 1)
         worth = {name: one["error_median_mm"] for name, one in found["beside_the_paper"].items()}
         assert min(worth, key=lambda name: worth[name]) == "ours"
         assert worth["one point a place"] > 3 * worth["ours"]
@@ -189,6 +197,42 @@ def test_every_experiment_has_a_test() -> None:
         "demonstrations",
         "orientation",
     }
+
+
+DRAWN = [name for name in ABOUT if hasattr(importlib.import_module(f"sim.experiments.{name}"), "draw_numbers")]
+
+
+def grey(path: Path) -> Array:
+    """A picture's brightness (N, M), each the mean of 8 by 8 pixels: fonts differ a little."""
+    one = np.asarray(Image.open(path).convert("L"), float)
+    height, width = (8 * (side // 8) for side in one.shape)
+    return one[:height, :width].reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.usefixtures("close_figures")
+def test_the_shipped_figures_are_of_the_shipped_numbers(name: str, tmp_path: Path) -> None:
+    shutil.copy(SHIPPED / f"{name}.json", tmp_path)
+    assert main([name, "--output", str(tmp_path), "--redraw", "--quiet"]) == 0
+    figures = list(tmp_path.glob("*.png"))
+    assert figures
+    for figure in figures:
+        np.testing.assert_allclose(grey(figure), grey(SHIPPED / figure.name), atol=10, err_msg=figure.name)
+
+
+def test_a_figure_of_other_numbers_is_another_one(tmp_path: Path) -> None:
+    numbers = json.loads((SHIPPED / "people.json").read_text())
+    numbers["methods"]["ours"]["success"]["mean"] -= 0.02
+    (tmp_path / "people.json").write_text(json.dumps(numbers))
+    assert main(["people", "--output", str(tmp_path), "--redraw", "--quiet"]) == 0
+    assert np.abs(grey(tmp_path / "people.png") - grey(SHIPPED / "people.png")).max() > 10
+
+
+def test_what_shows_more_than_its_numbers_is_not_drawn_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["correlation", "--output", str(tmp_path), "--redraw", "--quiet"]) == 1
+    assert "run it without --redraw" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", range(100))

@@ -244,27 +244,3 @@ def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, mon
 def test_a_method_meets_the_same_sessions_as_another() -> None:
     rows = [outcomes(Task(method, 0, "tuning", "", 2, 1, None)) for method in ("look_up", "none")]
     assert [(one.person, one.number) for one in rows[0]] == [(one.person, one.number) for one in rows[1]]
-
-
-def test_the_documents_tell_what_was_measured() -> None:
-    root = Path(__file__).parents[2]
-    found = json.loads((root / "recordings" / "experiments" / "people.json").read_text(encoding="utf-8"))
-    told, front = (
-        " ".join((root / p).read_text(encoding="utf-8").split()) for p in ("docs/experiments.md", "README.md")
-    )
-
-    def percent(method: str, measure: str = "success") -> str:
-        return f"{100 * found['methods'][method][measure]['mean']:.0f}"
-
-    assert f"succeeds in {percent('ours')} % of 96 scenes" in told
-    others = [percent(method) for method in ("as_paper", "none", "gaussian_process")]
-    assert "succeed in {} %, no demonstrations in {} %, a Gaussian process in {} %".format(*others) in told
-    assert f"looked up by distance, succeeds in {percent('look_up')} %" in told
-    kept = [percent(method, "success_on_the_way") for method in ("ours", "gaussian_process")]
-    assert f"falsely followed at most) in {kept[0]} % of the scenes" in told
-    assert f"a Gaussian process in {kept[1]}, look-up in none" in told
-    assert f"succeeds in {percent('ours')} % of the scenes, in {kept[0]} on the way" in front
-    for kind in BREAKING:
-        cells = [found["breaking"][method][kind] for method in ("ours", "look_up", "gaussian_process", "as_paper")]
-        row = [f"{one['successes']}" + (f", and {one['held']} held" if one["held"] else "") for one in cells]
-        assert f" | {' | '.join(row)} |" in told[told.index(f"| {kind}") :][:120], kind
