@@ -54,12 +54,13 @@ def driven(
     tool: ToolSettings = TOOL,
     costs: Vector = FREE,
     slow: float = 1.0,
+    rate_hz: int = 500,
 ) -> tuple[Vector, Vector]:
     """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
 
     In each step the bounds are looked at from outside.
     """
-    generator, state = Explained(Settings(tool=tool)), blank(STATE)
+    generator, state = Explained(Settings(tool=tool, rate_hz=rate_hz)), blank(STATE)
     generator.begin(state, at_rest(targets[0][0]) if start is None else start)
     out, said = [state["setpoint"].copy()], []
     for target in targets:
@@ -277,6 +278,27 @@ def test_a_slow_tracker_comes_to_rest_too(weight: float, distance_m: float) -> N
     states, _ = driven([at_rest(there)] * 3000, start=at_rest(MIDDLE), tool=tool)
     assert np.abs(states[-200:, 2]).max() < 1e-3
     assert states[:, 0, 0].max() < there[0] + 0.005
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "max_jerk", "weight"),
+    [(500, 5.0, 2.8e-9), (500, 2.0, 1e-11), (250, 1.0, 1e-7), (100, 50.0, 1e-7), (50, 20.0, 1e-5)],
+)
+def test_whatever_its_jerk_and_the_loops_rate_it_comes_to_rest(rate_hz: int, max_jerk: float, weight: float) -> None:
+    tool = msgspec.structs.replace(TOOL, jerk_weight=weight, max_jerk=max_jerk)
+    for way in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
+        u = np.minimum(1.0, np.arange(12 * rate_hz) / (0.4 * rate_hz))[:, None]
+        reach = np.stack(
+            [
+                MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * way,
+                30 * u * u * (1 - u) ** 2 / 0.4 * way,
+                (60 * u - 180 * u * u + 120 * u**3) / 0.16 * way,
+            ],
+            axis=1,
+        )
+        states, _ = driven(list(reach), tool=tool, rate_hz=rate_hz)
+        assert np.abs(states[-rate_hz:, 2]).max() < 1e-3
+        np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
 
 
 def test_a_target_that_moves_steadily_is_followed_close() -> None:

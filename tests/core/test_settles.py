@@ -80,6 +80,15 @@ def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill
     assert rms(found) < AT_REST
 
 
+@pytest.mark.parametrize(
+    ("rate_hz", "tool"), [(250, {"jerk_weight": 1e-11, "max_jerk": 43.0}), (500, {"max_jerk": 2.0})]
+)
+def test_a_tool_of_little_jerk_comes_to_rest(taught: Skill, rate_hz: int, tool: dict[str, float]) -> None:
+    cell, places = changed(cell_of("panda"), rate_hz=rate_hz, **tool), taught.hands.reshape(-1, 2, 3)
+    hands = list(places[np.random.default_rng(0).integers(len(places), size=2)])
+    assert rms(accelerations(cell, taught, np.array(cell.arm.posture), hands, 16.0)) < AT_REST
+
+
 @pytest.mark.parametrize("number", range(EXAMPLES))
 def test_whatever_the_cell_the_arm_comes_to_rest(taught: Skill, number: int) -> None:
     random, cell = np.random.default_rng(number), cell_of(("wam", "panda", "ur5")[number % 3])

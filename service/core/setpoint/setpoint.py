@@ -45,7 +45,11 @@ STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
 TRACKER_SHARE = 1.1  # of the rate at which joints change their acceleration: a quicker tracker swings with them
-BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up
+TRACKER_STEP = 0.6  # of the loop's rate, likewise: it acts once a tick (swings from 1)
+STIFFEST = 100.0  # [1/m] of the tool's jerk for an error: it swings only where farther off than the hull lets it be
+SLOWEST = 0.2  # [1/s] of a tracker, however little jerk there is: slower gains are not found
+BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
+BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
 SHARE = 0.91  # of acceleration and jerk that is planned with
 SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
@@ -64,7 +68,9 @@ class SetpointGenerator:
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
-        weight = max(tool.jerk_weight, (TRACKER_SHARE * acceleration_rate(settings.joints)) ** -6)
+        own = max(TRACKER_SHARE * tool.max_jerk / tool.max_acceleration, math.cbrt(STIFFEST * tool.max_jerk))
+        quickest = min(TRACKER_SHARE * acceleration_rate(settings.joints), own, TRACKER_STEP * settings.rate_hz)
+        weight = max(tool.jerk_weight, max(quickest, SLOWEST) ** -6)
         self._parameters = parameters(
             period_s=settings.period_s,
             gains=tracker_gains(weight),
@@ -198,15 +204,16 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     way += ROOM + STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE)
     # what is left of the room for a stop shrinks at BARRIER_RATE at most; linear between most and
     # least jerk
+    used = min(BARRIER_RATE * dt, BARRIER_TIME / dt)
     left = way - stop_distance(speed, a, brake, change)
-    limit = way + min(coming, speed) * dt - (1.0 - BARRIER_RATE * dt) * left
+    limit = way + min(coming, speed) * dt - (1.0 - used) * left
     v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a - 0.5 * dt * change), 0.0)
     most = stop_distance(v_u, a + u * dt, brake, change) + speed * dt
     least = stop_distance(v_d, a - change * dt, brake, change) + speed * dt
     chosen = _between(u, -change, most, least, limit)
     # so does what is left to the greatest speed, as it is when the acceleration has come to 0
     left = top - (speed + a * abs(a) / (2.0 * change))
-    limit = top - (1.0 - BARRIER_RATE * dt) * left
+    limit = top - (1.0 - used) * left
     a_u, a_d = a + chosen * dt, a - change * dt
     most = speed + dt * (a + 0.5 * dt * chosen) + a_u * abs(a_u) / (2.0 * change)
     least = speed + dt * (a - 0.5 * dt * change) + a_d * abs(a_d) / (2.0 * change)
