@@ -63,15 +63,22 @@ class Database(Immutable):
 
     def changed(self, changes: Changes) -> Database:
         """The database after the changes: the points not replaced, then the via-points."""
-        kept = np.delete(np.arange(len(self)), changes.replaced)
-        functionals = Functionals.concatenated([self.functionals.take(kept), changes.functionals])
-        return Database(functionals, Gaussians.concatenated([self.reference.take(kept), changes.points]))
+        functionals, reference = self.functionals, self.reference
+        if len(changes.replaced):
+            kept = np.delete(np.arange(len(self)), changes.replaced)
+            functionals, reference = functionals.take(kept), reference.take(kept)
+        return Database(
+            Functionals.concatenated([functionals, changes.functionals]),
+            Gaussians.concatenated([reference, changes.points]),
+        )
 
     def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
         """The indices, ascending, of the values nearest to those of via, if near enough.
 
         A derivative neither replaces a point nor is replaced.
         """
+        if tolerance == 0:
+            return np.empty(0, dtype=np.intp)
         values, near = via.inputs[via.values], np.zeros(len(self), dtype=bool)
         step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):

@@ -48,13 +48,17 @@ class _Taken(NamedTuple):
         span, root = np.linalg.qr(lapack.dtrtrs(base, unit, lower=1)[0])
         return cls(frozen(rows), frozen(np.delete(np.arange(len(base)), rows)), frozen(span), frozen(root))
 
-    def forth(self, base: Array, right: Array) -> Array:
-        """(I - Q Q^T) L^-1 times (p - q, J), which says nothing of the rows taken."""
+    def forth(self, base: Array, right: Array, there: Array | None = None) -> Array:
+        """(I - Q Q^T) L^-1 times (p - q, J), whatever would be `there` (q, J), in the rows taken.
+
+        Best is what the others let expect, None: little is left to project, and few digits lost.
+        """
         every = np.zeros((len(base), right.shape[1]), order="F")
         every[self.kept] = right
-        found, _ = lapack.dtrtrs(base, every, lower=1)
-        # With what the others let expect there, little is left to project, and few digits are lost.
-        every[self.rows] -= lapack.dtrtrs(self.root, self.span.T @ found)[0]
+        if there is None:
+            found, _ = lapack.dtrtrs(base, every, lower=1)
+            there = -lapack.dtrtrs(self.root, self.span.T @ found)[0]
+        every[self.rows] = there
         found, _ = lapack.dtrtrs(base, every, lower=1)
         return np.asarray(found - self.span @ (self.span.T @ found))
 
@@ -72,7 +76,10 @@ class _Bordered(NamedTuple):
     def solve(self, right: Array) -> Array:
         """The inverse of what is factorised times (p - q + m, J)."""
         shared = len(right) - len(self.corner)
-        forth = _forth(self.base, self.taken, right[:shared])
+        if self.taken is None:
+            forth, _ = lapack.dtrtrs(self.base, right[:shared], lower=1)
+        else:
+            forth = self.taken.forth(self.base, right[:shared])
         last, _ = lapack.dpotrs(self.corner, right[shared:] - self.border.T @ forth, lower=1)
         first, _ = lapack.dtrtrs(self.base, forth - self.border @ last, lower=1, trans=1)
         return np.concatenate([first if self.taken is None else first[self.taken.kept], last])
@@ -85,10 +92,6 @@ class _Bordered(NamedTuple):
             factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
         factor[p:, :p], factor[p:, p:] = self.border.T, self.corner
         return frozen(factor)
-
-
-def _forth(base: Array, taken: _Taken | None, right: Array) -> Array:
-    return lapack.dtrtrs(base, right, lower=1)[0] if taken is None else taken.forth(base, right)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -247,12 +250,17 @@ class Dense(Immutable):
     def _bordered(self, rows: Array, base_factor: Array) -> tuple[_Bordered, int]:
         """The base's factor with these rows, less those of points that are gone; LAPACK's info."""
         p, taken = rows.shape[1] - len(rows), None
-        if self.gone is None:
+        columns = rows[:, :p].T
+        if self.gone is None or self.base is None:
             shared = np.asfortranarray(base_factor[:p, :p])
+            border, _ = lapack.dtrtrs(shared, columns, lower=1)
         else:
-            shared, o = np.asfortranarray(base_factor), self.hyperparameters.kernel.channels * self.apart
+            shared, kernel = np.asfortranarray(base_factor), self.hyperparameters.kernel
+            o, gone = kernel.channels * self.apart, self.base.database.functionals.take(self.gone)
             taken = _Taken.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
-        border = _forth(shared, taken, rows[:, :p].T)
+            there = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
+            wide = np.asarray(np.kron(there, np.eye(self.apart)), dtype=np.float64)
+            border = taken.forth(shared, columns, wide)
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), taken), info
 
