@@ -85,8 +85,9 @@ class Database(Immutable):
             distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
             if self.functionals.directions is not None:
                 distance[:, ~self.functionals.values] = np.inf
-            least = distance.min(axis=1, keepdims=True)
-            near |= ((distance == least) & (least < tolerance)).any(axis=0)
+            least = distance.min(axis=1)
+            for n in np.flatnonzero(least < tolerance):
+                near |= distance[n] == least[n]
         return np.flatnonzero(near)
 
 
