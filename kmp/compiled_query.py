@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from kmp.checks import Array
 from kmp.compiled import AVAILABLE, compiled
+from kmp.compiled_mean import means, slopes, table_of
 from kmp.dense import Dense
+from kmp.functionals import Derivatives
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel
 from kmp.kernel_row import kernel_value
@@ -34,23 +38,55 @@ class CompiledQuery(Immutable):
     along: Array
     """(R, I) the directions of the derivatives, in the kernel's coordinates, zero for a value; or
     (0, I), where all are values."""
-    columns: Array | None
-    """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c Sigma
-    = L L^T (R A, R A); None: the covariance is the solution's own."""
-    apart: int
-    """A, the outputs that the factor holds each for itself: all, or 1 for all."""
+    table: Array
+    """(I + O, P) the rows beside one another, as `means` takes them."""
+    derivatives: Derivatives
+    """Which of the centres are derivatives, if any."""
 
     @classmethod
     def of(cls, query: Query) -> CompiledQuery | None:
         """The query for compiled loops; None where there are none for it."""
         if not AVAILABLE or not isinstance(query.kernel, GaussianKernel):
             return None
-        solution = query.solution
-        along = solution.functionals.along * query.stretch if query.derivatives else np.empty((0, len(query.stretch)))
-        rows = frozen(np.hstack([query.centres, query.weights]))
-        if not isinstance(solution, Dense):
-            return cls(query, rows, frozen(along), None, 0)
-        return cls(query, rows, frozen(along), _packed(solution), solution.apart)
+        inputs = len(query.stretch)
+        nothing = frozen(np.empty((0, inputs)))
+        none: NDArray[np.intp] = frozen(np.empty(0, dtype=np.intp))
+        along = frozen(query.solution.functionals.along * query.stretch) if query.derivatives else nothing
+        rows, table = np.hstack([query.centres, query.weights]), table_of(query.centres, query.weights)
+        return cls(query, frozen(rows), along, frozen(table), query.derivatives or Derivatives(none, nothing))
+
+    @cached_property
+    def columns(self) -> Array | None:
+        """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c
+        Sigma = L L^T (R A, R A); None: the covariance is the solution's own.
+        """
+        solution = self.query.solution
+        return _packed(solution) if isinstance(solution, Dense) else None
+
+    @cached_property
+    def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
+        """What `means` and `slopes` read besides the queries."""
+        q = self.query
+        coordinates = frozen(np.concatenate([[q.scale], q.stretch]))
+        return self.table, *self.derivatives, coordinates, q.prior_mean
+
+    def mean(self, queries: Array) -> tuple[Array, Array] | None:
+        """xi at queries (M, I), at least one: (M, O); and the last one's kernel row (R,).
+
+        But for rounding as `Query.mean`; None where what was given, or comes of it, is not finite.
+        """
+        table, places, along, coordinates, prior = self._reads
+        given = np.array(queries, np.float64, order="C")  # one type of array, and so compiled once
+        values, out = np.empty(table.shape[1]), np.empty((len(given), len(prior)))
+        finite = means(given, table, places, along, coordinates, prior, values, out)
+        return (out, values[: len(self.rows)]) if finite else None
+
+    def jacobian(self, query: Array) -> Array | None:
+        """As `Query.jacobian`, but for rounding; None as in `mean`."""
+        table, places, along, coordinates, prior = self._reads
+        given = np.array(query, np.float64, order="C")
+        out = np.empty((len(prior), len(given)))
+        return out if slopes(given, table, places, along, coordinates, prior, out) else None
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -70,13 +106,14 @@ class CompiledQuery(Immutable):
     def covariance(self, values: Array) -> Array:
         """As `Query.covariance`, but for rounding."""
         q = self.query
-        if self.columns is None:
+        if self.columns is None or not isinstance(q.solution, Dense):
             return q.covariance(values)
-        found = np.empty((self.apart, self.apart))
-        if not _posterior(values, self.columns, np.zeros((self.apart, len(values) * self.apart)), found):
+        apart = q.solution.apart
+        found = np.empty((apart, apart))
+        if not _posterior(values, self.columns, np.zeros((apart, len(values) * apart)), found):
             found = nearest_positive_semidefinite(found[None])[0]
         found *= q.covariance_scale
-        return found if self.apart > 1 else found[0, 0] * np.eye(len(q.prior_mean))
+        return found if apart > 1 else found[0, 0] * np.eye(len(q.prior_mean))
 
 
 def _packed(solution: Dense) -> Array:

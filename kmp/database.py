@@ -63,23 +63,31 @@ class Database(Immutable):
 
     def changed(self, changes: Changes) -> Database:
         """The database after the changes: the points not replaced, then the via-points."""
-        kept = np.delete(np.arange(len(self)), changes.replaced)
-        functionals = Functionals.concatenated([self.functionals.take(kept), changes.functionals])
-        return Database(functionals, Gaussians.concatenated([self.reference.take(kept), changes.points]))
+        functionals, reference = self.functionals, self.reference
+        if len(changes.replaced):
+            kept = np.delete(np.arange(len(self)), changes.replaced)
+            functionals, reference = functionals.take(kept), reference.take(kept)
+        return Database(
+            Functionals.concatenated([functionals, changes.functionals]),
+            Gaussians.concatenated([reference, changes.points]),
+        )
 
     def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
         """The indices, ascending, of the values nearest to those of via, if near enough.
 
         A derivative neither replaces a point nor is replaced.
         """
+        if tolerance == 0:
+            return np.empty(0, dtype=np.intp)
         values, near = via.inputs[via.values], np.zeros(len(self), dtype=bool)
         step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):
             distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
             if self.functionals.directions is not None:
                 distance[:, ~self.functionals.values] = np.inf
-            least = distance.min(axis=1, keepdims=True)
-            near |= ((distance == least) & (least < tolerance)).any(axis=0)
+            least = distance.min(axis=1)
+            for n in np.flatnonzero(least < tolerance):
+                near |= distance[n] == least[n]
         return np.flatnonzero(near)
 
 

@@ -25,23 +25,64 @@ from kmp.linear_algebra import kron_identity
 from kmp.solution import check_resolved
 
 _SHARED = 0.75  # of the points: where fewer come before the first change, a border costs more than a fit
+_TAKEN = 0.125  # of the points: where more are taken out of the factor, that costs more than a fit
 _COLUMNS = 64  # of a factor, copied at once
 
 
+class _Taken(NamedTuple):
+    """The rows that are taken out of what a Cholesky factor L is of: with E the unit columns of
+    these, the inverse of the rest is that of L L^T with I - Q Q^T between L^-T and L^-1, where
+    L^-1 E = Q R.
+    """
+
+    rows: NDArray[np.intp]  # (q,)
+    kept: NDArray[np.intp]  # (p - q,)
+    span: Array  # Q (p, q)
+    root: Array  # R (q, q)
+
+    @classmethod
+    def out_of(cls, base: Array, rows: NDArray[np.intp]) -> _Taken:
+        """These rows out of L (p, p)."""
+        unit = np.zeros((len(base), len(rows)), order="F")
+        unit[rows, np.arange(len(rows))] = 1.0
+        span, root = np.linalg.qr(lapack.dtrtrs(base, unit, lower=1)[0])
+        return cls(frozen(rows), frozen(np.delete(np.arange(len(base)), rows)), frozen(span), frozen(root))
+
+    def forth(self, base: Array, right: Array, there: Array | None = None) -> Array:
+        """(I - Q Q^T) L^-1 times (p - q, J), whatever would be `there` (q, J), in the rows taken.
+
+        Best is what the others let expect, None: little is left to project, and few digits lost.
+        """
+        every = np.zeros((len(base), right.shape[1]), order="F")
+        every[self.kept] = right
+        if there is None:
+            found, _ = lapack.dtrtrs(base, every, lower=1)
+            there = -lapack.dtrtrs(self.root, self.span.T @ found)[0]
+        every[self.rows] = there
+        found, _ = lapack.dtrtrs(base, every, lower=1)
+        return np.asarray(found - self.span @ (self.span.T @ found))
+
+
 class _Bordered(NamedTuple):
-    """A Cholesky factor [[L, 0], [B^T, M]], whose L is that of another and not copied."""
+    """A Cholesky factor [[L, 0], [B^T, M]], whose L is that of another and not copied; where rows
+    are taken out of that, B is `_Taken.forth` of the border.
+    """
 
     base: Array  # L (p, p)
     border: Array  # B (p, m)
     corner: Array  # M (m, m)
+    taken: _Taken | None
 
     def solve(self, right: Array) -> Array:
-        """The inverse of what is factorised times (p + m, J)."""
-        p = len(self.base)
-        forth, _ = lapack.dtrtrs(self.base, right[:p], lower=1)
-        last, _ = lapack.dpotrs(self.corner, right[p:] - self.border.T @ forth, lower=1)
+        """The inverse of what is factorised times (p - q + m, J)."""
+        shared = len(right) - len(self.corner)
+        if self.taken is None:
+            forth, _ = lapack.dtrtrs(self.base, right[:shared], lower=1)
+        else:
+            forth = self.taken.forth(self.base, right[:shared])
+        last, _ = lapack.dpotrs(self.corner, right[shared:] - self.border.T @ forth, lower=1)
         first, _ = lapack.dtrtrs(self.base, forth - self.border @ last, lower=1, trans=1)
-        return np.concatenate([first, last])
+        return np.concatenate([first if self.taken is None else first[self.taken.kept], last])
 
     def whole(self) -> Array:
         """The factor as one (p + m, p + m)."""
@@ -66,8 +107,10 @@ class Dense(Immutable):
     hyperparameters: Hyperparameters
     database: Database
     base: Dense | None = None
-    """The solution that shares the first `same` points, and so as many rows of the factors."""
+    """The solution that shares the first `same` points, and so rows of the factors."""
     same: int = 0
+    gone: NDArray[np.intp] | None = None
+    """The base's points that are not among these; None: those from the `same` on."""
 
     representation: ClassVar[Literal["dense"]] = "dense"
     error_bound: ClassVar[float] = 0.0
@@ -116,9 +159,13 @@ class Dense(Immutable):
     def adapted(self, changes: Changes) -> Dense:
         """The base's solution with these changes; they share the points before the first change."""
         base = self.base or self
-        same = int(changes.replaced[0]) if len(changes.replaced) else len(base.database)
-        worth_it = same >= _SHARED * len(base.database)
-        return Dense(self.hyperparameters, base.database.changed(changes), base, same if worth_it else 0)
+        count, gone = len(base.database), changes.replaced
+        database, first = base.database.changed(changes), int(gone[0]) if len(gone) else count
+        if count - first > 2 * len(gone) and len(gone) <= _TAKEN * count:
+            found = Dense(self.hyperparameters, database, base, count - len(gone), gone)
+            if found.apart >= base.apart:
+                return found
+        return Dense(self.hyperparameters, database, base, first if first >= _SHARED * count else 0)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
@@ -150,8 +197,7 @@ class Dense(Immutable):
     @cached_property
     def mean_factor(self) -> Array:
         """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""
-        solver = self._mean_solver
-        return solver if isinstance(solver, np.ndarray) else solver.whole()
+        return self._whole("mean_factor", self._mean_solver)
 
     @cached_property
     def covariance_factor(self) -> Array:
@@ -159,7 +205,15 @@ class Dense(Immutable):
         solver = self._covariance_solver
         if solver is self._mean_solver:
             return self.mean_factor
-        return solver if isinstance(solver, np.ndarray) else solver.whole()
+        return self._whole("covariance_factor", solver)
+
+    def _whole(self, name: str, solver: Array | _Bordered) -> Array:
+        if isinstance(solver, np.ndarray):
+            return solver
+        if solver.taken is None:
+            return solver.whole()
+        anew: Array = getattr(Dense(self.hyperparameters, self.database), name)
+        return anew
 
     @cached_property
     def _mean_solver(self) -> Array | _Bordered:
@@ -184,11 +238,7 @@ class Dense(Immutable):
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
             found: Array | _Bordered = frozen(factor)
         else:
-            p = rows.shape[1] - len(rows)
-            shared = np.asfortranarray(base_factor[:p, :p])
-            border, _ = lapack.dtrtrs(shared, rows[:, :p].T, lower=1)
-            corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
-            found = _Bordered(frozen(shared), frozen(border), frozen(corner))
+            found, info = self._bordered(rows, base_factor)
         if info:
             point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.apart)
             raise ValueError(
@@ -196,6 +246,23 @@ class Dense(Immutable):
                 f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
             )
         return found
+
+    def _bordered(self, rows: Array, base_factor: Array) -> tuple[_Bordered, int]:
+        """The base's factor with these rows, less those of points that are gone; LAPACK's info."""
+        p, taken = rows.shape[1] - len(rows), None
+        columns = rows[:, :p].T
+        if self.gone is None or self.base is None:
+            shared = np.asfortranarray(base_factor[:p, :p])
+            border, _ = lapack.dtrtrs(shared, columns, lower=1)
+        else:
+            shared, kernel = np.asfortranarray(base_factor), self.hyperparameters.kernel
+            o, gone = kernel.channels * self.apart, self.base.database.functionals.take(self.gone)
+            taken = _Taken.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
+            there = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
+            wide = np.asarray(np.kron(there, np.eye(self.apart)), dtype=np.float64)
+            border = taken.forth(shared, columns, wide)
+        corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
+        return _Bordered(frozen(shared), frozen(border), frozen(corner), taken), info
 
     def _rows(self, penalty: float) -> Array:
         """The rows of K (x) I + lambda Sigma that the base does not share: all columns."""

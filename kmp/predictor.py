@@ -52,13 +52,14 @@ class Predictor(Immutable):
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
 
-        One query alone may differ by rounding from the same in a set. Raises ValueError if the
-        shape is another or a number is not finite.
+        One query alone may differ by rounding from the same in a set. Where Numba is installed,
+        compiled loops serve. Raises ValueError if the shape is another or a number is not finite.
         """
-        s = self._checked_many(queries)
-        if len(s) == 1:
-            return self.query.mean(self.query.row(s[0]))[None]
-        return mean_at(self.solution, s)
+        s = real("queries", queries)
+        if (found := self._compiled_mean(s)) is not None:
+            return found[0]
+        s = self._checked_many(s)
+        return self.query.mean(self.query.row(s[0]))[None] if len(s) == 1 else mean_at(self.solution, s)
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -68,11 +69,14 @@ class Predictor(Immutable):
         one before there is a deadline. Raises ValueError if the shape is another, a number is not
         finite, or what was stored cannot be solved here.
         """
-        s = self._checked_many(queries)
+        s = real("queries", queries)
+        compiled = self.compiled_query if s.shape[:1] == (1,) else None
+        if compiled is not None and (found := self._compiled_mean(s)) is not None:
+            return unchecked(found[0], compiled.covariance(found[1])[None])
+        s = self._checked_many(s)
         if len(s) == 1:
             row = self.query.row(s[0])
-            by = self.compiled_query or self.query
-            return unchecked(self.query.mean(row)[None], by.covariance(row.kernel)[None])
+            return unchecked(self.query.mean(row)[None], self.query.covariance(row.kernel)[None])
         batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
         posterior = [self.solution.posterior_covariance(self._rows(one)) for one in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
@@ -134,7 +138,10 @@ class Predictor(Immutable):
 
         Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
         """
-        return self.query.jacobian(self.query.row(self._one_query(query)))
+        s, compiled = real("query", query), self.compiled_query
+        if compiled is not None and s.shape == (self._dimensions,) and (found := compiled.jacobian(s)) is not None:
+            return found
+        return self.query.jacobian(self.query.row(self._one_query(s)))
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). The numbers are `jacobian`'s, but for rounding.
@@ -251,6 +258,13 @@ class Predictor(Immutable):
     def _rows(self, queries: Array, directions: Array | None = None) -> Array:
         """k of M queries, or their derivatives, and what is known: (M C, R C)."""
         return between(self.kernel, Functionals(queries, directions), self.solution.functionals)
+
+    def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
+        """The mean (M, O) by compiled loops, and the last kernel row; None if they do not serve."""
+        compiled = self.compiled_query
+        if compiled is None or queries.ndim != 2 or queries.shape[1] != self._dimensions or len(queries) == 0:
+            return None
+        return compiled.mean(queries)
 
     def _wrapped(self, queries: Array) -> Array:
         """The queries, within the period where there is one: no seam, not even rounding's."""

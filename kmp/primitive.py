@@ -222,7 +222,7 @@ class KMP(Predictor, Plotted):
         before = self.changes
         nearest = self.base.solution.database.nearest(points, tolerance, self.kernel.period)
         changes = Changes(
-            frozen(np.union1d(before.replaced, nearest)),
+            frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
             Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )

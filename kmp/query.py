@@ -7,6 +7,7 @@ and arrays come out, so that compiled functions can take the place of these.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -82,15 +83,26 @@ class Query(Immutable):
             count / parameters.lambda_covariance,
         )
 
+    @cached_property
+    def unstretched(self) -> bool:
+        """Whether the kernel's coordinates are the inputs themselves."""
+        return bool((self.stretch == 1.0).all())
+
+    @cached_property
+    def prior_offset(self) -> Array:
+        """(O,) the prior mean's offset."""
+        return frozen(np.ascontiguousarray(self.prior_mean[:, 0]))
+
     def row(self, query: Array) -> KernelRow:
         """The kernel row of a query (I,)."""
-        offsets = query * self.stretch - self.centres
+        offsets = (query if self.unstretched else query * self.stretch) - self.centres
         values = self.kernel.values(offsets, self.scale)
         return KernelRow(query, offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives))
 
     def mean(self, row: KernelRow) -> Array:
         """xi(s) (O,). Equation (8)."""
-        found = (row.kernel @ self.weights).ravel() + self.prior_mean[:, 0]
+        found = row.kernel @ self.weights
+        found = (found if found.ndim == 1 else found.ravel()) + self.prior_offset
         return np.asarray(found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:] @ row.query)
 
     def covariance(self, kernel: Array) -> Array:
@@ -101,7 +113,7 @@ class Query(Immutable):
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""
         found = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
-        found = found * self.stretch
+        found = found if self.unstretched else found * self.stretch
         return found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:]
 
     def curvature(self, row: KernelRow, velocity: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from kmp.compiled import compiled
+from kmp.compiled_mean import exponentials
 from support.paths import ROOT
 
 numba = pytest.importorskip("numba")
@@ -35,7 +36,9 @@ def test_sums_keep_their_order_and_products_are_rounded(seed):
 
 OPERATIONS = """
 import math
+from dataclasses import replace
 import numpy as np
+from kmp import KMP, GaussianKernel, Gaussians
 from kmp.compiled import compiled
 
 def operations(a, b, m, out):
@@ -53,6 +56,12 @@ a, b = random.normal(size=(2, 1000))
 out = np.zeros(1000)
 compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
+s = random.normal(size=(37, 3))
+query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).query
+from kmp.compiled_query import CompiledQuery
+rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
+loops = CompiledQuery.of(replace(query, weights=rounded))
+print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex())
 """
 
 
@@ -66,6 +75,15 @@ def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
     )
     assert len(native) > 1000
     assert native == generic
+
+
+def test_exponentials_are_right_to_a_unit_in_the_last_place():
+    values = np.concatenate([np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]])
+    found = values.copy()
+    exponentials(found, 0.5, np.empty_like(values))
+    wanted = np.exp(np.longdouble(-0.5) * values).astype(np.float64)
+    assert np.all(np.abs(found - wanted)[:-2] <= np.spacing(wanted)[:-2])
+    assert found[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
 def test_nothing_is_compiled_otherwise():

@@ -67,6 +67,30 @@ def test_compiled_loops_give_the_same_but_for_rounding(skill, seed):
     np.linalg.cholesky(found.covariance)
 
 
+@pytest.mark.skipif(not AVAILABLE, reason="needs Numba")
+def test_compiled_means_and_jacobians_are_the_plain_ones_to_a_few_units_in_the_last_place(skill):
+    """Of the sum of the terms' magnitudes: what cancels is lost either way."""
+    queries = np.random.default_rng(3).normal(size=(20, skill.inputs.shape[1]))
+    found, one = skill.mean(queries), skill.query
+    for query, mean in zip(queries, found, strict=True):
+        row = one.row(query)
+        size = (np.abs(row.kernel) @ np.abs(one.weights)).ravel() + 1
+        assert np.all(np.abs(mean - one.mean(row)) <= 20 * np.spacing(size))
+        slope, reach = one.jacobian(row), np.abs(row.offsets).max() + 1
+        bound = 20 * np.spacing(4 * one.scale * reach * np.sum(size)) * one.stretch.max()
+        assert np.all(np.abs(skill.jacobian(query) - slope) <= bound)
+    if skill.kernel.channels == 1:
+        assert np.array_equal(found, np.concatenate([skill.mean(query[None]) for query in queries]))
+
+
+@pytest.mark.parametrize("how", [np.asfortranarray, np.float32, lambda s: s.astype(">f8"), lambda s: s.tolist()])
+def test_a_query_may_come_as_any_array(how):
+    one = primitive("one length", "dense", False)
+    s = np.random.default_rng(3).normal(size=(5, 3)).astype(np.float32).astype(np.float64)
+    assert np.array_equal(one.mean(how(s)), one.mean(s))
+    assert np.array_equal(one.jacobian(how(s)[0]), one.jacobian(s[0]))
+
+
 def test_one_query_agrees_with_it_in_a_set(skill):
     s, v, a = moving(skill)
     found, together = skill.predict_motion(s, v, a), skill.predict([s, s])

@@ -180,3 +180,41 @@ def test_adapting_copies_no_factor_and_gives_what_a_fit_of_all_points_gives(lamb
     for name in ("mean_factor", "covariance_factor"):
         np.testing.assert_allclose(getattr(adapted, name), getattr(anew, name), atol=1e-10)
     assert (adapted.mean_factor is adapted.covariance_factor) == (lambda_covariance is None)
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
+@pytest.mark.parametrize("kernel", [GaussianKernel(1.0), VelocityKernel(1.0)], ids=["one", "two"])
+@pytest.mark.parametrize("lambda_covariance", [None, 3.0])
+@pytest.mark.parametrize("replaced", [[0], [3, 40], [1, 2, 30, 90]], ids=str)
+def test_points_replaced_early_leave_the_factor_of_the_base_and_are_solved_as_a_fit_is(
+    kernel, lambda_covariance, replaced
+):
+    random = np.random.default_rng(1)
+    inputs = np.linspace(0, 40, 120)[:, None] if kernel.channels == 2 else random.normal(size=(120, 2)) * 3
+    o = 2 * kernel.channels
+    root = 0.1 * random.normal(size=(120, o, o))
+    reference = Gaussians(random.normal(size=(120, o)), root @ root.swapaxes(1, 2) + 0.01 * np.eye(o))
+    options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": lambda_covariance, "representation": "dense"}
+    base = KMP.fit(inputs, reference, **options)
+    desired = Gaussians(reference.mean[replaced] + 0.1, reference.covariance[replaced])
+    adapted = base.adapt(inputs[replaced] + 1e-3, desired, tolerance=0.01)
+    assert list(adapted.changes.replaced) == replaced
+    one = adapted.solution
+    assert list(one.gone) == replaced
+    anew = Dense(one.hyperparameters, one.database)
+    np.testing.assert_allclose(one.weights, anew.weights, rtol=0, atol=1e-9 * np.abs(anew.weights).max())
+    equation, wanted = anew.mean_factor @ anew.mean_factor.T, one.database.reference.mean
+    residual, usual = (np.abs(equation @ x.weights.ravel() - wanted.ravel()).max() for x in (one, anew))
+    assert residual < 10 * usual + 1e-13
+    queries = inputs[[*replaced, 60]] + 0.05
+    again = KMP(anew, adapted.changes, base)
+    assert np.array_equal(adapted.predict(queries).covariance, again.predict(queries).covariance)
+    assert np.array_equal(adapted.refitted(reference).weights, adapted.weights)
+
+
+def test_a_point_lost_in_rounding_is_refused_in_the_place_of_an_early_one_too():
+    inputs = np.arange(40.0)[:, None]
+    base = KMP.fit(inputs, REFERENCE, kernel=GaussianKernel(0.5), lambda_mean=1.0, representation="dense")
+    twice = Gaussians(np.zeros((2, 2)), np.tile(1e-18 * np.eye(2), (2, 1, 1)))
+    with pytest.raises(ValueError, match="at point 40"):
+        base.adapt([[3.0], [3.0]], twice, tolerance=0.1)

@@ -31,6 +31,8 @@ TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
 THINGS_ROOM = 0.005  # [m] from things, likewise
 PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
+PLAN_BRAKE = np.array([1.0, 0.5])  # of the tool's acceleration, for people and things: no more is planned with ...
+PLAN_REACTION_S = 0.02  # ... nor with less reaction time: joints that are let nearer more quickly swing there
 CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
 RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
 RETREAT_MIN_AUTHORITY = 0.1  # [m/s] only what the joints can move so fast is moved back
@@ -61,10 +63,13 @@ class Separation:
         boxes += [[np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)] for b in things.boxes]
         self._boxes = np.array(boxes)
         self._capsules, self._pairs = body.capsules, body.pairs
-        direction = np.array(people.toward_elbow)
+        direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake])
+        reaction_s = np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, things.reaction_ms / 1000])
         self._parameters = parameters(
-            brake=np.array([people.brake, things.brake]),
-            reaction_s=np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, things.reaction_ms / 1000]),
+            brake=brake,
+            reaction_s=reaction_s,
+            planned_brake=PLAN_SHARE * np.minimum(brake, PLAN_BRAKE * settings.tool.max_acceleration),
+            planned_reaction_s=np.maximum(reaction_s, PLAN_REACTION_S),
             clearance=np.array([people.clearance, things.clearance]),
             room=np.array([PEOPLE_ROOM, THINGS_ROOM]),
             contact_speed=float(people.contact_speed),
@@ -266,8 +271,8 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
     is `braked` until then.
     """
     given = parameters[0]
-    brake, clearance = PLAN_SHARE * given.brake[rule], given.clearance[rule] + given.room[rule]
-    planned = allowed_speed(distance, coming, brake, given.reaction_s[rule], clearance)
+    brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
+    planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.room[rule])
     return max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
 
 

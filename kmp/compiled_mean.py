@@ -1,0 +1,173 @@
+"""Equation (8) and its Jacobian as compiled loops over centres that lie beside one another, so that
+vector units take several at once.
+
+A table (I + O, P) holds coordinates and weights of R centres. P is R rounded up to LANES; what is
+beyond R weighs 0. Each sum is LANES sums of every LANES-th term: its order is fixed, on every CPU.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.checks import Array
+from kmp.compiled import compiled
+
+LANES = 4
+
+# exp(x) = 2^k exp(f), k whole, |f| <= ln 2 / 2, as C libraries have it, without branch or table.
+_LOG2_E = 1.4426950408889634
+_LN2_HIGH = 6.93147180369123816490e-01  # ends in zeros: k times it is exact
+_LN2_LOW = 1.90821492927058770002e-10
+_ROUND = 6755399441055744.0  # 1.5 2^52: what is added to it becomes a whole number, in its last bits
+_LEAST = -708.0  # below it exp is less than 1e-307, and taken for 0
+_EXPONENT = 52  # bits of a number below its exponent
+
+
+def table_of(centres: Array, weights: Array) -> Array:
+    """The table (I + O, P) of centres (R, I) and weights (R, O)."""
+    (count, inputs), outputs = centres.shape, weights.shape[1]
+    table = np.zeros((inputs + outputs, -(-count // LANES) * LANES))
+    table[:inputs, :count], table[inputs:, :count] = centres.T, weights.T
+    return table
+
+
+@compiled
+def exponentials(values: Array, scale: float, steps: Array) -> None:
+    """exp(-scale v) of each value v (P,), none below 0, in its place, to a unit in the last place;
+    with room for the `steps` (P,).
+    """
+    for r in range(len(values)):
+        x = values[r] * -scale
+        step = x * _LOG2_E + _ROUND
+        k = step - _ROUND
+        f = (x - k * _LN2_HIGH) - k * _LN2_LOW
+        # The series to f^13, in shares that do not wait for each other.
+        g = f * f
+        h = g * g
+        p = (0.5 + f * (1 / 6)) + g * (1 / 24 + f * (1 / 120))
+        q = (1 / 720 + f * (1 / 5040)) + g * (1 / 40320 + f * (1 / 362880))
+        q += h * ((1 / 3628800 + f * (1 / 39916800)) + g * (1 / 479001600 + f * (1 / 6227020800)))
+        p = 1.0 + (f + g * (p + h * q))
+        values[r] = p if x > _LEAST else 0.0
+        steps[r] = step if x > _LEAST else _ROUND
+    bits, whole = values.view(np.int64), steps.view(np.int64)
+    for r in range(len(bits)):
+        bits[r] += whole[r] << _EXPONENT
+
+
+@compiled
+def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Array) -> None:
+    """exp(-scale |x - x_r|^2), for x (I,), into `values` (P,), with `room` (P,)."""
+    inputs = len(x)
+    values[:] = 0.0
+    for i in range(0, inputs - 1, 2):
+        here, there, centres, others = x[i], x[i + 1], table[i], table[i + 1]
+        for r in range(len(values)):
+            one, other = here - centres[r], there - others[r]
+            values[r] += one * one + other * other
+    if inputs % 2:
+        here, centres = x[inputs - 1], table[inputs - 1]
+        for r in range(len(values)):
+            one = here - centres[r]
+            values[r] += one * one
+    exponentials(values, scale, room)
+
+
+@compiled
+def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scale: float, values: Array) -> None:
+    """Makes of the values at `places` (R',) their derivatives along `along` (R', I)."""
+    for n in range(len(places)):
+        r, away = places[n], 0.0
+        for i in range(len(x)):
+            away += (x[i] - table[i, r]) * along[n, i]
+        values[r] *= 2.0 * scale * away
+
+
+@compiled
+def _sum(a: Array, b: Array) -> float:
+    """sum_r a_r b_r (P,)."""
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)  # a signed index may be from the end: slower
+    first = second = third = fourth = 0.0
+    for k in range(len(a) // LANES):
+        r = np.uint64(LANES * k)
+        first += a[r] * b[r]
+        second += a[r + one] * b[r + one]
+        third += a[r + two] * b[r + two]
+        fourth += a[r + three] * b[r + three]
+    return (first + second) + (third + fourth)
+
+
+@compiled
+def means(
+    queries: Array,
+    table: Array,
+    places: NDArray[np.intp],
+    along: Array,
+    coordinates: Array,
+    prior: Array,
+    values: Array,
+    out: Array,
+) -> bool:
+    """xi at queries (M, I) into `out` (M, O), the last one's kernel row into `values` (P,); whether
+    all is finite.
+
+    `places` (R',) are the centres that stand for derivatives, along `along` (R', I); `coordinates`
+    (1 + I,) the kernel's scale, and the stretch of each input. `prior` (O, 1), or (O, 1 + I) where
+    the prior mean goes with the input, is its offset and matrix.
+    """
+    scale, stretch, outputs = coordinates[0], coordinates[1:], len(prior)
+    inputs = len(stretch)
+    x, room, total = np.empty(inputs), np.empty(len(values)), 0.0
+    for m in range(len(queries)):
+        for i in range(inputs):
+            x[i] = queries[m, i] * stretch[i]
+            total += x[i]
+        _kernel_values(x, table, scale, values, room)
+        _derive(x, table, places, along, scale, values)
+        for o in range(outputs):
+            mean = _sum(values, table[inputs + o]) + prior[o, 0]
+            for i in range(prior.shape[1] - 1):
+                mean += prior[o, 1 + i] * queries[m, i]
+            out[m, o] = mean
+            total += mean
+    return math.isfinite(total)
+
+
+@compiled
+def slopes(
+    query: Array,
+    table: Array,
+    places: NDArray[np.intp],
+    along: Array,
+    coordinates: Array,
+    prior: Array,
+    out: Array,
+) -> bool:
+    """dxi/ds at a query (I,) into `out` (O, I); whether all is finite. Else as in `means`."""
+    scale, stretch, outputs, total = coordinates[0], coordinates[1:], len(prior), 0.0
+    inputs, padded = len(stretch), table.shape[1]
+    x, values, pull, offsets = query * stretch, np.empty(padded), np.empty(padded), np.empty((inputs, padded))
+    _kernel_values(x, table, scale, values, pull)
+    out[:] = 0.0
+    for n in range(len(places)):
+        for o in range(outputs):
+            share = values[places[n]] * table[inputs + o, places[n]]
+            for i in range(inputs):
+                out[o, i] -= share * along[n, i]
+    _derive(x, table, places, along, scale, values)
+    for i in range(inputs):
+        here, centres, offset = x[i], table[i], offsets[i]
+        for r in range(len(values)):
+            offset[r] = here - centres[r]
+    for o in range(outputs):
+        weights = table[inputs + o]
+        for r in range(len(values)):
+            pull[r] = values[r] * weights[r]
+        for i in range(inputs):
+            slope = -2.0 * scale * (out[o, i] + _sum(pull, offsets[i])) * stretch[i]
+            out[o, i] = slope + prior[o, 1 + i] if prior.shape[1] > 1 else slope
+            total += out[o, i] + x[i]
+    return math.isfinite(total)
