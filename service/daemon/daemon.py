@@ -106,7 +106,7 @@ class Daemon:
         except OccupiedError:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
-        slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once on this machine"])
+        slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once for so many joints"])
         slow.start()
         try:
             warm_up(settings, skill, urdf=urdf)
