@@ -13,6 +13,7 @@ from service.cli.here import still
 from service.cli.usage import UsageError, added_in, reached
 from service.client import Client
 from service.contract.incidents import in_brief, remedy
+from service.contract.records import SIDES
 
 
 def via_points(args: argparse.Namespace) -> int:
@@ -50,8 +51,13 @@ def _add(args: argparse.Namespace) -> Any:
     if args.here and args.name:
         for name, position in still(args).items():
             setattr(args, name, getattr(args, name) or position)
+    given = [side for side in SIDES if getattr(args, side)]
+    if args.name and args.tool and len(given) == 1 and ask(args, "status").get("hands") == given[0]:
+        args.left = args.right = args.left or args.right  # the other one makes no difference
     if not (args.name and args.left and args.right and args.tool):
-        raise UsageError("a name, and --here or --left, --right and --tool, are needed, or --file")
+        raise UsageError(
+            "a name, and --here or --left, --right and --tool, are needed, or --file; where one hand conducts, it alone"
+        )
     fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
     point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}

@@ -158,6 +158,9 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
         if name == "arm"
         else f"frame {' or '.join(repr(frame) for frame in now.frames if frame)} or none"
     )
+    if not source.rate_hz and name in SIDES and name not in now.needed:
+        yield Finding("ok", what, "nothing comes, and the skill does without it")
+        return
     if not source.rate_hz:
         told = "nothing comes" if source.age_ms is None else f"nothing came for {source.age_ms / 1000:.1f} s"
         group = KEYS[name].rpartition("/")[0]
@@ -223,7 +226,9 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     now, boxes = seen[-1], seen[-1].demonstrated_m
     there = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
     off = {side: _outside(at, boxes[side]) for side, at in there.items()}
-    crossed = [_outside(at, boxes[SIDES[1 - SIDES.index(side)]]) for side, at in there.items()]
+    crossed = [
+        _outside(at, boxes[other]) for side, at in there.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
+    ]
     swapped = len(off) == len(SIDES) and max(crossed) < OUTSIDE_M < min(off.values())
     advice = (
         "left and right look swapped: publish each under the other's key"

@@ -23,21 +23,28 @@ class NotHereError(ExplainedError, RuntimeError):
 
 
 def still(args: argparse.Namespace) -> dict[str, list[float]]:
-    """The positions of hands and tool [m] that the arguments do not give, once they hold still.
+    """The positions of the hands by which the skill goes, and of the tool [m], that the arguments
+    do not give, once they hold still.
 
     The tool's is measured where the arm publishes its joints, else commanded. Raises NotHereError
     where hands or tool are not seen, or move, for TIMEOUT_S.
     """
-    wanted = [name for name in (*SIDES, "tool") if not getattr(args, name)]
-    say(f"waiting for the daemon, and until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s")
+    said: set[str] = set()
     seen: list[tuple[float, dict[str, list[float]]]] = []
     with reached(args, TIMEOUT_S) as session:
         client = Client(session, args.cell)
         client.wait_until_ready(timeout_s=TIMEOUT_S)
+        hands = client.status().hands
+        going = [name for name in (*SIDES, "tool") if name not in SIDES or hands in ("both", name)]
+        wanted = [name for name in going if not getattr(args, name)]
+        say(f"waiting until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s")
         begun_s = time.monotonic()
         while True:
             now, at_s = client.ask("status"), time.monotonic()
             lacking = _not_seen(now, wanted)
+            if lacking.keys() - said:
+                say("; ".join(lacking.values()))
+            said = set(lacking)
             if lacking:
                 seen.clear()
             else:
@@ -48,15 +55,18 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
                 if at_s - seen[0][0] >= STILL_S:
                     return seen[-1][1]
             if at_s - begun_s > TIMEOUT_S:
-                raise NotHereError(f"nothing taught: {lacking or 'hands or tool did not hold still'}")
+                raise NotHereError(
+                    f"nothing taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
+                )
             time.sleep(POLL_S)
 
 
-def _not_seen(status: dict[str, Any], wanted: list[str]) -> str:
-    """The first of the wanted positions that is not known now, in words; empty: all are."""
+def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
+    """Those of the wanted positions that are not known now, each in words."""
+    found = {}
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
         if age_ms is None or age_ms > OLDEST_MS:
             ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
-            return f"the {side} hand {ago}; --{side} X Y Z says where it would be"
-    return "where the tool is is not known before the first tick" if status["tick"] < 0 else ""
+            found[side] = f"the {side} hand {ago}; --{side} X Y Z says where it would be"
+    return found | ({"tool": "where the tool is is not known before the first tick"} if status["tick"] < 0 else {})

@@ -123,7 +123,7 @@ def rows(now: Status) -> dict[str, str]:
         "tool": _at(now.tool_m),
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
         if now.target_m is not None
-        else "none: it needs both hands",
+        else f"none: it needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "turned": _turned(now),
         "gripper": now.gripper + (f", {now.closure:.0%} closed is predicted" if now.closure is not None else ""),
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)

@@ -12,6 +12,7 @@ import msgspec
 
 from service.contract.explain import ExplainedError, explained
 from service.contract.messages import Vector3
+from service.contract.records import SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 NORM = 1e-3  # by which that of a quaternion may differ from 1
@@ -20,6 +21,7 @@ Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 
 Point = tuple[Metre, Metre, Metre]
 Turned = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001, extra={"accepted": "-1 to 1"})]
 Orientation = tuple[Turned, Turned, Turned, Turned]  # quaternion x y z w
+Hands: TypeAlias = Literal["both", "left", "right"]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)]
 
 
@@ -177,6 +179,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     realtime: bool
     memory_locked: bool
     skill: str
+    hands: Hands = "both"  # by which the skill goes
     places: tuple[str, ...]
     rejected: dict[str, int]
     received: dict[str, int] = {}  # messages that the loop took, by channel; of many in one tick the newest
@@ -209,3 +212,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     deviation_m: float | None = None  # of the hands from what the skill knows
     threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """The hands that must be seen: those by which the skill goes, and any that ever was."""
+        return tuple(side for side in SIDES if self.hands in ("both", side) or side in self.hand_age_ms)

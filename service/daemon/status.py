@@ -58,6 +58,7 @@ class CellStatus(NamedTuple):
             flags=tuple(map(word, flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
+            hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
             places=tuple(point.name for point in skill.via_points),
             rejected=_by_cause(sources),
             sources=sources,
@@ -67,7 +68,9 @@ class CellStatus(NamedTuple):
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
-            demonstrated_m={side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES)},
+            demonstrated_m={
+                side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
+            },
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
@@ -92,7 +95,7 @@ class CellStatus(NamedTuple):
         errors = np.abs(self.frame["joints"] - self.state["measured"])
         limit = settings.tool.fault_speed
         return Evidence(
-            sources=self.sources,
+            sources={name: source for name, source in self.sources.items() if not self._spare(name, source)},
             contested=SETTLED,
             scatter_mm=1e3 * SCATTERED_M,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
@@ -106,6 +109,11 @@ class CellStatus(NamedTuple):
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
         )
+
+    def _spare(self, name: str, source: Source) -> bool:
+        """Whether that is a hand which the skill does without, and which was never seen."""
+        side = self.controller.skill.conductor
+        return side is not None and name in SIDES and name != SIDES[side] and source.age_ms is None
 
     def _outside(self) -> Outside | None:
         """The first joint that is moved back into its limits."""

@@ -98,7 +98,7 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     shown = [side for side in SIDES if side == "tool" or recorded.conducts in ("both", side)]
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True) if side in shown)
     remarks += [*_still(demonstration), *remarks_on_places(demonstration)]
-    for side in SIDES:
+    for side in shown:
         if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
             remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
     return Summary(path, demonstration, streams, tuple(remarks))
@@ -141,7 +141,7 @@ def table(found: Summary) -> str:
     if found.demonstration.places:
         lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
     lines += [f"  {remark}" for remark in found.remarks]
-    speeds = {side: _speed(found.demonstration, side) for side in SIDES}
+    speeds = {one.name: _speed(found.demonstration, one.name) for one in found.streams}
     lines += [
         f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s" for side, speed in speeds.items()
     ]
@@ -180,7 +180,7 @@ def draw(found: Summary, path: Path) -> None:
     first = figure.add_subplot(grid[0, 0])
     axes = [first, *(figure.add_subplot(grid[i, 0], sharex=first) for i in (1, 2))]
     above = figure.add_subplot(grid[:, 1])
-    for side in SIDES:
+    for side in (one.name for one in found.streams):
         at = getattr(demonstration, side)
         for i, axis in enumerate(axes):
             axis.plot(seconds, at[:, i], color=COLOURS[side], lw=1.2, label=side)

@@ -105,6 +105,8 @@ def learn(
             beside = {NO_PLACES: [one.errors for one in _held_out(paths, fit, progress)], **beside}
         else:
             remarks += [task] if task else []
+            if alone != "both" and any(one.places for one in demonstrations):
+                remarks.append(f"the places that are named are not used: the {alone} hand conducts alone")
             if components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
                 fit = _from_demonstrations(paths, points, ell)

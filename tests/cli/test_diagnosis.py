@@ -276,3 +276,24 @@ def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
     assert [(one.level, "give it room" in one.remedy) for one in found if one.what == "tool"] == [("note", True)]
     lagging = msgspec.structs.replace(now, target_m=HEALTHY.target_m)
     assert not any(one.what == "tool" for one in findings(first, lagging, own_ns=now.time_ns, own_version="0.1.0"))
+
+
+def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
+    unseen = {
+        "hands": "left",
+        "sources": source("right", rate_hz=0.0, age_ms=None, fresh=False),
+        "hand_age_ms": {"left": 4.0},
+        "hands_m": {"left": HEALTHY.hands_m["left"]},
+        "demonstrated_m": {"left": BOXES["left"]},
+    }
+    found = diagnosed(**unseen)
+    assert {finding.level for finding in found} == {"ok"}
+    assert "right hand         nothing comes, and the skill does without it" in [one.line()[7:] for one in found]
+    assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
+    gone = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
+    assert "nothing came for 3.0 s" in wrongs(diagnosed(**unseen | gone))[0]  # it may be anywhere
+    seen = {"sources": HEALTHY.sources, "hand_age_ms": HEALTHY.hand_age_ms, "hands_m": HEALTHY.hands_m}
+    assert not wrongs(diagnosed(**unseen | seen))
+    now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
+    assert rows(now)["target"] == "none: it needs the left hand"
+    assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: it needs both hands"

@@ -28,9 +28,11 @@ from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill
 from service.daemon.status import MeasuredArm
+from service.learning.learn import learn
 from service.recording.recording import Recording
 from service.recording.replay import replay
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
+from support.circling import circling
 from support.in_process import arm
 from support.paths import RECORDINGS, ROOT
 from support.wam import JOINT_NAMES
@@ -232,6 +234,35 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     np.testing.assert_allclose(point["tool"], status["tool_m"], atol=1e-3)
     shared_daemon.client.ask("via_points", {"op": "clear"})
     shared_daemon.client.ask("resume")
+
+
+def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    takes = [circling(seed, apart_m=0.03) for seed in range(3)]
+    (tmp_path / "one.npz").write_bytes(
+        learn([one._replace(left=one.right, conducts="right") for one in takes], points=60).file
+    )
+    with serving(tmp_path, "--arm", "assumed", "--skill", str(tmp_path / "one.npz")) as daemon:
+        add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
+        daemon.until(lambda s: s["tick"] > 0)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("service.cli.here.TIMEOUT_S", 2.0)
+            assert main([*add, "--here"]) == 1
+        said = capsys.readouterr().err
+        assert "waiting until right, tool are seen" in said
+        assert said.count("the right hand has not been seen yet") == 2  # while it waits, and at its end
+        assert "left" not in said
+        with Tracker(daemon.session) as tracker:
+            tracker.left, tracker.right = None, (0.5, -0.2, 0.3)
+            assert main([*add, "--here"]) == 0
+        (point,) = daemon.client.places()
+        np.testing.assert_allclose([point.left, point.right], [(0.5, -0.2, 0.3)] * 2, atol=1e-3)
+        typed = ["--right", ".52", "-.2", ".3", "--tool", *map(str, point.tool)]
+        assert main([*add, *typed]) == 0
+        (point,) = daemon.client.places()
+        assert point.left == point.right == (0.52, -0.2, 0.3)
+        assert main([*add, "--left", *typed[1:]]) == 2
 
 
 def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:

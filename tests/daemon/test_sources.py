@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import re
@@ -177,6 +178,24 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     told = cell.status(0.6)
     assert "the right hand was last seen" in told.because
     assert not told.sources["right"].fresh
+
+
+def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_seen(skill: Skill) -> None:
+    cell = Cell(dataclasses.replace(skill, conductor=1))
+    for k in range(150):
+        cell.tell(("arm", joints(1 + k)))
+    told = cell.status(0.3)
+    assert (told.hands, told.needed, set(told.demonstrated_m)) == ("right", ("right",), {"right"})
+    assert (told.reason, told.because) == ("no_hands", "the right hand has not been seen yet")
+    for k in range(200):
+        cell.tell(("arm", joints(200 + k)), ("left", pose(1 + k)), ("right", pose(1 + k, RIGHT)))
+    cell.status(0.7)
+    for k in range(200):
+        cell.tell(("arm", joints(400 + k)), ("right", pose(300 + k, RIGHT)))
+    told = cell.status(1.1)
+    assert (told.reason, told.needed) == ("stale_hand", ("left", "right"))
+    assert told.because.startswith("the left hand was last seen")
+    assert (Cell(skill).status(0.0).hands, set(Cell(skill).status(0.0).demonstrated_m)) == ("both", {"left", "right"})
 
 
 def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:

@@ -92,6 +92,14 @@ def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: St
         adapted(skill, [point, other], tolerance=0.05)
 
 
+def test_places_that_takes_of_one_hand_name_are_said_not_to_be_used() -> None:
+    spot = ViaPoint("spot", AT, AT, (0.5, 0.2, 0.4))
+    for places, remarks in (((spot,), 1), ((), 0)):
+        learnt = learn([led(seed)._replace(places=places) for seed in range(2)], points=40)
+        said = msgspec.json.decode(learnt.figures, type=Figures).warnings
+        assert said.count("the places that are named are not used: the left hand conducts alone") == remarks
+
+
 def test_takes_of_different_hands_are_not_mixed() -> None:
     with pytest.raises(SkillError, match="conducted by different hands: both, left"):
         learn([led(0), circling(1)])

@@ -353,4 +353,6 @@ def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     assert got.conducts == who
     assert "hands/" + ("right" if who == "left" else "left") not in " ".join(Recorded(tmp_path / "a.mcap").topics)
     np.testing.assert_array_equal(got.left, got.right)
-    assert f"the {who} hand conducts alone" in table(summary(tmp_path / "a.mcap"))
+    lines = table(summary(tmp_path / "a.mcap")).splitlines()
+    assert any(f"the {who} hand conducts alone" in line for line in lines)
+    assert [line.split()[0] for line in lines if line.endswith(" m/s")] == [who, "tool"]
