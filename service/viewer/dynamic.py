@@ -294,6 +294,6 @@ def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool
     """Of which frames (T,) there is a target: while one hand conducts and the other was never seen,
     a prediction is told by its covariance.
     """
-    predicted: NDArray[np.bool_] = frames["covariance"].any(axis=(1, 2))
-    told: NDArray[np.bool_] = np.where(predicted, seen.any(axis=1), seen.all(axis=1))
+    is_predicted = np.any(frames["covariance"], axis=(1, 2))
+    told: NDArray[np.bool_] = np.where(is_predicted, seen.any(axis=1), seen.all(axis=1))
     return told
