@@ -31,7 +31,8 @@ class Visit(NamedTuple):
 
 class Place(NamedTuple):
     """A taught place while it was in force [s], the visits to it, and how near the hands came to
-    where it was taught: the farther one of the two [m]; infinite where none was seen.
+    where it was taught: the farther one of the two, or the one that conducts alone [m]; infinite
+    where none was seen.
     """
 
     name: str
@@ -50,36 +51,41 @@ def places(columns: Columns) -> list[Place]:
     """Every place that was in force at some time, by the time it was taught."""
     ticks, times = columns.frames["tick"], columns.times
     found: list[Place] = []
-    for point, begin, end in _taught(columns):
+    for point, conductor, begin, end in _taught(columns):
         within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
         frames = columns.frames[within]
         if len(frames):
-            nearest, visits = _visits(point, frames, times[within], columns.period_s)
+            nearest, visits = _visits(point, conductor, frames, times[within], columns.period_s)
             found.append(Place(point.name, float(times[within][0]), float(times[within][-1]), nearest, tuple(visits)))
     return found
 
 
-def _taught(columns: Columns) -> list[tuple[ViaPoint, int, float]]:
-    """Each via-point with the ticks from and before which it was in force, as it was."""
-    begun: dict[ViaPoint, int] = {}
-    over: list[tuple[ViaPoint, int, float]] = []
+def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
+    """Each via-point, the side of the hand that conducts alone or None, and the ticks from and
+    before which it was in force so.
+    """
+    begun: dict[tuple[ViaPoint, int | None], int] = {}
+    over: list[tuple[ViaPoint, int | None, int, float]] = []
     for tick, skill in columns.skills:
-        there = set(skill.via_points)
-        over += [(point, begun.pop(point), tick) for point in list(begun) if point not in there]
+        there = {(point, skill.conductor) for point in skill.via_points}
+        over += [(*one, begun.pop(one), tick) for one in list(begun) if one not in there]
         for point in skill.via_points:
-            begun.setdefault(point, tick)
-    return sorted([*over, *((point, tick, np.inf) for point, tick in begun.items())], key=lambda one: one[1])
+            begun.setdefault((point, skill.conductor), tick)
+    return sorted([*over, *((*one, tick, np.inf) for one, tick in begun.items())], key=lambda one: one[2])
 
 
-def _visits(point: ViaPoint, frames: Records, times: Vector, period_s: float) -> tuple[float, list[Visit]]:
+def _visits(
+    point: ViaPoint, conductor: int | None, frames: Records, times: Vector, period_s: float
+) -> tuple[float, list[Visit]]:
     """How near the hands came, and when they were there."""
-    taught = np.array([point.left, point.right])
-    seen = (frames["hand_ages"] >= 0).all(axis=1)
-    away = np.where(seen, np.linalg.norm(frames["hands"] - taught, axis=2).max(axis=1), np.inf)
+    sides = [0, 1] if conductor is None else [conductor] * 2
+    taught, hands = np.array([point.left, point.right])[sides], frames["hands"][:, sides]
+    seen = (frames["hand_ages"][:, sides] >= 0).all(axis=1)
+    away = np.where(seen, np.linalg.norm(hands - taught, axis=2).max(axis=1), np.inf)
     wanted = np.array(point.tool)
     if point.follow != "none":
         side = ("left", "right").index(point.follow)
-        wanted = wanted + frames["hands"][:, side] - taught[side]
+        wanted = wanted + hands[:, side] - taught[side]
     off = np.linalg.norm(frames["tool"] - wanted, axis=1)
     there = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
     visits, least, settled = [], round(LEAST_S / period_s), max(1, round(SETTLED_S / period_s))

@@ -134,7 +134,7 @@ class DynamicScene:
         near = np.flatnonzero(seen.any(axis=1))
         yield from scalars("/separation/distance", near, frames["hand_distance"])
         yield from scalars("/separation/limit", near, frames["hand_limit"])
-        known = seen.all(axis=1)
+        known = _predicted(frames, seen)
         aimed = np.flatnonzero(known)
         following = known & (frames["mode"] == Mode.FOLLOW)
         off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
@@ -175,7 +175,8 @@ class DynamicScene:
                 text = f"{fresh} deadline{'s' * (fresh > 1)} missed before tick {frames['tick'][timed[-1]]}"
                 yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
             self._missed = missed
-        yield from scalars("/age", aimed, frames["hand_ages"] * self._period_ms)
+        ages = np.where(seen, frames["hand_ages"] * self._period_ms, np.nan)
+        yield from scalars("/age", np.flatnonzero(seen.any(axis=1)), ages)
 
     def _rotation_error(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
         """Angle between tool and target (T,) [°], of the part that `[tool] orientation` names; NaN
@@ -239,7 +240,7 @@ class DynamicScene:
             shown = rows[seen[rows, side]]
             if len(shown):
                 yield columns(f"/scene/{name}_hand", shown, rr.Points3D.columns(positions=frames["hands"][shown, side]))
-        shown = rows[seen[rows].all(axis=1)]
+        shown = rows[_predicted(frames, seen)[rows]]
         if len(shown):
             variances, axes = np.linalg.eigh(frames["covariance"][shown])
             axes[:, :, 0] *= np.linalg.det(axes)[:, None]
@@ -287,3 +288,12 @@ class DynamicScene:
                     strips.append(np.array(trail, np.float32).reshape(-1, 3))
             if shown:
                 yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
+
+
+def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Of which frames (T,) there is a target: while one hand conducts and the other was never seen,
+    a prediction is told by its covariance.
+    """
+    is_predicted = np.any(frames["covariance"], axis=(1, 2))
+    told: NDArray[np.bool_] = np.where(is_predicted, seen.any(axis=1), seen.all(axis=1))
+    return told

@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ from service.core.frame import STAGES, Event, Tick, order, timed
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.status import CellStatus
+from service.learning.skill_file import with_file
 from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
@@ -173,6 +176,28 @@ def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_pa
     assert visit.nearest_m == pytest.approx(np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min())
     assert visit.settled_m == pytest.approx(np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4)
     assert place.hands_m < 1e-3
+
+
+@pytest.mark.parametrize("other", [(), RIGHT, (0.5, -1.4, 0.3)])
+def test_a_place_of_one_hand_is_met_by_it_wherever_the_other_is(
+    skill: Skill, tmp_path: Path, other: tuple[float, float, float] | tuple[()]
+) -> None:
+    alone = with_file(
+        replace(skill, conductor=0, via_points=(msgspec.structs.replace(HERE, right=LEFT, follow="right"),))
+    )
+    controller = Controller(SETTINGS, alone, urdf=URDF)
+    with Recorder(tmp_path / "a.mcap", settings=SETTINGS, skill=alone.file, state=controller.state) as recorder:
+        for k in range(300):
+            came = [hand("left", LEFT, k + 1), *([hand("right", other, k + 1)] if other else [])]
+            tick = Tick(k, tuple(came if k % 5 == 0 else ()))
+            recorder.write(tick, controller.step(tick), time_ns=stamp(k))
+    frames = np.array([step.frame for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None])
+    [place] = reported(tmp_path / "a.mcap").places
+    [visit] = place.visits
+    assert place.hands_m < 1e-3
+    assert visit.lasts_s == pytest.approx(len(frames) * PERIOD_S)
+    off = np.linalg.norm(frames["tool"] - HERE.tool - (frames["hands"][:, 0] - LEFT), axis=1)
+    assert visit.nearest_m == pytest.approx(off.min())
 
 
 @pytest.mark.parametrize("statuses", [True, False])

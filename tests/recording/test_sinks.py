@@ -118,6 +118,27 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
     assert any(len(strip) == 0 for strip in strips)
 
 
+@pytest.mark.parametrize("conducts", [0, 1])
+def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(200):
+        frame["hand_ages"][1 - conducts] = -1
+        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
+        frame["tool"] += [0.02, 0.0, 0.0]
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    followed = list(range(10, 200))
+    assert values(rows["/scene/target"], "tick") == followed[::5]
+    for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
+        assert values(rows[path], "tick") == followed
+        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
+    ages = np.array(values(rows["/age"], "Scalars:scalars"))
+    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
+    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
+
+
 def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(100):
