@@ -28,6 +28,7 @@ TRAIL_S, TRAIL_HZ = 3.0, 20
 TRAIL_BREAK_M = 0.15  # a longer step between two corners is no motion of one hand
 NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
 SAME_M = 1e-5  # rounding: at most this much apart, a deviation and the target's are the same
+TINY = 1e-4  # scale of each link of an arm that is not to be seen: the viewer takes 0 for an error
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
 REPEAT_S = 1.0  # the mode is sent again to live viewers, for those that connect later
 Columns = Callable[..., rr.chunk.Chunk]
@@ -103,6 +104,8 @@ class DynamicScene:
             return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
         seen = frames["hand_ages"] >= 0
+        if self._shown is None and batch[0].measured is None:
+            yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, times, columns)
         before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
@@ -112,6 +115,14 @@ class DynamicScene:
         corners = np.flatnonzero(ticks // self._trail_every != before // self._trail_every)
         if len(corners):
             yield from self._trail(frames, corners, columns)
+
+    def _unmeasured(self, time_ns: NDArray[np.int64]) -> Iterator[rr.chunk.Chunk]:
+        """The measured arm too small to see: links that are nowhere are errors to the viewer."""
+        for number, joint in enumerate(self._ghost):
+            if joint is not None:
+                size = rr.Transform3D.columns(scale=[(TINY, TINY, TINY)])
+                at = [*joint.compute_transform_columns([0.0], clamp=False), *size]
+                yield rr.chunk.Chunk.from_columns(f"/measured/joints/{number}", self.index(time_ns), at)
 
     def _curves(
         self, batch: list[DrawnFrame], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns

@@ -153,6 +153,23 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
 
 
+def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
+        one.add(
+            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
+        )
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    for number in range(len(JOINT_NAMES)):
+        first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
+        assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
+        assert np.max(first["Transform3D:scale"]) < 1e-3
+        assert not any(row.get("Transform3D:scale") for row in later)
+
+
 def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
     tmp_path: Path, skill: Skill
 ) -> None:
