@@ -15,8 +15,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.records import Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
-from service.core.decision.decision import ALONE, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
-from service.core.decision.stuck import FOLLOW
+from service.core.decision.decision import ALONE, FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
 from service.core.frame import (
     Event,
     Frame,

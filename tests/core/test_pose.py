@@ -20,7 +20,7 @@ from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.limiter import Limiter
 from service.core.outputs import outgoing
-from service.core.setpoint.orientation import TURN_SPEED_SHARE, OrientationSetpoint
+from service.core.setpoint.setpoint import TURN_SPEED_SHARE, OrientationSetpoint
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation
 from service.core.skill.skill import MOVES_S, Skill, decided
 from service.learning.via_points import adapted

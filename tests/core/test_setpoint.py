@@ -23,9 +23,9 @@ from service.core.setpoint.bounds import (
     fastest_stop,
     speed_to_come,
     stop_distance,
-    tracker_gains,
 )
-from service.core.setpoint.setpoint import SetpointGenerator, slow_down, waiting
+from service.core.setpoint.setpoint import SetpointGenerator, slow_down
+from service.core.setpoint.tracker import tracker_gains, waiting
 from service.core.skill.skill import Target
 from support.explained import Explained, margin
 from support.wam import STATE

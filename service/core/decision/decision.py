@@ -11,7 +11,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.records import Mode, Reason
-from service.core.decision.stuck import FOLLOW, HELD, WayOut, stuck
+from service.core.decision.leave import HELD, NOTICED, WayOut
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
 
@@ -19,11 +19,19 @@ READY = 1  # an arm within its limits, and in nothing
 RETURNING = 2  # an arm on its way to that
 RETURN_RADPS = 0.1  # [rad/s] at which a joint outside its limits moves back
 TOO_FAST_S = 0.03  # too fast for so long is a fault: an arm that catches up after a late command is none
+STUCK_M = 0.02  # [m] a tool nearer to its target is there
+STUCK_S = 0.8  # a tool that comes nearer by less than the next within so long is stuck
+PROGRESS = 0.08  # share of its distance ...
+FREED = 0.25  # ... or this, once it was
+PROGRESS_SPEED = 0.3  # or share of the tool's greatest speed, where that is less
+MOVED_M = 0.02  # [m] by which a target may move in that time
+ANOTHER_M = 0.04  # [m] a target so far from the one that it was stuck for may be reached
+WAY_S = 20.0  # that a way may take
 FREED_S = 1.0  # an arm that cannot get out of a thing stays as it is after so long
 GATE_EASE = 0.9  # of the threshold: what has been found far must come clearly nearer again
 
 # Plain numbers, as compiled functions and their callers need them.
-HOLD, FAULT = int(Mode.HOLD), int(Mode.FAULT)
+HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
@@ -139,7 +147,7 @@ def _step(
         ease = GATE_EASE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else NONE
     if reason == NONE:
-        state.stuck = stuck(states, frames, heres, parameters)
+        state.stuck = _stuck(states, frames, heres, parameters)
         reason = BLOCKED if state.stuck == HELD else NONE
     state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
     return starts, error, speed
@@ -183,6 +191,31 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.slow_tick = state.tick
     fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
     return 0, fault, error, speed
+
+
+@compiled
+def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
+    """Whether the tool comes no nearer to where it is to be: NOTICED or HELD; else 0."""
+    state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
+    gap = moved = 0.0
+    for i in range(3):
+        gap += (frame.target[i] - tool[i]) ** 2
+        moved += (frame.target[i] - state.stuck_target[i]) ** 2
+    gap, moved = math.sqrt(gap), math.sqrt(moved)
+    passed_s = (state.tick - state.stuck_tick) * given.period_s
+    if state.way_next < state.way_count and passed_s < WAY_S:
+        return HELD
+    if state.stuck == HELD and not state.way_count and moved < ANOTHER_M:
+        return HELD
+    state.way_next = state.way_count = 0
+    if state.stuck == NOTICED:
+        least = FREED * state.stuck_gap
+    else:
+        least = min(PROGRESS * state.stuck_gap, PROGRESS_SPEED * given.max_speed * STUCK_S)
+    if state.mode != FOLLOW or gap < STUCK_M or state.stuck_gap - gap > least or moved > MOVED_M:
+        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
+        return 0
+    return NOTICED if passed_s >= STUCK_S else 0
 
 
 @compiled

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
@@ -125,9 +124,6 @@ RETURN_SHARE = 1 / 16  # of the speed it may have with which a setpoint comes ba
 ON_BOUND = 1e-9  # [m] beyond a bound that are rounding
 ROUNDING = 1e-12  # [m] away from a bound that are rounding
 BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
-DECIMALS = 6  # of the gains: rounded so that a replay on another kind of CPU agrees
-REVERT_V = 150.0  # [1/s²] with which it expects a target's velocity to end
-REVERT_A = 5.0  # [1/s] with which the tracker expects a target's acceleration to end
 
 
 @compiled
@@ -290,19 +286,3 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
     if speed_then >= brake * brake / change:
         return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
     return way + speed_then * math.sqrt(speed_then / change)
-
-
-def tracker_gains(jerk_weight: float) -> Vector:
-    """Gains (5,) of the error, of target velocity and acceleration, and of the setpoint's.
-
-    For the jerk that minimises the integral of error² + jerk_weight [s⁶] jerk² while the target's
-    acceleration reverts to 0 as REVERT_A and REVERT_V say.
-    """
-    a = np.zeros((5, 5))  # error, target velocity and acceleration, setpoint velocity and acceleration
-    a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = 1.0, -1.0, 1.0, -REVERT_V, -REVERT_A, 1.0
-    b = np.zeros((5, 1))
-    b[4, 0] = 1.0
-    cost = np.zeros((5, 5))
-    cost[0, 0] = 1.0
-    riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
-    return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], DECIMALS))

@@ -22,9 +22,10 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Settings
-from service.core.arm.arm import Arm, Kinematics, acceleration_rate
+from service.core.arm.arm import Arm, Kinematics
 from service.core.arm.inverse_kinematics import joint_costs
 from service.core.frame import Record, Records, Vector, as_array, parameters
+from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.bounds import (
     BOUNDS,
@@ -32,10 +33,9 @@ from service.core.setpoint.bounds import (
     bounds_around,
     stop_distance,
     take_safe,
-    tracker_gains,
     what_is_wrong,
 )
-from service.core.setpoint.orientation import OrientationSetpoint, turn
+from service.core.setpoint.tracker import GAP_WIDE, gains_for, waiting
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Target, Wanted, decided
 
@@ -44,10 +44,6 @@ STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
-TRACKER_SHARE = 1.1  # of the rate at which joints change their acceleration: a quicker tracker swings with them
-TRACKER_STEP = 0.6  # of the loop's rate, likewise: it acts once a tick (swings from 1)
-STIFFEST = 100.0  # [1/m] of the tool's jerk for an error: it swings only where farther off than the hull lets it be
-SLOWEST = 0.2  # [1/s] of a tracker, however little jerk there is: slower gains are not found
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
 BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
 SHARE = 0.91  # of acceleration and jerk that is planned with
@@ -55,7 +51,6 @@ SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
 GAP_FREE = 0.003  # [m] a tool so far behind its setpoint slows it ...
 GAP_SLOW = 0.012  # [m] ... more so by every so far
-GAP_WIDE, GAP_MOST = 0.12, 0.2  # [m] ... and here it begins to wait for the tool, and here it waits
 PLANNED = 1  # a step met a bound in planning
 STOPPED = 2  # the stop was begun
 WRONG = 3  # a bound was passed
@@ -68,12 +63,9 @@ class SetpointGenerator:
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
-        own = max(TRACKER_SHARE * tool.max_jerk / tool.max_acceleration, math.cbrt(STIFFEST * tool.max_jerk))
-        quickest = min(TRACKER_SHARE * acceleration_rate(settings.joints), own, TRACKER_STEP * settings.rate_hz)
-        weight = max(tool.jerk_weight, max(quickest, SLOWEST) ** -6)
         self._parameters = parameters(
             period_s=settings.period_s,
-            gains=tracker_gains(weight),
+            gains=gains_for(settings),
             max_speed=float(tool.max_speed),
             max_acceleration=float(tool.max_acceleration),
             max_jerk=float(tool.max_jerk),
@@ -121,19 +113,6 @@ def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) ->
         speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
         slow = min(slow, share * speed / max_speed)
     return slow
-
-
-def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
-    """The target for a setpoint (3, 3) that is far ahead of the tool (3,) [m]: so much nearer to
-    where it is as it is to wait, unless that brings it back.
-    """
-    ahead, way = setpoint[0] - tool, target.position - setpoint[0]
-    gap = float(np.linalg.norm(ahead))
-    if gap <= GAP_WIDE or ahead @ way <= 0.0:
-        return target
-    share = max((GAP_MOST - gap) / (GAP_MOST - GAP_WIDE), 0.0)
-    still = np.zeros(3)
-    return Target(setpoint[0] + share * way, still, still, clamped=target.clamped)
 
 
 @compiled
@@ -276,6 +255,81 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
         jerk[i] = min(most, max(least, jerk[i]))
 
 
+TURN_GAIN = 12.0  # [1/s] of a small error's decay
+TURN_BRAKE_SHARE = 0.7  # of the acceleration, with which a large one's turn is planned to end
+TURN_SPEED_SHARE = 0.9  # of the tool's greatest: the arm needs the rest to catch up
+ROUND_TO = 1e9  # [s/rad] of the angular velocity: rounded so that a replay on another kind of CPU agrees
+
+
+class OrientationSetpoint:
+    """Turns the state's orientation (4,), at an angular velocity (3,) [rad/s], toward targets."""
+
+    def __init__(self, settings: Settings) -> None:
+        tool = settings.tool
+        self.parameters = parameters(
+            max_speed=TURN_SPEED_SHARE * tool.max_turn_speed,
+            max_acceleration=float(tool.max_turn_acceleration),
+            about=int(tool.orientation == "full"),
+            period_s=settings.period_s,
+        )
+
+    def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
+        """Puts it where the tool is, before there are targets: rotation (3, 3), turning (3,)
+        [rad/s].
+        """
+        quaternion_of(rotation, state["orientation"])
+        state["turning"] = turning
+
+    def step(self, state: Record, orientation: Vector, turning: Vector) -> None:
+        """Turns it one period on toward an orientation (4,) that turns itself (3,) [rad/s].
+
+        Where the settings say that a direction is followed, +z goes the shortest way.
+        """
+        _turn(state["orientation"], state["turning"], orientation, turning, self.parameters)
+
+
+@compiled
+def _turn(
+    quaternion: Vector,
+    turning: Vector,
+    target: Vector,
+    target_turning: Vector,
+    parameters: Records,
+) -> None:
+    """One period, in place."""
+    given, dt = parameters[0], parameters[0].period_s
+    error, wanted, axis, target_axis = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    axis_of(quaternion, axis)
+    along = 0.0
+    if given.about:
+        turn_between(quaternion, target, error)
+    else:
+        axis_of(target, target_axis)
+        swing(axis, target_axis, error)
+        for i in range(3):
+            along += target_turning[i] * axis[i]
+    angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
+    # in proportion to the error when near, braking evenly from afar
+    brake, rate = TURN_BRAKE_SHARE * given.max_acceleration, TURN_GAIN
+    near = brake / TURN_GAIN**2
+    if angle > near:
+        rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
+    speed = 0.0
+    for i in range(3):
+        wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
+        speed += wanted[i] * wanted[i]
+    slower = min(1.0, given.max_speed / max(math.sqrt(speed), 1e-12))
+    change = 0.0
+    for i in range(3):
+        wanted[i] = slower * wanted[i] - turning[i]
+        change += wanted[i] * wanted[i]
+    share = min(1.0, given.max_acceleration * dt / max(math.sqrt(change), 1e-12))
+    for i in range(3):
+        turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
+        wanted[i] = dt * turning[i]
+    turn_on(quaternion, wanted)
+
+
 class SetpointStage:
     """Leads the state's setpoints within the workspace's box (2, 3) [m] of the skill in force."""
 
@@ -297,7 +351,7 @@ class SetpointStage:
         """
         states, frames = as_array(state), as_array(frame)
         slow = _ready(states, here.record, self._arm.parameters, self._max_speed, share, self._costs)
-        target, tool = wanted.target, here.position
+        target, tool = wanted.target, here.record["position"][0]
         if math.dist(state["setpoint"][0].tolist(), tool.tolist()) > GAP_WIDE:
             target = waiting(target, state["setpoint"], tool)
         met = self._position.step(state, target, box, self._costs, slow)
@@ -327,7 +381,7 @@ def _ready(states: Records, heres: Records, arms: Records, max_speed: float, sha
 def _finish(states: Records, frames: Records, parameters: Records) -> None:
     """Turns the orientation's setpoint on toward the frame's target, and shows the setpoints."""
     state, frame = states[0], frames[0]
-    turn(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
+    _turn(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
     _write(states, frames)
 
 
