@@ -20,6 +20,7 @@ from service.contract.records import SIDES, Cause, Mode
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, order
+from service.core.setpoint.setpoint import STOP_BRAKE
 from service.learning.skill_file import decoded
 from support.in_process import ASSUMED, LEFT, RIGHT, hand
 from support.paths import RECORDINGS
@@ -107,7 +108,9 @@ def test_a_legal_hand_never_faults_nor_jumps_and_hardly_holds(
     controller, ticks = Controller(settings, SKILL, urdf=URDF), round(SECONDS * loop_hz)
     way = random.standard_normal((2, 3))
     way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
-    lasts = 1.875 * np.linalg.norm(way, axis=1).max() / max_speed  # of a minimum-jerk reach
+    far = np.linalg.norm(way, axis=1).max()
+    # a minimum-jerk reach, which no hand brakes harder at its end than the setpoint takes it to
+    lasts = max(1.875 * far / max_speed, math.sqrt(5.774 * far / STOP_BRAKE))
     stamps = np.arange(0.0, SECONDS, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
     for at in random.uniform(0.0, SECONDS, 2):
