@@ -19,14 +19,13 @@ from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
 from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
-from service.contract.requests import ViaPoint, encode_json
+from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
 from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
-from service.learning.demonstration import Conducts
 from service.recording.mcap_file import machine, whole_file
 
 HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
@@ -59,7 +58,7 @@ class Sample(NamedTuple):
 class Capture:
     """The samples of one demonstration, of the hands that conduct; subscribed until closed."""
 
-    def __init__(self, session: zenoh.Session, cell: str, settings: Settings, conducts: Conducts = "both") -> None:
+    def __init__(self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both") -> None:
         self.cell, self.settings, self.conducts = cell, settings, conducts
         self.hands = HANDS if conducts == "both" else (ENDINGS[conducts],)
         self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD if key not in HANDS or key in self.hands}
@@ -228,7 +227,7 @@ def capture(
     *,
     until: Until,
     rest_s: float,
-    conducts: Conducts = "both",
+    conducts: Hands = "both",
     is_ended: Callable[[], bool],
     wait_s: float,
     longest_s: float,

@@ -19,10 +19,9 @@ from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import BASE, PoseStamped, WireError, in_order
-from service.contract.requests import Add, ViaPoint, decode_request
+from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
-from service.learning.demonstration import Conducts
 from service.recording.mcap_file import RecordingError, existing
 from service.recording.mcap_reader import FileFault, Messages, full_name
 
@@ -86,7 +85,7 @@ class Recorded:
         self.settings: Settings | None = None  # those in force when it was recorded, if it is ours
         self.urdf = ""
         self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
-        self.conducts: Conducts = "both"  # which hands, in a take
+        self.conducts: Hands = "both"  # which hands, in a take
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
         self._is_ros_1 = self.path.suffix == ".bag"
@@ -111,7 +110,7 @@ class Recorded:
                 self.places = self._decoded_places(message.data)
         self.faults = messages.faults
         told = messages.metadata.get("thirdhand", {}).get("hands", "both")
-        self.conducts = next((who for who in get_args(Conducts) if who == told), "both")
+        self.conducts = next((who for who in get_args(Hands) if who == told), "both")
         if "settings.json" in messages.attachments:
             try:
                 self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)

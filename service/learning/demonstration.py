@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.contract.messages import BASE
-from service.contract.requests import ViaPoint
+from service.contract.requests import Hands, ViaPoint
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 FARTHEST_M, LEAST_M = 5.0, 0.01  # what demonstrations may hold
 ALIKE = 0.25  # least correlation of speeds that tells of a lag: steady ones, of noise alone, reach 0.2
 CLOSURE_MARGIN = 0.05  # by which a gripper may be told to be more than open or closed
-
-
-Conducts = Literal["both", "left", "right"]
 
 
 class Demonstration(NamedTuple):
@@ -37,7 +34,7 @@ class Demonstration(NamedTuple):
     frame: str = BASE
     places: tuple[ViaPoint, ...] = ()
     gripper: Vector | None = None
-    conducts: Conducts = "both"
+    conducts: Hands = "both"
 
     @property
     def hands(self) -> Vector:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from service.contract.records import Mode, Reason
-from service.contract.requests import ViaPoint
+from service.contract.requests import Hands, ViaPoint
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.demonstrations.demonstration_files import summary
 from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
-from service.learning.demonstration import Conducts, Demonstration
+from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded
@@ -27,7 +27,7 @@ AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
 FAR = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
 
 
-def led(seed: int, who: Conducts = "left") -> Demonstration:
+def led(seed: int, who: Hands = "left") -> Demonstration:
     """A take in which the tool goes with one hand."""
     one = circling(seed, apart_m=0.03)
     tool = one.tool.copy()

@@ -54,8 +54,8 @@ def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
     """
     ahead, way = setpoint[0] - tool, target.position - setpoint[0]
     gap = float(np.linalg.norm(ahead))
-    if gap <= GAP_WIDE or ahead @ way <= 0.0:
+    if ahead @ way <= 0.0:
         return target
-    share = max((GAP_MOST - gap) / (GAP_MOST - GAP_WIDE), 0.0)
+    share = min(max((GAP_MOST - gap) / (GAP_MOST - GAP_WIDE), 0.0), 1.0)
     still = np.zeros(3)
     return Target(setpoint[0] + share * way, still, still, clamped=target.clamped)
