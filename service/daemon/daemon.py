@@ -59,6 +59,7 @@ SLOWEST_START_S = 120.0  # of the skill worker, on a busy machine
 LONG_START_S = 3.0
 STAGE_NUMBERS = {stage: number for number, stage in enumerate(STAGES)}
 MOST_NOTES = 100  # a second
+MOMENT_TRIES = 10  # until a status tells of one moment
 LONGEST_LATENCY_MS = 1000.0  # a longer one means that the clocks differ
 
 
@@ -323,7 +324,12 @@ class Daemon:
 
     def _status_now(self) -> Status:
         """The status at this moment."""
-        frame, state, clock = self._frame, self._controller.state, self._clock
+        clock = self._clock
+        for _ in range(MOMENT_TRIES):  # the loop may be amid a tick: a frame goes with the state that it left
+            frame, state = self._frame, self._controller.state
+            if frame["tick"] == state["tick"]:
+                break
+            time.sleep(0.2 * self._settings.period_s)
         sources = self._sources.update(self._controller, state, time.monotonic())
         inside = self._measured_arm.inside(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, self._failure, inside).status(
