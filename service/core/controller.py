@@ -143,8 +143,8 @@ class Controller:
 
     def _alone(self, frame: Frame) -> int:
         """HANDS_KNOWN and ALONE, where one hand conducts the skill and the other never was seen, or
-        has gone. One that was seen lately may be near: the arm keeps away from it, so it holds. From
-        where it was last seen the arm keeps away ever after.
+        has gone. One that was seen lately may be near, so the arm holds; it keeps away ever after
+        from where that was last seen.
         """
         side, ages = self.skill.conductor, frame["hand_ages"]
         if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:

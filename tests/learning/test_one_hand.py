@@ -146,7 +146,9 @@ def test_the_arm_keeps_away_from_where_a_hand_that_has_gone_was_seen_last(skill:
     assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}
     assert seen["hand_distance"].min() > ASSUMED.people.clearance - 0.001
     free = served(skill, 0, 0)
-    assert np.linalg.norm(free["tool"][-1] - there) < 0.03 < 0.05 < np.linalg.norm(seen["tool"][-1] - there)
+    near, away = (np.linalg.norm(found["tool"][-1] - there) for found in (free, seen))
+    assert near < 0.03
+    assert away > 0.05
 
 
 def test_a_skill_of_both_hands_waits_for_both_as_ever() -> None:
