@@ -124,8 +124,8 @@ def reaching(args: argparse.Namespace) -> ClientSettings:
     )
 
 
-def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router. Raises UnreachableError."""
+def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A session to the daemon or router; None: it waits until Ctrl-C. Raises UnreachableError."""
     return reaching(args).session(timeout_s=timeout_s)
 
 

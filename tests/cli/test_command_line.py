@@ -100,7 +100,6 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (1, "", ("doctor", *NOBODY)),
         (1, "", ("cells", *NOBODY)),
         (1, "is a daemon running", ("hold", *NOBODY)),
-        (1, "", ("play", str(RECORDINGS / "demonstration-6.mcap"), *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
@@ -135,6 +134,7 @@ def test_exit_codes_are_as_promised(
         (0, "thirdhand 0.", ("--version",)),
         (1, "nowhere.mcap", ("replay", "nowhere.mcap")),
         (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
+        (1, "/proc/x: No such file or directory", ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0")),
         (2, "COMMAND", ()),
     ],
 )
@@ -143,6 +143,19 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
     assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
     assert words in (done.stderr if code else done.stdout)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
+def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
+    if command == ("sim",):
+        pytest.importorskip("pybullet", reason="the bench needs PyBullet")
+    arguments = [sys.executable, "-m", "service", *command, *NOBODY]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == "thirdhand: interrupted\n"
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:
