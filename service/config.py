@@ -159,7 +159,7 @@ class Obstacles(Section, frozen=True):
     """What the arm keeps away from besides people: the table, itself, and boxes."""
 
     boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them; of itself 0.01 at most
     brake: Positive = 2.0  # [m/s²] toward them
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
