@@ -75,7 +75,8 @@ def endpoint(given: str) -> str:
 
 KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
-    **dict.fromkeys(("M", "S"), float),
+    "S": float,
+    "M": within(float, 0, 10, " m"),
     "HZ": within(int, *RATES_HZ, " Hz"),
     "EP": endpoint,
 }

@@ -162,6 +162,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
+            if (arm := seen.sources.get("arm")) is not None and arm.fresh:
+                remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
             if seen.inside is not None:
                 remedy = "bring the arm out by hand, or by `thirdhand reset`, which moves it out slowly; "
                 remedy += "where nothing is there mend [table], [obstacles] or the URDF"

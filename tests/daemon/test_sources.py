@@ -205,7 +205,9 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
     assert "what comes of the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
     cell.tell(("arm", joints(2)))
-    assert cell.status(0.2).because == "the arm has not told one posture for long enough"
+    told = cell.status(0.2)
+    assert told.because == "the arm has not told one posture for long enough"
+    assert told.remedy == "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))
