@@ -161,6 +161,8 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
 
 
 def _short(value: Any) -> str:
+    if value is None:
+        return "null (or NaN)"
     try:
         text = repr(value)
     except RecursionError:

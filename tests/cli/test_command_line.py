@@ -133,6 +133,14 @@ def test_exit_codes_are_as_promised(
     assert not code or done.stderr.strip() or done.stdout.startswith("wrong ")
 
 
+def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = told("view", str(RECORDINGS / "golden.mcap"))
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "there is no screen" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("code", "words", "arguments"),
     [
