@@ -314,7 +314,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     [
         ([], 2, "a take's name needed, or --list"),
         (["a", "--list"], 2, "a take's name needed, or --list"),
-        (["../a", "--show"], 1, "accepted as a take's name"),
+        (["../a", "--show"], 2, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
         (["there"], 1, "is there already: another name needed, or --delete it first"),
         (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
