@@ -195,6 +195,10 @@ def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_s
     told = cell.status(1.1)
     assert (told.reason, told.needed) == ("stale_hand", ("left", "right"))
     assert told.because.startswith("the left hand was last seen")
+    for k in range(2300):  # 5 s since it was seen
+        cell.tell(("arm", joints(600 + k)), ("right", pose(500 + k, RIGHT)))
+    told = cell.status(5.7)
+    assert (told.reason != "stale_hand", told.needed) == (True, ("right",))
     assert (Cell(skill).status(0.0).hands, set(Cell(skill).status(0.0).demonstrated_m)) == ("both", {"left", "right"})
 
 
