@@ -77,9 +77,11 @@ def load(path: str | Path) -> Stored:
             arrays = dict(archive)
     except OSError:
         raise
-    except Exception as error:  # what a damaged archive may raise is not documented by anyone
-        raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote: {error}") from None
-    if (given := arrays.get("kmp_format", np.array(0)).tolist()) != _FORMAT:
+    except Exception:  # what a damaged archive may raise is not documented, nor does it help who reads it
+        arrays = {}
+    if "kmp_format" not in arrays:
+        raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged.")
+    if (given := arrays["kmp_format"].tolist()) != _FORMAT:
         raise ValueError(f"{path}: format {given} given, {_FORMAT} needed.")
     if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
         raise ValueError(f"{path}: the numbers are not those that were saved: their checksum is another.")

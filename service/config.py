@@ -159,7 +159,7 @@ class Obstacles(Section, frozen=True):
     """What the arm keeps away from besides people: the table, itself, and boxes."""
 
     boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them; of itself 0.01 at most
     brake: Positive = 2.0  # [m/s²] toward them
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
@@ -319,6 +319,14 @@ def _resolve_paths(given: Any, folder: Path | None) -> None:
                 table[name] = str(folder / expanded)
 
 
+def _mistakes(given: Any) -> list[str]:
+    try:
+        validated(given, Settings)
+    except InvalidError as error:
+        return [str(error)]
+    return []
+
+
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
@@ -330,8 +338,12 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         _resolve_paths(given, folder)
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
-            given = completed(given, Urdf(own, origin=arm["urdf"]))
+            try:
+                own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
+                given = completed(given, Urdf(own, origin=arm["urdf"]))
+            except (UrdfError, SettingsError) as error:  # all else that is wrong, but for what is the arm's
+                others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
+                raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
         settings = validated(given, Settings)
         check(
             settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate

@@ -44,15 +44,10 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     joints.setdefault("names", [joint.name for joint in moving])
     for name in ("lower", "upper", "velocity"):
         joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    for path, section, name in (
-        ("joints", joints, "acceleration"),
-        ("joints", joints, "jerk"),
-        ("arm", arm, "posture"),
-    ):
-        if name not in section:
-            raise SettingsError(
-                f"$.{path}.{name}: missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
-            )
+    wanted = (("joints", joints, "acceleration"), ("joints", joints, "jerk"), ("arm", arm, "posture"))
+    if missing := [f"$.{path}.{name}" for path, section, name in wanted if name not in section]:
+        needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
+        raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     lengths = [math.hypot(*joint.translation) for joint in urdf.chain(str(arm["plate"]))]
     reach.setdefault("centre", [0.0, 0.0, lengths[0]])
     reach.setdefault("outer", FARTHEST_POINT * sum(lengths[1:]))
@@ -68,6 +63,7 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
         raise SettingsError(
             f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
         )
+    wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (
             ("lower", joint.lower, math.inf),
@@ -77,6 +73,6 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
             given = getattr(joints, name)[i]
             if not low <= given <= high:
                 accepted = f"{low} or more" if name == "lower" else f"up to {high}"
-                raise SettingsError(
-                    f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}"
-                )
+                wide.append(f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}")
+    if wide:
+        raise SettingsError("\n".join(wide))

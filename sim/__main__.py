@@ -155,8 +155,6 @@ def main(arguments: list[str] | None = None) -> int:
         came.append(number)
         stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
     try:
         Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
@@ -198,7 +196,10 @@ def main(arguments: list[str] | None = None) -> int:
         )
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
-        session = open_session(connect=args.connect, listen=args.listen) if args.listen else reach.session()
+        own = open_session(connect=args.connect, listen=args.listen) if args.listen else None
+        session = own or reach.session(timeout_s=None)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, end)
         with session, Bench(script) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
@@ -210,4 +211,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    interrupt.watch()
     sys.exit(main())

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.config import Settings, SettingsError, load, parse
+from service.config import WAM, Settings, SettingsError, load, parse
 from service.network_settings import is_local
 
 
@@ -97,7 +97,10 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[joints]\nupper = [-2.6, 1, 1, 3, 1, 1, 1]", "joints.lower[0]", "less than $.joints.upper[0] = -2.6"),
         ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "arm.posture[5]", "-1.5707 to 1.5707 accepted"),
         ("[arm]\nsource = 'guess'", "$.arm.source", "assumed"),
-        ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "`array`"),
+        ("[network]\nlisten = 'tcp/0.0.0.0:1'", "$.network.listen", "'tcp/0.0.0.0:1' given; a list needed"),
+        ("[network]\nallow_insecure = 3", "$.network.allow_insecure", "3 given; true or false needed"),
+        ("[hand]\nunit = 'mm'", "unknown field 'hand'", "did you mean hands?"),
+        ("[obstacles]\nclearence = 1", "unknown field 'clearence'", "did you mean clearance?"),
         ("[files]\nrecord = 3", "$.files.record", "a text needed"),
         ("[files]\nstate = '~nobody-of-this-name/x'", "$.files.state", "no such user's folder"),
         ('[network]\ncertificate = "a\\u0000b"', "$.network.certificate", "no zero bytes"),
@@ -182,6 +185,20 @@ def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
         "$.tool",
         "$.tool.max_speed",
     ]
+
+
+@pytest.mark.parametrize(
+    ("arm", "told"),
+    [
+        ("urdf = 'nowhere.urdf'", ["$.arm.urdf"]),
+        (f"urdf = '{WAM}'", ["$.arm.plate"]),
+        (f"urdf = '{WAM}'\nplate = 'tool_plate'", ["$.joints.acceleration", "$.joints.jerk", "$.arm.posture"]),
+    ],
+)
+def test_what_else_is_wrong_is_told_beside_a_urdf_that_cannot_be_used(arm: str, told: list[str]) -> None:
+    text = f"[arm]\n{arm}\n[hands]\nunit = 'ft'\n[tool]\ncolour = 'red'\nmax_speed = -1"
+    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
+    assert [line.split(":")[0] for line in lines] == [*told, "$.hands.unit", "$.tool", "$.tool.max_speed"]
 
 
 def test_what_follows_from_another_error_is_not_told() -> None:

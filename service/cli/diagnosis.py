@@ -175,7 +175,10 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     fine = source.fresh and source.rate_hz >= SLACK * least
     advice = "" if source.fresh else _of_unit(source) or remedy(source.cause)
-    yield from _rejected(before, now, name)
+    rejected = list(_rejected(before, now, name))
+    yield from rejected
+    if source.age_ms is None and any(one.level == "wrong" for one in rejected):
+        return  # nothing is accepted of it, and why is said
     yield judged(fine, what, told, wanted, advice or "let it publish as often, and without pauses")
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
         way = "before it comes" if source.clock_ms > 0 else "after it comes: its clock is ahead"

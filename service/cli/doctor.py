@@ -66,10 +66,12 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
                 for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
                 if reply.ok is not None
             }
-            cells.discard(args.cell)
-            there = f"give --cell: {', '.join(sorted(cells))} can be reached here"
-            start = "start `thirdhand serve`; with certificates use an operator's or an observer's"
-            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", there if cells else start)
+            remedy = "start `thirdhand serve`; with certificates use an operator's or an observer's"
+            if args.cell in cells:
+                remedy = "wait: the first start on a machine compiles for half a minute"
+            elif cells:
+                remedy = f"give --cell: {', '.join(sorted(cells))} can be reached here"
+            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
         except msgspec.ValidationError as error:
             yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")

@@ -106,7 +106,8 @@ def parser() -> argparse.ArgumentParser:
     arm = "wait for the arm's joint states, or assume its posture (default: state)"
     c.add_argument("--arm", choices=("state", "assumed"), help=arm)
     option(c, "--record", "DIR", "write .mcap and .rrd files there")
-    option(c, "--live", "PORT", "serve Rerun viewers on this loopback port", type=int)
+    live = "serve Rerun viewers on this loopback port"
+    option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
 
     c = command(
         "play",
@@ -190,7 +191,8 @@ def parser() -> argparse.ArgumentParser:
     )
     a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
     for place in (*SIDES, "tool"):
-        a.add_argument(f"--{place}", nargs=3, type=float, metavar=("X", "Y", "Z"), help="position [m] in frame base")
+        at = "position [m] in frame base"
+        a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
     a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     option(a, "--std", "M", "how exactly the tool is to go there [m]", defaults.std)
@@ -198,7 +200,7 @@ def parser() -> argparse.ArgumentParser:
     follow = "within the radius the tool moves with this hand"
     option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
     turn = "how the tool is turned there"
-    a.add_argument("--orientation", nargs=4, type=float, metavar=("X", "Y", "Z", "W"), help=turn)
+    a.add_argument("--orientation", nargs=4, type=within(float, -1.001, 1.001), metavar=("X", "Y", "Z", "W"), help=turn)
     a.add_argument("--gripper", choices=("open", "closed"), help="what the gripper does there")
     option(a, "--tolerance", "M", f"points learned nearer than this give way (default: {TOLERANCE_M} m)")
     option(a, "--file", "FILE", "a request as JSON instead; - is standard input")

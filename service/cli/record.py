@@ -32,6 +32,11 @@ def record(args: argparse.Namespace) -> int:
     """Exit code 0 once a demonstration is written, or an existing one shown, trimmed or deleted."""
     if args.list == (args.name is not None):
         raise UsageError("a take's name needed, or --list")
+    if args.name is not None:
+        try:
+            path_of(args.folder, args.name)
+        except DemonstrationNameError as error:
+            raise UsageError(str(error)) from None
     settings = load(args.config) if args.config else None
     if args.plot is not None:
         check_writable(args.plot, ".png")

@@ -41,11 +41,11 @@ def play(args: argparse.Namespace) -> int:
     start_ns, last_ns = hands[0][0], hands[-1][0]
     if ends_early(args.file):
         print(f"{args.file} is cut: its end is missing, and what is there is played", file=sys.stderr)
-    with reached(args) as session, Tracker(session, args.cell) as tracker:
+    with reached(args, None) as session, Tracker(session, args.cell) as tracker:
         client = Client(session, args.cell)
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
         while True:
-            before = client.wait_until_ready()
+            before = client.wait_until_ready(timeout_s=None)
             begin = time.monotonic()
             for time_ns, side, pose in hands:
                 early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,12 @@ def serve(args: argparse.Namespace) -> int:
     settings = _overridden(load(args.config) if args.config else Settings(), args)
     skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
     scribe = Scribe(settings, folder=folder, live_port=args.live)
 
     def announce(running: daemon.Daemon) -> None:

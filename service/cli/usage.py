@@ -75,7 +75,8 @@ def endpoint(given: str) -> str:
 
 KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
-    **dict.fromkeys(("M", "S"), float),
+    "S": float,
+    "M": within(float, 0, 10, " m"),
     "HZ": within(int, *RATES_HZ, " Hz"),
     "EP": endpoint,
 }
@@ -124,8 +125,8 @@ def reaching(args: argparse.Namespace) -> ClientSettings:
     )
 
 
-def reached(args: argparse.Namespace, timeout_s: float = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router. Raises UnreachableError."""
+def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:
+    """A session to the daemon or router; None: it waits until Ctrl-C. Raises UnreachableError."""
     return reaching(args).session(timeout_s=timeout_s)
 
 

@@ -70,6 +70,7 @@ def view(args: argparse.Namespace) -> int:
         raise ExplainedError(
             f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed"
         )
+    _check_screen(args)  # before what takes long
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / f"{path.stem}.rrd"
         with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
@@ -128,9 +129,15 @@ def _show(source: str, args: argparse.Namespace) -> int:
         age_s = screenshot(source, args.screenshot, time=args.time, tab=args.tab)
         print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
         return 0
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
+    _check_screen(args)
     return subprocess.run([rerun_program(), "--bind", "127.0.0.1", source], check=False).returncode
+
+
+def _check_screen(args: argparse.Namespace) -> None:
+    """Raises ViewerError where a window is wanted and there is no screen."""
+    has_none = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if has_none and not args.screenshot:
+        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
 
 
 def convert(

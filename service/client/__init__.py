@@ -4,7 +4,7 @@ on a network.
 
 from service.client.calls import Client
 from service.client.client_settings import CLIENT_FILE, ClientSettings, client_settings
-from service.client.presence import Cell, Overheard, cells, living
+from service.client.presence import Cell, Overheard, cells, living, why_silent
 from service.client.session import (
     AUTHORITY,
     CERTIFICATE,
@@ -38,4 +38,5 @@ __all__ = [
     "living",
     "open_session",
     "publisher",
+    "why_silent",
 ]

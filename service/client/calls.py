@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
-from service.client.presence import living
+from service.client.presence import living, why_silent
 from service.client.session import RETRY_S, RefusedError, UnreachableError, tried
 from service.contract import channels, requests
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
@@ -111,7 +111,7 @@ class Client:
                 raise RefusedError(text or "no reason given")
             return reply.ok.payload.to_bytes()
         raise UnreachableError(
-            f"nobody answers on {self._key(suffix)}: is the daemon running there, and is the cell's name right?"
+            f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
             + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps an old reply." * kept
         )
 

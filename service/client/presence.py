@@ -32,6 +32,13 @@ def living(session: zenoh.Session, cell: str, *, timeout_s: float = TIMEOUT_S) -
     return frozenset(own for _, own in _tokens(session, channels.presence(cell), timeout_s))
 
 
+def why_silent(session: zenoh.Session, cell: str) -> str:
+    """Why nothing comes of a cell: its daemon has not started yet, or there is none."""
+    if living(session, cell):
+        return "its daemon is still starting: wait, a first start compiles for half a minute"
+    return "is the daemon running there, and is the cell's name right?"
+
+
 def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell, ...]:
     """All cells that are served on a network, by name; their daemons are queried in parallel."""
     found = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))

@@ -135,9 +135,15 @@ EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if ch
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
+LAST_PORT = 65535  # of IP
+
+
 def lacking(endpoint: str) -> str:
     """What a Zenoh endpoint lacks to be one, in words; empty: nothing."""
     protocol, slashes, address = _ENDPOINT.findall(endpoint)[0]
+    host, _, port = re.sub("[?#].*", "", address).rpartition(":")
+    if protocol in _ON_IP and port.isdecimal() and int(port) > LAST_PORT:
+        return f"{endpoint!r} given; a port from 0 to {LAST_PORT} needed"
     if slashes == "/" and address and (protocol not in _ON_IP or re.fullmatch(".+:.+", address)):
         return ""
     host, _, port = address.rpartition(":")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import re
 from typing import Any, TypeVar
 
@@ -78,7 +79,10 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
         return f"$: {error}"
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
-        return f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(_known(node)) or 'none'}"
+        known = _known(node)
+        near = difflib.get_close_matches(unknown[1], known, n=1)
+        told = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(known) or 'none'}"
+        return told + (f"; did you mean {near[0]}?" if near else "")
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
     if (
@@ -145,6 +149,10 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
             return f"{node.min_length or 0} to {most} needed"
         case inspect.VarTupleType(min_length=least) if least:
             return f"at least {least} needed"
+        case inspect.VarTupleType() if not isinstance(value, list):
+            return f"a list needed, like [{value!r}]" if isinstance(value, str) else "a list needed"
+        case inspect.BoolType():
+            return "true or false needed"
         case inspect.StrType():
             return "a text needed"
         case inspect.StructType() | inspect.UnionType():
@@ -153,6 +161,8 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
 
 
 def _short(value: Any) -> str:
+    if value is None:
+        return "null (or NaN)"
     try:
         text = repr(value)
     except RecursionError:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias, assert_never
 
 from service.contract.messages import JointState, PoseStamped
-from service.contract.records import SIDES, Cause, Flag, Mode, Reason
+from service.contract.records import GONE_S, SIDES, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 
 SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
@@ -141,7 +141,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy = _of_rejected(seen, *SIDES) or remedy
         case Reason.STALE_HAND:
             about, found = "no accepted sample of a hand for 100 ms", _unseen(seen)
-            remedy = "look at the tracker; growing counters under `rejected` mean that samples come and are refused"
+            remedy = "look at the tracker; growing counters under `rejected` mean that samples come and are refused; "
+            remedy += f"a hand that the skill does without is waited for {GONE_S:g} s only"
             remedy = _of_rejected(seen, *SIDES) or remedy
         case Reason.FAR_FROM_DEMONSTRATIONS:
             about = "the skill is not sure where the tool belongs with the hands as they are"
@@ -161,6 +162,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
+            if (arm := seen.sources.get("arm")) is not None and arm.fresh:
+                remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
             if seen.inside is not None:
                 remedy = "bring the arm out by hand, or by `thirdhand reset`, which moves it out slowly; "
                 remedy += "where nothing is there mend [table], [obstacles] or the URDF"

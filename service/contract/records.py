@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 SIDES = ("left", "right")
+GONE_S = 5.0  # a hand that a skill does without is waited for so long: what hides it in passing is gone sooner
 SOURCES = (*SIDES, "arm")
 
 

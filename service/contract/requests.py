@@ -12,7 +12,7 @@ import msgspec
 
 from service.contract.explain import ExplainedError, explained
 from service.contract.messages import Vector3
-from service.contract.records import SIDES
+from service.contract.records import GONE_S, SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 NORM = 1e-3  # by which that of a quaternion may differ from 1
@@ -215,5 +215,6 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """The hands that must be seen: those by which the skill goes, and any that ever was."""
-        return tuple(side for side in SIDES if self.hands in ("both", side) or side in self.hand_age_ms)
+        """The hands that must be seen: those by which the skill goes, and any that was lately."""
+        lately = {side for side, age_ms in self.hand_age_ms.items() if age_ms < 1000 * GONE_S}
+        return tuple(side for side in SIDES if self.hands in ("both", side) or side in lately)

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from service.config import Settings
-from service.contract.records import Flag, Reason
+from service.contract.records import GONE_S, Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
 from service.core.decision.decision import ALONE, FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
 from service.core.frame import (
@@ -77,6 +77,7 @@ class Controller:
         self._arm = Arm(settings, urdf)
         self._setpoint = SetpointStage(settings, self._arm)
         self._limiter = LimiterStage(settings, self._arm)
+        self._gone_ticks = math.ceil(GONE_S / settings.period_s)
         self._here: Kinematics | None = None  # of the state's joints
 
     @property
@@ -141,11 +142,12 @@ class Controller:
         return self.intake.step(state, frame, tick.index - int(state["tick"]), samples)
 
     def _alone(self, frame: Frame) -> int:
-        """HANDS_KNOWN and ALONE, where one hand conducts the skill and the other never was seen.
-        One that was seen once may be anywhere: the arm keeps away from it, so it must be seen.
+        """HANDS_KNOWN and ALONE, where one hand conducts the skill and the other never was seen, or
+        has gone. One that was seen lately may be near, so the arm holds; it keeps away ever after
+        from where that was last seen.
         """
         side, ages = self.skill.conductor, frame["hand_ages"]
-        if side is None or not ages[1 - side] < 0 <= ages[side]:
+        if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
             return 0
         return ALONE | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
 

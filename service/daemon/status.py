@@ -10,7 +10,7 @@ import numpy as np
 from service.config import Settings
 from service.contract.incidents import MALFORMED, Evidence, Inside, Outside, Stuck, explained, word
 from service.contract.messages import Vector3
-from service.contract.records import SIDES, Flag, Mode, Reason
+from service.contract.records import GONE_S, SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
@@ -111,9 +111,9 @@ class CellStatus(NamedTuple):
         )
 
     def _spare(self, name: str, source: Source) -> bool:
-        """Whether that is a hand which the skill does without, and which was never seen."""
-        side = self.controller.skill.conductor
-        return side is not None and name in SIDES and name != SIDES[side] and source.age_ms is None
+        """Whether that is a hand which the skill does without, and which was not seen lately."""
+        side, gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
+        return side is not None and name in SIDES and name != SIDES[side] and gone
 
     def _outside(self) -> Outside | None:
         """The first joint that is moved back into its limits."""

@@ -22,7 +22,7 @@ from service.contract.messages import BASE, PoseStamped, WireError, finite, in_o
 from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake.intake import FARTHEST_M, UNIT_M
-from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker
+from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
 from service.demonstrations.tool_poses import tool_poses
@@ -108,12 +108,14 @@ class Capture:
         return [key for key in self.hands if not self.samples[key]] + tool
 
     def check(self) -> None:
-        """Raises CaptureError where a hand or the tool is too far away to be plausible."""
+        """Raises CaptureError where a hand or the tool is too far away, or in an unknown frame."""
         hands = self.settings.hands
         for key in (*self.hands, TOOL):
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
                 at = np.array(pose.position)
+                if problem := unknown_frame(key, pose.frame_id, hands):
+                    raise CaptureError(f"{problem}. Nothing is recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
                     at = from_tracker(at, hands)
                 if np.linalg.norm(at) > FARTHEST_M:

@@ -172,6 +172,17 @@ def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettin
     return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
 
 
+def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
+    """Words and remedy for a stream in a frame of which nothing is known; empty for others."""
+    if frame in ("", BASE, hands.frame):
+        return ""
+    known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
+    return (
+        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) whose [hands] frame "
+        "names it and says by base_from_tracker where it is"
+    )
+
+
 def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
     """Tracks of left hand, right hand and tool in frame `base`, and in words which of them were
     transformed.
@@ -180,12 +191,8 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     The tool is only where it names that frame. Raises RecordingError for other frames.
     """
     for track in tracks:
-        if track.frame not in ("", BASE, hands.frame):
-            known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
-            raise RecordingError(
-                f"{path}: {track.name} is in frame {track.frame!r}: {BASE!r}{known} needed, or a configuration "
-                "(--config) whose [hands] frame names it and says by base_from_tracker where it is"
-            )
+        if problem := unknown_frame(track.name, track.frame, hands):
+            raise RecordingError(f"{path}: {problem}")
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []

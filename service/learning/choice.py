@@ -33,6 +33,7 @@ REGIONS = (2.366, 7.815)  # chi-square of three degrees of freedom: the 50 and 9
 CLEARLY = 0.9  # a linear mean must have less than this share of a constant one's error: it extrapolates
 RIDGE_M = 0.005  # along which hands hardly moved, as trackers and fingers tremble, the tool is said to stay
 MAX_GAIN = ToolSettings().max_gain  # of a linear mean, as of the way between via-points
+NOISE_M = 0.001  # of a good tracker, each axis: demonstrations without noise tell no more of people
 DWELL = 0.25  # share of the reference points that goes by time, the rest by the hands' way
 
 
@@ -107,14 +108,16 @@ class Choice:
             if least < CLEARLY * error:
                 noise, residuals, is_linear = best, self.residuals(ell, best, is_linear=True), True
         unscaled = Parameters(ell, noise, spread, 1.0, is_linear)
-        squares = []
+        squares, floors = [], []
         for left_out in range(count):
             mine = self.owner == left_out
             found = self.primitive(unscaled, residuals, without=left_out).predict(self.inputs[mine])
             squares.append(mahalanobis(self.outputs[mine] - found.mean, found.covariance))
+            floors.append(NOISE_M**2 * np.trace(np.linalg.inv(found.covariance), axis1=1, axis2=2))
         # Of H demonstrations each is predicted by H - 1 whose scatter was measured on the same few.
         few = (count + 1) / (count - 1)
-        return unscaled._replace(deviation=float(np.sqrt(few * np.concatenate(squares).mean() / 3)))
+        scale = max(few * np.concatenate(squares).mean(), np.concatenate(floors).mean()) / 3
+        return unscaled._replace(deviation=float(np.sqrt(scale)))
 
     def residuals(self, ell: float, noise: float, *, is_linear: bool = False) -> Vector:
         """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""

@@ -15,6 +15,7 @@ from service.core.frame import Vector
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
 CEILING_M = 0.15  # and no tool is followed that may be so far off, each axis: a thing held is as large
+FLOOR_M = 0.02  # nor does a hand count as off its places that only looks so: twice the noisiest tracker's deviation
 MISSED = 0.05  # of the nonsense may pass, and
 FALSE = 0.02  # of the time may a gate hold that does not separate the two
 BESIDE_M = 0.3
@@ -33,10 +34,13 @@ class Gate(NamedTuple):
 
     threshold: float
     caught: Caught
-    capped: bool  # whether the ceiling alone made it
+    capped: bool  # whether the ceiling alone made it,
+    floored: bool  # or the floor
 
 
-def gate_between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, false: float = FALSE) -> Gate:
+def gate_between(
+    held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, floor: float = 0.0, false: float = FALSE
+) -> Gate:
     """The gate between what held-out demonstrations (T,) and each kind of nonsense reach [m]."""
     most = float(held_out.max())
     least = min(float(np.quantile(x, MISSED)) for x in wrong)
@@ -44,8 +48,8 @@ def gate_between(held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, f
         threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
     else:
         threshold = min(max(least, float(np.quantile(held_out, 1 - false))), most)
-    threshold, capped = min(threshold, ceiling), threshold > ceiling
-    return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in wrong)), capped)
+    capped, floored, threshold = threshold > ceiling, threshold < floor, max(min(threshold, ceiling), floor)
+    return Gate(threshold, Caught(*(float((x > threshold).mean()) for x in wrong)), capped, floored)
 
 
 def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:

@@ -16,7 +16,7 @@ from service.core.frame import Vector
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import is_reachable
 from service.learning.ambiguity import COMPARED, ambiguity, lengths
-from service.learning.choice import REGIONS, mahalanobis, rms
+from service.learning.choice import NOISE_M, REGIONS, mahalanobis, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
 
@@ -131,7 +131,7 @@ def figures(
         orientation_error_deg=posed.turn_error_deg,
         gripper_right=posed.gripper_right,
     )
-    warnings, unsafe = _verdicts(found, demonstrations, contradiction, capped=gate.capped)
+    warnings, unsafe = _verdicts(found, demonstrations, contradiction, gate=gate)
     return msgspec.structs.replace(
         found, warnings=(*remarks, *warnings, *posed.warnings), unsafe=(*unsafe, *posed.unsafe)
     )
@@ -168,7 +168,7 @@ def _row(name: str, one: HeldOut, threshold: float, beside: Mapping[str, Vector]
 
 
 def _verdicts(
-    found: Figures, demonstrations: Sequence[Demonstration], contradiction: str, *, capped: bool
+    found: Figures, demonstrations: Sequence[Demonstration], contradiction: str, *, gate: Gate
 ) -> tuple[list[str], list[str]]:
     warnings: list[str] = []
     unsafe: list[str] = []
@@ -184,6 +184,11 @@ def _verdicts(
         say(f"the demonstrations are in frame {frames[0]!r}: it is taken to be {BASE!r}, the arm's base plate")
     if len(found.demonstrations) < 3:
         say(f"{len(found.demonstrations)} demonstration(s) tell little of how sure the skill may be; 5 advised")
+    if gate.floored or overall.error_mm < 1000 * NOISE_M:
+        say(
+            "the demonstrations are more exact than any tracker: were they made, not taken? The gate allows for a "
+            f"tracker's noise, and is {found.gate_mm:.1f} mm"
+        )
     if overall.error_mm > NOTED_MM:
         say(
             f"held-out demonstrations are missed by {overall.error_mm:.0f} mm: where the hands are tells little of "
@@ -191,7 +196,7 @@ def _verdicts(
             bad=overall.error_mm > UNSAFE_MM,
         )
     for way, error_mm in overall.other_mm.items():
-        if error_mm < overall.error_mm:
+        if round(error_mm) < round(overall.error_mm):
             say(f"{way}, held-out demonstrations are missed by less: {error_mm:.0f} mm, not {overall.error_mm:.0f}")
     usual = float(np.median([row.error_mm for row in found.demonstrations]))
     for row in found.demonstrations:
@@ -209,7 +214,7 @@ def _verdicts(
             bad=found.beyond_reach > BEYOND_UNSAFE,
         )
     if overall.held > HELD:
-        why = "its ceiling" if capped else "nonsense beyond it"
+        why = "its ceiling" if gate.capped else "nonsense beyond it"
         say(
             f"the gate, kept low by {why}, holds {overall.held:.0f} % of what was demonstrated, up to "
             f"{HELD_UNSAFE:.0f} % accepted",

@@ -23,7 +23,7 @@ from service.core.skill.task import LEFT, MOST_CORNERS, NONE, RIGHT, Indices, Na
 from service.core.skill.task_parameterized import TaskInstance, TaskParameterized
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration
-from service.learning.gate import CEILING_M, Gate, gate_between, nonsense
+from service.learning.gate import CEILING_M, FLOOR_M, Gate, gate_between, nonsense
 from service.learning.judgement import HeldOut
 from service.learning.skill_file import SkillError
 
@@ -345,4 +345,4 @@ def _gate(task: Task, encoded: Sequence[Encoded]) -> Gate:
         wrong.append([instance.inputs(hands)[1] for hands in nonsense(some)])
     held_out = np.concatenate([one.gate_m for one in encoded])
     kinds = [np.concatenate(kind) for kind in zip(*wrong, strict=True)]
-    return gate_between(held_out, kinds, ceiling=CEILING_M, false=FALSE_HOLDS)
+    return gate_between(held_out, kinds, ceiling=CEILING_M, floor=FLOOR_M, false=FALSE_HOLDS)

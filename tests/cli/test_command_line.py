@@ -100,7 +100,6 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (1, "", ("doctor", *NOBODY)),
         (1, "", ("cells", *NOBODY)),
         (1, "is a daemon running", ("hold", *NOBODY)),
-        (1, "", ("play", str(RECORDINGS / "demonstration-6.mcap"), *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
@@ -110,6 +109,11 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "--cell: $.cell", ("hold", "--cell", "")),
         (2, "--cell: $.cell", ("play", "nowhere.mcap", "--cell", "**")),
         (2, "", ("record",)),
+        (2, "accepted as a take's name", ("record", "a/b", *NOBODY)),
+        (2, "a port from 0 to 65535 needed", ("status", "--connect", "tcp/127.0.0.1:99999")),
+        (2, "0 to 65535 needed", ("serve", "--live", "99999")),
+        (2, "nan given, -10 to 10 m needed", ("via-points", "add", "here", "--left", "nan", "0", "0")),
+        (2, "nan given, 0 to 10 m needed", ("via-points", "add", "here", "--std", "nan")),
         (2, "", ("bench", "--seconds", "-1")),
         *((2, "50 to 1000 Hz", ("serve", "--rate", rate)) for rate in ("7", "5OO")),
         (2, "needed", ("via-points", "add")),
@@ -129,12 +133,21 @@ def test_exit_codes_are_as_promised(
     assert not code or done.stderr.strip() or done.stdout.startswith("wrong ")
 
 
+def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = told("view", str(RECORDINGS / "golden.mcap"))
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "there is no screen" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("code", "words", "arguments"),
     [
         (0, "thirdhand 0.", ("--version",)),
         (1, "nowhere.mcap", ("replay", "nowhere.mcap")),
         (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
+        (1, "/proc/x: No such file or directory", ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0")),
         (2, "COMMAND", ()),
     ],
 )
@@ -143,6 +156,19 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
     assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
     assert words in (done.stderr if code else done.stdout)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
+def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
+    if command == ("sim",):
+        pytest.importorskip("pybullet", reason="the bench needs PyBullet")
+    arguments = [sys.executable, "-m", "service", *command, *NOBODY]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == "thirdhand: interrupted\n"
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:

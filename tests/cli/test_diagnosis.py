@@ -77,6 +77,12 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     assert told >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
 
 
+def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
+    refused = {"fresh": False, "age_ms": None, "rejected": {"wrong_frame": 200}, "cause": "wrong_frame"}
+    (told,) = wrongs(diagnosed(sources=source("right", **refused)))
+    assert "100 messages/s rejected as wrong_frame" in told
+
+
 @pytest.mark.parametrize(
     ("changed", "what", "words"),
     [

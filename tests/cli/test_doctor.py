@@ -23,6 +23,7 @@ from service.cli.main import main
 from service.client import endpoints, open_session
 from service.config import Settings
 from service.contract import cdr, messages
+from service.daemon.single_instance import occupy
 from service.launch import launched
 from support.cell import LEFT, Daemon, Tracker
 from support.paths import ROOT
@@ -187,6 +188,20 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
     said = capsys.readouterr().out
     assert "nothing comes on lab/status" in said
     assert "give --cell: lab/bench2 can be reached here" in said
+
+
+def test_a_daemon_that_still_compiles_is_said_to_start(capsys: pytest.CaptureFixture[str]) -> None:
+    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
+        token = occupy(near, "lab")  # as a daemon does before it compiles
+        reach = ["--connect", endpoints(near)[0], "--cell", "lab"]
+        assert main(["doctor", *reach]) == 1
+        doctor = capsys.readouterr().out
+        assert main(["status", *reach]) == 1
+        status = capsys.readouterr().err
+        token.undeclare()  # type: ignore[no-untyped-call]
+    for said in (doctor, status):
+        assert "its daemon is still starting: wait, a first start compiles" in said
+        assert "start `thirdhand serve`" not in said
 
 
 def test_words_that_are_not_known_are_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

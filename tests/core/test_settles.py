@@ -80,6 +80,15 @@ def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill
     assert rms(found) < AT_REST
 
 
+def test_a_clearance_greater_than_the_arms_own_gaps_does_not_swing_it(taught: Skill) -> None:
+    """Of its elbow from its base, which are 12.2 cm apart as it stands."""
+    cell = replace(cell_of("wam"), rate_hz=250, obstacles=replace(Settings().obstacles, clearance=0.12))
+    places = taught.hands.reshape(-1, 2, 3)
+    rest = places[np.random.default_rng(12).integers(len(places))]
+    found = accelerations(cell, taught, np.array(cell.arm.posture), [rest, rest], 16.0)
+    assert rms(found) < AT_REST
+
+
 @pytest.mark.parametrize(
     ("rate_hz", "tool"), [(250, {"jerk_weight": 1e-11, "max_jerk": 43.0}), (500, {"max_jerk": 2.0})]
 )

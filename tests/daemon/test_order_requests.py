@@ -52,7 +52,7 @@ def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
     ("request_", "message"),
     [
         ({"now": True}, "$: unknown field 'now'; known are none"),
-        (None, "$: None given; an object with its fields needed"),
+        (None, "$: null (or NaN) given; an object with its fields needed"),
         (b"hold!", "not JSON: JSON is malformed"),
     ],
 )

@@ -195,6 +195,10 @@ def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_s
     told = cell.status(1.1)
     assert (told.reason, told.needed) == ("stale_hand", ("left", "right"))
     assert told.because.startswith("the left hand was last seen")
+    for k in range(2300):  # 5 s since it was seen
+        cell.tell(("arm", joints(600 + k)), ("right", pose(500 + k, RIGHT)))
+    told = cell.status(5.7)
+    assert (told.reason != "stale_hand", told.needed) == (True, ("right",))
     assert (Cell(skill).status(0.0).hands, set(Cell(skill).status(0.0).demonstrated_m)) == ("both", {"left", "right"})
 
 
@@ -205,7 +209,9 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
     assert "what comes of the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
     cell.tell(("arm", joints(2)))
-    assert cell.status(0.2).because == "the arm has not told one posture for long enough"
+    told = cell.status(0.2)
+    assert told.because == "the arm has not told one posture for long enough"
+    assert told.remedy == "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))

@@ -11,7 +11,7 @@ import pytest
 from service.contract.records import Mode, Reason
 from service.contract.requests import Hands, ViaPoint
 from service.core.controller import Controller
-from service.core.frame import Tick
+from service.core.frame import Records, Tick
 from service.demonstrations.demonstration_files import summary
 from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
@@ -24,7 +24,8 @@ from support.in_process import ASSUMED, frames, hand
 from support.wam import URDF
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
-FAR = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
+Point = tuple[float, float, float]
+FAR: Point = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
 
 
 def led(seed: int, who: Hands = "left") -> Demonstration:
@@ -105,26 +106,49 @@ def test_takes_of_different_hands_are_not_mixed() -> None:
         learn([led(0), circling(1)])
 
 
-def modes(skill: StoredSkill, other_from: int, other_to: int, one_to: int = 10_000) -> list[tuple[int, int]]:
-    """Mode and reason of each tick, the other hand seen for some, the one until another."""
+def served(
+    skill: StoredSkill, other_from: int, other_to: int, one_to: int = 10_000, *, count: int = 1200, at: Point = FAR
+) -> Records:
+    """The frame of each tick, the other hand seen for some, the one until another."""
     one, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
     ticks = []
-    for k in range(1200):
+    for k in range(count):
         events = [hand(one, AT, k + 1)] if k % 5 == 0 and k < one_to else []
-        events += [hand(other, FAR, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
+        events += [hand(other, at, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
         ticks.append(Tick(k, tuple(events)))
-    seen = frames(Controller(ASSUMED, skill, urdf=URDF), ticks)
+    return frames(Controller(ASSUMED, skill, urdf=URDF), ticks)
+
+
+def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200) -> list[tuple[int, int]]:
+    """Mode and reason of each tick of `served`."""
+    seen = served(skill, *hands, one_to, count=count)
     return list(zip(seen["mode"].tolist(), seen["reason"].tolist(), strict=True))
 
 
-def test_it_is_served_without_a_hand_that_never_was_seen_and_never_without_one_that_was(skill: StoredSkill) -> None:
+def test_it_is_served_without_a_hand_that_was_never_seen_or_has_gone_but_waits_for_one_that_vanishes(
+    skill: StoredSkill,
+) -> None:
     follow = (Mode.FOLLOW, Reason.NONE)
     assert set(modes(skill, 0, 0)[5:]) == {follow}
-    lost = modes(skill, 300, 600)
+    lost = modes(skill, 300, 600, count=3200)
     assert set(lost[10:640]) == {follow}  # and both are seen
-    assert set(lost[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    assert set(lost[660:3090]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    assert set(lost[3100:]) == {follow}  # 5 s after it was seen last
+    again = modes(skill, 300, 600, one_to=3150, count=3300)
+    assert set(again[3210:]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(modes(skill, 0, 0, one_to=600)[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(modes(skill, 0, 1200, one_to=0)) == {(Mode.HOLD, Reason.NO_HANDS)}
+
+
+def test_the_arm_keeps_away_from_where_a_hand_that_has_gone_was_seen_last(skill: StoredSkill) -> None:
+    there = (0.5, 0.21, 0.4)  # where the tool is to go
+    seen = served(skill, 0, 50, count=3500, at=there)
+    assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}
+    assert seen["hand_distance"].min() > ASSUMED.people.clearance - 0.001
+    free = served(skill, 0, 0)
+    near, away = (np.linalg.norm(found["tool"][-1] - there) for found in (free, seen))
+    assert near < 0.03
+    assert away > 0.05
 
 
 def test_a_skill_of_both_hands_waits_for_both_as_ever() -> None:

@@ -197,6 +197,23 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
         read_demonstration(path, settings=Settings(hands=HandSettings(frame="tracker")))
 
 
+@pytest.mark.parametrize("key", ["hands/right", "tool/pose"])
+def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begins(
+    sessions: tuple[zenoh.Session, zenoh.Session], key: str
+) -> None:
+    for hands, refused in ((HandSettings(), True), (HandSettings(frame="camera"), False)):
+        taken = Capture(sessions[0], "bench", Settings(hands=hands))
+        taken.close()
+        pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
+        taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
+        if refused:
+            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing is recorded"
+            with pytest.raises(CaptureError, match=words):
+                taken.check()
+        else:
+            taken.check()
+
+
 def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
     """A sample each 10 ms up to now, at places (N,) along one axis [m]."""
     times = end_ns - np.arange(len(way))[::-1] * 10_000_000
@@ -297,7 +314,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     [
         ([], 2, "a take's name needed, or --list"),
         (["a", "--list"], 2, "a take's name needed, or --list"),
-        (["../a", "--show"], 1, "accepted as a take's name"),
+        (["../a", "--show"], 2, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
         (["there"], 1, "is there already: another name needed, or --delete it first"),
         (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),

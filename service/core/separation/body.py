@@ -19,7 +19,13 @@ from service.urdf import Joint, Shape, Urdf
 
 LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
 UNMOVED = 1e-9  # [m]
+OWN_M = 0.01  # that parts keep from each other at most: where they are is known, and more keeps them from folding
 FITS = 101  # lengths tried for a capsule
+
+
+def own_clearance(settings: Settings) -> float:
+    """How far parts of the arm keep from each other [m]."""
+    return min(settings.obstacles.clearance, OWN_M)
 
 
 class Body(NamedTuple):
@@ -41,8 +47,8 @@ def body_of(settings: Settings, description: str) -> Body:
     """The body of the arm that a URDF describes, with the tool on its plate.
 
     Kept apart are capsules of links that do not follow each other, but for those that cannot move
-    against each other, and those that belong together: they are nearer than the clearance in the
-    configured posture.
+    against each other, and those that belong together: they are nearer than their own clearance in
+    the configured posture.
     """
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
@@ -76,7 +82,7 @@ def body_of(settings: Settings, description: str) -> Body:
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
-            if apart[0] > settings.obstacles.clearance and np.ptp(apart) > UNMOVED:
+            if apart[0] > own_clearance(settings) and np.ptp(apart) > UNMOVED:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 

@@ -9,7 +9,7 @@ from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
 
 FARTHEST = 3.0  # [m] no distance is reported as greater
-PEOPLE, THINGS = 0, 1  # of a rule's parameters
+PEOPLE, THINGS, ITSELF = 0, 1, 2  # of a rule's parameters
 NEAR_HAND, NEAR_ITSELF = -1, -2  # what a capsule is nearest to, but for boxes
 NOBODY = np.empty((0, 3))  # hands
 
@@ -38,7 +38,7 @@ def clearance(
                 least, part, thing = apart, capsule, box
     for pair in range(len(pairs)):
         one, other = pairs[pair]
-        apart = between_segments(placed[one], placed[other], near) - given.clearance[THINGS]
+        apart = between_segments(placed[one], placed[other], near) - given.clearance[ITSELF]
         apart -= capsules[one].radius + capsules[other].radius
         if apart < least:
             least, part, thing = apart, other, NEAR_ITSELF

@@ -24,14 +24,14 @@ from service.config import Settings
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
-from service.core.separation.body import body_of
-from service.core.separation.clearance import FARTHEST, NOBODY, PEOPLE, THINGS, clearance
+from service.core.separation.body import body_of, own_clearance
+from service.core.separation.clearance import FARTHEST, ITSELF, NOBODY, PEOPLE, THINGS, clearance
 
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
 THINGS_ROOM = 0.005  # [m] from things, likewise
 PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
-PLAN_BRAKE = np.array([1.0, 0.5])  # of the tool's acceleration, for people and things: no more is planned with ...
+PLAN_BRAKE = np.array([1.0, 0.5, 0.5])  # of the tool's acceleration, for people and things: no more is planned with ...
 PLAN_REACTION_S = 0.02  # ... nor with less reaction time: joints that are let nearer more quickly swing there
 CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
 RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
@@ -63,15 +63,16 @@ class Separation:
         boxes += [[np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)] for b in things.boxes]
         self._boxes = np.array(boxes)
         self._capsules, self._pairs = body.capsules, body.pairs
-        direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake])
-        reaction_s = np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, things.reaction_ms / 1000])
+        direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake, things.brake])
+        late_s = things.reaction_ms / 1000
+        reaction_s = np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, late_s, late_s])
         self._parameters = parameters(
             brake=brake,
             reaction_s=reaction_s,
             planned_brake=PLAN_SHARE * np.minimum(brake, PLAN_BRAKE * settings.tool.max_acceleration),
             planned_reaction_s=np.maximum(reaction_s, PLAN_REACTION_S),
-            clearance=np.array([people.clearance, things.clearance]),
-            room=np.array([PEOPLE_ROOM, THINGS_ROOM]),
+            clearance=np.array([people.clearance, things.clearance, own_clearance(settings)]),
+            room=np.array([PEOPLE_ROOM, THINGS_ROOM, THINGS_ROOM]),
             contact_speed=float(people.contact_speed),
             unknown_speed=float(people.unknown_speed),
             tremor_speed=float(people.tremor_speed),
@@ -82,6 +83,8 @@ class Separation:
             max_velocity=np.array(limits.velocity, np.float64),
             first=int(np.flatnonzero(body.capsules["link"])[0]),
         )
+        self._bare = self._parameters.copy()
+        self._bare["clearance"] = 0.0
         capsules, joints = len(body.capsules), len(limits.names)
         most = 2 * capsules * len(AHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
         self._jerk = np.array(limits.jerk)
@@ -134,9 +137,8 @@ class Separation:
         """By how much [m] a part of the arm is inside of a thing or of another part, if above 0;
         the number of the joint that moves it; and the thing, as `clearance` says.
         """
-        clear, part, thing = self.clearance(joints, NOBODY)
-        link = int(self._capsules["link"][part])
-        return -clear - float(self._parameters["clearance"][0][THINGS]), link - 1, thing
+        clear, part, thing = clearance(joints, NOBODY, self._bare, self._capsules, self._pairs, self._boxes)
+        return -clear, int(self._capsules["link"][part]) - 1, thing
 
     def share(self, velocity: Vector) -> float:
         """How much of joint velocities (J,) [rad/s] is slow enough for all that is near."""
@@ -248,10 +250,10 @@ def _step(
     for pair in range(len(pairs)):
         one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
         distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
-        planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
+        planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
         if planned < one.max_speed + other.max_speed:
             constraint = constraints[count]
-            constraint.planned, constraint.allowed = planned, _allowed(parameters, THINGS, distance, 0.0) + SLIP
+            constraint.planned, constraint.allowed = planned, _allowed(parameters, ITSELF, distance, 0.0) + SLIP
             _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
             _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
             count += _may_pass(constraints, count, planned, given.max_velocity)

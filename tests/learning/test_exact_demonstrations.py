@@ -1,0 +1,51 @@
+"""Demonstrations that were made, without any noise, teach a skill that a tracker's noise does not
+hold.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from service.contract.requests import ViaPoint
+from service.learning.demonstration import Demonstration
+from service.learning.gate import FLOOR_M
+from service.learning.judgement import Figures
+from service.learning.learn import learn
+from support.circling import circling
+
+NOISE_M = 0.002  # of a usual tracker
+PLACES = tuple(
+    ViaPoint(name, (x, 0.2, 0.2), (x, -0.2, 0.2), (x, 0.0, 0.4)) for name, x in (("near", 0.4), ("far", 0.7))
+)
+
+
+def along_a_line(number: int) -> Demonstration:
+    """Hands that go exactly from place to place, each time at another speed, and the tool along."""
+    t = np.arange(0.0, 6.0, 0.02)
+    share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
+    ways = (np.array(one) for one in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True))
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    poses = [np.hstack([begin + share * (end - begin), turn]) for begin, end in ways]
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, places=PLACES)
+
+
+def test_between_places_the_gate_is_no_nearer_than_noise() -> None:
+    skill = learn([along_a_line(number) for number in range(3)])
+    assert skill.threshold >= FLOOR_M
+    random, still = np.random.default_rng(1), np.zeros((2, 3))
+    hands = along_a_line(0).hands[::10].reshape(-1, 2, 3)
+    noisy = [skill.predict(at + NOISE_M * random.normal(size=(2, 3)), still, still).gate_m for at in hands]
+    assert max(noisy) < skill.threshold
+    said = msgspec.json.decode(skill.figures, type=Figures).warnings
+    assert any("more exact than any tracker" in one for one in said)
+
+
+def test_a_covariance_is_never_less_than_a_trackers_noise() -> None:
+    made = [one._replace(tool=(one.left + one.right) / 2) for one in (circling(seed, noise_m=0.0) for seed in range(4))]
+    figures = msgspec.json.decode(learn(made, points=80).figures, type=Figures)
+    assert figures.all.error_mm < 1.0 < figures.all.predicted_mm
+    assert figures.gate_mm > 1.0
+    said = "; ".join(figures.warnings)
+    assert "more exact than any tracker" in said
+    assert "missed by less: 0 mm, not 0" not in said
