@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_kind, not_negative, numbers, positive, squared, whole
+from kmp.checks import Array, check_kind, not_negative, numbers, one_of, positive, squared, whole
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
@@ -95,8 +95,7 @@ class KMP(Predictor, Plotted):
             inputs=s.shape[1],
             outputs=reference.outputs,
         )
-        if not isinstance(representation, str) or representation not in {"auto", "dense", "low_rank"}:
-            raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
+        one_of("representation", representation, ("auto", "dense", "low_rank"))
         whole("rank", rank)
         if positive("rank_tolerance", rank_tolerance) >= 1:
             raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_gaussian_process import off, two_hands
 
 import kmp
 from kmp import GaussianKernel, VelocityKernel
@@ -92,3 +93,27 @@ def test_what_cannot_be_done_is_refused_with_what_could():
             chosen(**{name: 0.0})
     alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
     assert np.isnan(alone.regression_rmse)
+
+
+def test_points_of_many_inputs_are_shown_ones_where_these_predict_better():
+    *shown, (hands, tool) = two_hands(0, demonstrations=6)
+    learned = {points: chosen(shown, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
+    misses = {points: off(one.primitive.mean(hands), tool) for points, one in learned.items()}
+    assert misses["shown"] < 0.8 * misses["drawn"]
+    rmses = {points: one.scores[0].rmse for points, one in learned.items()}
+    assert rmses["auto"] == min(rmses.values())
+    samples = np.concatenate([s for s, _ in shown])
+    for points in ("shown", "auto"):
+        assert all((samples == s).all(axis=1).any() for s in learned[points].primitive.inputs)
+    assert not (samples == learned["drawn"].primitive.inputs[0]).all(axis=1).any()
+
+
+def test_points_over_time_may_be_shown_ones_too():
+    learned = chosen(over_time(), points="shown", count=30)
+    assert np.isin(learned.primitive.inputs, np.linspace(0, 2, 80)).all()
+
+
+def test_one_scale_for_all_inputs_keeps_their_lengths_over_their_deviations():
+    ell = np.asarray(chosen(scales="one").primitive.kernel.ell)
+    variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
+    assert ell[0] * variances[0] == pytest.approx(ell[1] * variances[1], rel=1e-9)
