@@ -78,6 +78,7 @@ RIGHT = {
     ONE.adapt: {"inputs": S[:2], "desired": R[:2], "tolerance": 0.1, "directions": np.zeros((2, 2))},
     ONE.adapt_jacobian: {"inputs": S[:1], "jacobians": np.eye(2)[None], "deviation": 0.1},
     ONE.constrained: {"constraints": LIMITS},
+    ONE.extended: {"inputs": S[:2] + 1, "reference": R[:2], "directions": np.zeros((2, 2))},
     ONE.refitted: {"reference": R},
     KMP.from_arrays: {"arrays": LOW.to_arrays()},
     ONE.mean: {"queries": S},
