@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from test_selection import driven_by_hands, over_time
 
 import kmp
 from kmp import GaussianKernel, Gaussians, VelocityKernel
 from kmp.database import Database
 from kmp.functionals import Functionals
 from kmp.likelihood import negative_log_likelihood, with_ell
+from support.shown_skills import driven_by_hands, over_time
 
 
 def database(dimensions, outputs):

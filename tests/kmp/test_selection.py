@@ -2,27 +2,10 @@
 
 import numpy as np
 import pytest
-from test_gaussian_process import off, two_hands
 
 import kmp
 from kmp import GaussianKernel, VelocityKernel
-
-
-def driven_by_hands(seed=0, count=4):
-    """Two inputs of which only the first matters, on a long way; the second jitters."""
-    random, demonstrations = np.random.default_rng(seed), []
-    for _ in range(count):
-        t = np.linspace(0, 1, 80)
-        s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
-        xi = np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1)
-        demonstrations.append((s, xi + 0.01 * random.normal(size=(80, 2))))
-    return demonstrations
-
-
-def over_time(velocity=False):
-    random, t = np.random.default_rng(0), np.linspace(0, 2, 80)
-    paths = [np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2) for _ in range(3)]
-    return [(t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths]
+from support.shown_skills import driven_by_hands, off, over_time, two_hands
 
 
 def chosen(demonstrations=None, **options):
