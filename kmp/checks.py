@@ -132,6 +132,13 @@ def check_kind(name: str, value: object, kind: type, how: str) -> None:
         raise ValueError(f"{name}: {type(value).__name__} given, {kind.__name__} needed: {how}.")
 
 
+def one_of(name: str, value: object, words: Sequence[str]) -> None:
+    """Raises ValueError unless the value is one of the words."""
+    if not isinstance(value, str) or value not in words:
+        *most, last = map(repr, words)
+        raise ValueError(f"{name}: {value!r} given, {', '.join(most)} or {last} needed.")
+
+
 def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
     """Inputs and outputs of a demonstration. Raises ValueError unless it is a pair."""
     if isinstance(demonstration, (tuple, list)) and len(demonstration) == 2:

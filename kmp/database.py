@@ -56,6 +56,11 @@ class Database(Immutable):
         chosen = slice(first, None)
         return Database(self.functionals.take(chosen), self.reference.take(chosen))
 
+    def joined(self, other: Database) -> Database:
+        """These points, then the others."""
+        functionals = Functionals.concatenated([self.functionals, other.functionals])
+        return Database(functionals, Gaussians.concatenated([self.reference, other.reference]))
+
     def unchanged(self) -> Changes:
         """No changes at all."""
         nothing = frozen(np.empty(0, dtype=np.intp))

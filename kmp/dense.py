@@ -167,6 +167,12 @@ class Dense(Immutable):
                 return found
         return Dense(self.hyperparameters, database, base, first if first >= _SHARED * count else 0)
 
+    def extended(self, database: Database) -> Dense:
+        """The solution of a database that begins with this one's: the factors grow by a border."""
+        bordered = Dense(self.hyperparameters, database, self, len(self.database))
+        factors = {"_mean_solver": bordered.mean_factor, "_covariance_solver": bordered.covariance_factor}
+        return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
+
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
 

@@ -55,33 +55,7 @@ class GaussianMixture(Immutable):
         Raises ValueError if the shape is another, a number is not finite, there are fewer samples
         than components, or a parameter is out of its range.
         """
-        data = numbers("samples", samples, "M", "I+O")
-        check_some("samples", data.T)
-        added = positive("regularization", regularization)
-        whole("components", components)
-        seeded(seed)
-        if len(data) < components:
-            given = f"{len(data)} samples given for {components} components"
-            raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
-        # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
-        from sklearn.mixture import GaussianMixture as Estimator
-        from threadpoolctl import threadpool_limits
-
-        estimator = Estimator(
-            components,
-            covariance_type="full",
-            init_params="kmeans",
-            random_state=seed,
-            reg_covar=added,
-            tol=_TOLERANCE,
-            max_iter=_ITERATIONS,
-        )
-        try:
-            with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
-                found = estimator.fit(data)
-            return cls(found.weights_, found.means_, symmetric(found.covariances_))
-        except ValueError as error:
-            raise ValueError(f"samples: with regularization {added:g} no mixture was found: {error}") from None
+        return mixture_of(samples, components=components, seed=seed, regularization=regularization)
 
     def regress(self, inputs: ArrayLike) -> Gaussians:
         """xi | s at each input (N, I): N normals, by Gaussian mixture regression.
@@ -131,3 +105,47 @@ class GaussianMixture(Immutable):
             takes = f"this mixture of {total} dimensions in all takes 1 to {total - 1}"
             raise ValueError(f"inputs: {inputs} input dimensions given; {takes}.")
         return inputs
+
+
+def mixture_of(
+    samples: ArrayLike,
+    *,
+    components: int,
+    seed: int,
+    regularization: float,
+    start: GaussianMixture | None = None,
+) -> GaussianMixture:
+    """`GaussianMixture.fit`, from a mixture of nearly the same samples instead of k-means."""
+    data = numbers("samples", samples, "M", "I+O")
+    check_some("samples", data.T)
+    added = positive("regularization", regularization)
+    whole("components", components)
+    seeded(seed)
+    if len(data) < components:
+        given = f"{len(data)} samples given for {components} components"
+        raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
+    # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
+    from sklearn.mixture import GaussianMixture as Estimator
+    from threadpoolctl import threadpool_limits
+
+    known = {}
+    if start is not None:
+        precisions = np.asarray(np.linalg.inv(start.covariances), dtype=np.float64)
+        known = {"weights_init": start.weights / start.weights.sum(), "means_init": start.means}
+        known["precisions_init"] = symmetric(precisions)
+    estimator = Estimator(
+        components,
+        covariance_type="full",
+        init_params="kmeans",
+        random_state=seed,
+        reg_covar=added,
+        tol=_TOLERANCE,
+        max_iter=_ITERATIONS,
+        **known,
+    )
+    try:
+        with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
+            found = estimator.fit(data)
+        return GaussianMixture(found.weights_, found.means_, symmetric(found.covariances_))
+    except ValueError as error:
+        raise ValueError(f"samples: with regularization {added:g} no mixture was found: {error}") from None

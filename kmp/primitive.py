@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_kind, not_negative, numbers, positive, squared, whole
+from kmp.checks import Array, check_kind, check_some, not_negative, numbers, one_of, positive, squared, whole
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
@@ -36,7 +36,7 @@ class KMP(Predictor, Plotted):
 
     Made by `fit`, `adapt` and `from_arrays`. N points in all, I inputs, O outputs. Immutable, so
     that threads may share it. What is fitted depends on the database and the parameters alone, bit
-    for bit, however the primitive came about.
+    for bit, however the primitive came about; after `extended`, but for rounding.
     """
 
     solution: Solution
@@ -95,8 +95,7 @@ class KMP(Predictor, Plotted):
             inputs=s.shape[1],
             outputs=reference.outputs,
         )
-        if not isinstance(representation, str) or representation not in {"auto", "dense", "low_rank"}:
-            raise ValueError(f"representation: {representation!r} given, 'auto', 'dense' or 'low_rank' needed.")
+        one_of("representation", representation, ("auto", "dense", "low_rank"))
         whole("rank", rank)
         if positive("rank_tolerance", rank_tolerance) >= 1:
             raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
@@ -192,13 +191,31 @@ class KMP(Predictor, Plotted):
         check_pairs("reference", points.inputs, reference, self.outputs)
         database, parameters = Database(points, reference), self.solution.hyperparameters
         fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
-        if self is self.base:
-            return fitted
-        changed: Solution = fitted.solution.adapted(self.changes) if len(self.via_inputs) else fitted.solution
-        before: Solution = self.solution
-        if isinstance(before, Constrained) and isinstance(changed, Dense):
-            changed = Constrained(changed, before.constraints)
-        return KMP(changed.solved(), self.changes, fitted)
+        return self._on(fitted)
+
+    def extended(self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None) -> KMP:
+        """A new primitive that knows M points more: inputs (M, I), M normals, as `fit` takes them.
+
+        It is what `fit` would make of all points, to rounding: the dense factors grow, at the cost
+        of N^2 M, where those of a new fit cost (N + M)^3; a low rank is fitted anew. Parameters,
+        via-points, the points that these replaced, and constraints stay. N of the covariance counts
+        the new points.
+
+        Raises ValueError if there is no point, and as `fit` does.
+        """
+        added = numbers("inputs", inputs, "M", self._dimensions)
+        check_some("inputs", added)
+        check_gaussians("reference", reference)
+        check_pairs("reference", added, reference, self.outputs)
+        more = Database(Functionals.checked(added, directions), reference)
+        before: Solution = self.base.solution
+        database = before.database.joined(more)
+        grown = (
+            before.extended(database)
+            if isinstance(before, Dense)
+            else solved(before.hyperparameters, database, self.representation, RANK, TOLERANCE)
+        )
+        return self._on(KMP(grown, database.unchanged()))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
@@ -227,6 +244,16 @@ class KMP(Predictor, Plotted):
             Gaussians.concatenated([before.points, desired]),
         )
         return KMP(self.solution.adapted(changes).solved(), changes, self.base)
+
+    def _on(self, fitted: KMP) -> KMP:
+        """This primitive's via-points and constraints on another base."""
+        if self is self.base:
+            return fitted
+        changed: Solution = fitted.solution.adapted(self.changes) if len(self.via_inputs) else fitted.solution
+        before: Solution = self.solution
+        if isinstance(before, Constrained) and isinstance(changed, Dense):
+            changed = Constrained(changed, before.constraints)
+        return KMP(changed.solved(), self.changes, fitted)
 
     def to_plot(self) -> Shown:
         """Its references and via-points that are values."""

@@ -1,22 +1,27 @@
 """From demonstrations to a primitive, with the hyper-parameters chosen where none are given.
 
-Chosen by leaving one demonstration out: what is learned from the others must predict it.
+Chosen by leaving one demonstration out: what is learned from the others must predict it. Or by the
+marginal likelihood of the reference.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_kind, checked_demonstrations, positive, whole
-from kmp.gaussians import Gaussians
-from kmp.gmm import GaussianMixture
+from kmp.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
+from kmp.database import Database
+from kmp.folds import Fold
+from kmp.functionals import Functionals
+from kmp.gmm import GaussianMixture, mixture_of
 from kmp.hyperparameters import checked_kernel
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel, Kernel
+from kmp.likelihood import most_likely
 from kmp.primitive import KMP
 from kmp.time_kernels import VelocityKernel
 
@@ -65,28 +70,6 @@ class Learned(Immutable):
 
 
 @dataclass(frozen=True)
-class _Fold:
-    """What is learned from all demonstrations but one, and the points of that one."""
-
-    inputs: Array
-    reference: Gaussians
-    prior_mean: Array
-    held_inputs: Array
-    held_outputs: Array
-    regression_rmse: float
-
-    def fitted(self, kernel: Kernel, lambda_mean: float, lambda_covariance: float | None) -> KMP:
-        return KMP.fit(
-            self.inputs,
-            self.reference,
-            kernel=kernel,
-            lambda_mean=lambda_mean,
-            lambda_covariance=lambda_covariance,
-            prior_mean=self.prior_mean,
-        )
-
-
-@dataclass(frozen=True)
 class _Recipe:
     """How a reference is made of demonstrations."""
 
@@ -96,34 +79,65 @@ class _Recipe:
     regularization: float
     channels: int
 
-    def reference(self, data: Sequence[tuple[Array, Array]]) -> tuple[_Fold, GaussianMixture]:
-        """The reference of all demonstrations, nothing held out, and its mixture."""
-        samples, seed = np.concatenate([np.hstack(one) for one in data]), self.seed
-        dimensions = data[0][0].shape[1]
-        mixture = GaussianMixture.fit(
-            samples,
+    def mixture(self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None) -> GaussianMixture:
+        """The mixture of all samples, from that of a few more if it is known."""
+        return mixture_of(
+            np.concatenate([np.hstack(one) for one in data]),
             components=self.components,
-            seed=seed,
+            seed=self.seed,
             regularization=self.regularization,
+            start=start,
         )
-        if dimensions == 1:
-            inputs = np.linspace(samples[:, 0].min(), samples[:, 0].max(), self.count)[:, None]
+
+    def reference(self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool) -> Fold:
+        """The reference of all demonstrations, nothing held out."""
+        samples = np.concatenate([s for s, _ in data])
+        if shown:
+            inputs = samples[np.linspace(0, len(samples) - 1, min(self.count, len(samples))).astype(int)]
+        elif samples.shape[1] == 1:
+            inputs = np.linspace(samples.min(), samples.max(), self.count)[:, None]
         else:
-            inputs = mixture.sample_inputs(self.count, dimensions=dimensions, seed=seed)
+            inputs = mixture.sample_inputs(self.count, dimensions=samples.shape[1], seed=self.seed)
         reference = mixture.regress(inputs)
         prior = reference.mean.mean(axis=0)
         prior[len(prior) // self.channels :] = 0
         nothing = np.empty((0, 0))
-        return _Fold(frozen(inputs), reference, frozen(prior), nothing, nothing, np.nan), mixture
+        return Fold(frozen(inputs), reference, frozen(prior), nothing, nothing, np.nan)
 
-    def fold(self, data: Sequence[tuple[Array, Array]], h: int) -> _Fold:
-        """The fold that holds out demonstration h."""
-        rest, mixture = self.reference([*data[:h], *data[h + 1 :]])
+    def folds(self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool) -> _Folds:
+        """Those that hold out one demonstration each, with the mixtures of the others."""
+        return _Folds(tuple(self._fold(data, h, one, shown) for h, one in enumerate(mixtures)), shown, self.channels)
+
+    def _fold(self, data: Sequence[tuple[Array, Array]], h: int, mixture: GaussianMixture, shown: bool) -> Fold:
+        rest = self.reference([*data[:h], *data[h + 1 :]], mixture, shown)
         some = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
         inputs, outputs = data[h][0][some], data[h][1][some]
         miss = (mixture.regress(inputs).mean - outputs)[:, : outputs.shape[1] // self.channels]
         rmse = float(np.sqrt((miss**2).sum(axis=1).mean()))
-        return replace(rest, held_inputs=inputs, held_outputs=outputs, regression_rmse=rmse)
+        return Fold(rest.inputs, rest.reference, rest.prior_mean, inputs, outputs, rmse)
+
+
+class _Folds(NamedTuple):
+    """The folds of all demonstrations, whose references are at inputs shown, or not."""
+
+    each: tuple[Fold, ...]
+    shown: bool
+    channels: int
+
+    @property
+    def outputs(self) -> int:
+        """Of values: rates do not count."""
+        return self.each[0].reference.outputs // self.channels
+
+    def rmses(self, kernel: Kernel, penalties: Sequence[float]) -> list[float]:
+        """Of all folds, for each penalty."""
+        each = [fold.rmses(kernel, penalties, self.outputs) for fold in self.each]
+        return [float(one) for one in np.sqrt(np.mean(np.square(each), axis=0))]
+
+    def likelihoods(self, kernel: Kernel, penalty: float, others: Sequence[float]) -> list[float]:
+        """The mean negative log likelihoods, for each lambda of the covariance."""
+        each = [fold.negative_log_likelihoods(kernel, penalty, others, self.outputs) for fold in self.each]
+        return [float(one) for one in np.mean(each, axis=0)]
 
 
 def learn(
@@ -137,18 +151,31 @@ def learn(
     lambda_mean: float | None = None,
     lambda_covariance: float | None = None,
     regularization: float = 1e-6,
+    points: Literal["auto", "shown", "drawn"] = "auto",
+    criterion: Literal["left-out", "likelihood"] = "left-out",
+    scales: Literal["each", "one"] = "each",
 ) -> Learned:
     """The primitive of demonstrations, each inputs (T, I) and outputs (T, O), and its scores.
 
-    The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs
-    (evenly spaced over time, where I is 1; drawn from the marginal else), and the primitive, whose
-    mean returns to the reference's. `regularization` [unit^2] is that of `GaussianMixture.fit`.
+    The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs, and
+    the primitive, whose mean returns to the reference's. `regularization` [unit^2] is that of
+    `GaussianMixture.fit`.
 
-    A kernel (one length for each input) and a lambda that are not given are those with the least
-    RMSE on the demonstration that is left out, over all of them; then a lambda of the covariance
-    that is not given is the one with the least negative log likelihood. `velocity`: the outputs are
-    values and then their rates over time, the kernel a VelocityKernel. What is tried follows the
-    data's units.
+    `points`: the inputs are "drawn" from the marginal as in the paper (evenly spaced over time,
+    where I is 1), or "shown", the demonstrations' own. "auto": drawn where I is 1; else those
+    with the least RMSE on what is left out, or shown where nothing is left out.
+
+    A kernel and a lambda that are not given are chosen by the `criterion`. "left-out": those with
+    the least RMSE on the demonstration that is left out, over all of them; then a lambda of the
+    covariance that is not given is the one with the least negative log likelihood there.
+    "likelihood": those of the greatest marginal likelihood of the reference (Rasmussen and Williams
+    2006, section 5.4.1), for normals of the covariance s^2 (K + lambda Sigma), s^2 the likeliest;
+    then a lambda of the covariance that is not given is N / s^2. One demonstration is enough, and
+    no scores are made. Give components enough: it takes the kinks of too few for what was shown.
+
+    `scales`: a length for "each" input, or "one" for all, over their deviations. `velocity`: the
+    outputs are values and then their rates over time, the kernel a VelocityKernel. What is tried
+    follows the data's units.
 
     Raises ValueError if shapes do not agree, a number is not finite, a parameter is out of its
     range, or there are too few samples for the components, or demonstrations for a choice.
@@ -159,100 +186,125 @@ def learn(
             positive(name, value)
     whole("count", count)
     check_kind("velocity", velocity, bool, "True or False")
+    one_of("points", points, ("auto", "shown", "drawn"))
+    one_of("criterion", criterion, ("left-out", "likelihood"))
+    one_of("scales", scales, ("each", "one"))
     if kernel is not None:
         checked_kernel(kernel).check(data[0][0].shape[1], data[0][1].shape[1])
+    elif velocity:
+        VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
     recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1)
-    full, mixture = recipe.reference(data)
+    mixture = recipe.mixture(data)
+    shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
-    folds: list[_Fold] = []
-    if kernel is None or lambda_mean is None or lambda_covariance is None:
+    plain = np.nan
+    wanted = kernel is None or lambda_mean is None or lambda_covariance is None
+    if wanted and criterion == "left-out":
         if len(data) < 2:
             raise ValueError(
                 f"{len(data)} demonstration given: at least 2 needed to choose parameters by leaving one out. "
-                "Give kernel, lambda_mean and lambda_covariance, or another demonstration."
+                'Give kernel, lambda_mean and lambda_covariance, or criterion "likelihood", or another demonstration.'
             )
-        folds = [recipe.fold(data, h) for h in range(len(data))]
-        outputs = data[0][1].shape[1] // recipe.channels
-        kernel, lambda_mean = _search(folds, recipe.channels, kernel, lambda_mean, scores)
+        mixtures = [recipe.mixture([*data[:h], *data[h + 1 :]], mixture) for h in range(len(data))]
+        asked = [shown, False] if points == "auto" and shown else [shown]
+        search = _Search(kernel, lambda_mean, scales == "one")
+        choices = [recipe.folds(data, mixtures, one) for one in asked]
+        folds, kernel, lambda_mean, scores = search.best(choices)
+        shown = folds.shown
+        plain = float(np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds.each])))
         if lambda_covariance is None:
-            tried = [_score(folds, outputs, kernel, lambda_mean, f * lambda_mean) for f in _OF_MEAN]
-            scores += tried
-            lambda_covariance = min(tried, key=lambda one: one.negative_log_likelihood or 0.0).lambda_covariance
+            lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
+    full = recipe.reference(data, mixture, shown)
+    if wanted and criterion == "likelihood":
+        start = 0.5 / _variances(full.inputs)
+        found = most_likely(
+            Database(Functionals(full.inputs), full.reference),
+            full.prior_mean,
+            kernel or (VelocityKernel(float(start[0])) if velocity else GaussianKernel(start)),
+            lambda_mean,
+            free="none" if kernel else scales,
+        )
+        kernel, lambda_mean = found.kernel, found.lambda_mean
+        lambda_covariance = lambda_covariance or len(full.inputs) / found.signal_variance
+    assert kernel is not None, "given or chosen"
+    assert lambda_mean is not None, "given or chosen"
     order = sorted(scores, key=_best_first)
-    plain = np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds])) if folds else np.nan
-    return Learned(full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), float(plain))
+    return Learned(full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), plain)
+
+
+def _variances(inputs: Array) -> Array:
+    """The variances (I,) of inputs (N, I), above 0."""
+    variances = np.var(inputs, axis=0)
+    return np.where(variances > 0, variances, variances.max() or 1.0)  # one that never changed has no length
 
 
 def _best_first(score: Score) -> tuple[float, float]:
     return score.rmse, np.inf if score.negative_log_likelihood is None else score.negative_log_likelihood
 
 
-def _search(
-    folds: Sequence[_Fold],
-    channels: int,
-    kernel: Kernel | None,
-    lambda_mean: float | None,
-    scores: list[Score],
-) -> tuple[Kernel, float]:
-    """The kernel and lambda of the least RMSE: a grid, then steps along each. Notes the scores."""
-    dimensions, outputs = folds[0].inputs.shape[1], folds[0].reference.outputs // channels
-    variances = np.var(np.concatenate([fold.held_inputs for fold in folds]), axis=0)
-    variances = np.where(variances > 0, variances, variances.max() or 1.0)  # one that never changed has no length
-    variance = float(np.mean([np.trace(fold.reference.covariance, axis1=1, axis2=2).mean() for fold in folds]))
-    variance /= folds[0].reference.outputs
-
-    def kernel_of(parameters: tuple[float, ...]) -> Kernel:
-        ell = np.exp(np.array(parameters[:-1]))
-        return kernel or (VelocityKernel(float(ell[0])) if channels == 2 else GaussianKernel(ell))
-
-    def rmse(parameters: tuple[float, ...]) -> float:
-        k = kernel_of(parameters)
-        penalty = lambda_mean or float(np.exp(parameters[-1]))
-        found = _rmse(folds, outputs, k, penalty)
-        scores.append(Score(k.ell, penalty, None, found, None))
-        return found
-
-    lengths = [0.0] if kernel else np.log(_ELLS)
-    penalties = [0.0] if lambda_mean else np.log(_LAMBDAS) - np.log(variance)
-    start = np.log(0.5 / variances)
-    grid = [(*(start + length), penalty) for length in lengths for penalty in penalties]
-    best = min((rmse(one), one) for one in grid)
-    free = ([] if kernel else list(range(dimensions))) + ([] if lambda_mean else [dimensions])
-    for _ in range(_SWEEPS):
-        for i in free:
-            for step in (np.log(_STEP), -np.log(_STEP)):
-                other = tuple(value + step * (i == n) for n, value in enumerate(best[1]))
-                best = min(best, (rmse(other), other))
-    found = best[1]
-    return kernel_of(found), lambda_mean or float(np.exp(found[-1]))
+def _likeliest(folds: _Folds, kernel: Kernel, lambda_mean: float, scores: list[Score]) -> float:
+    """The lambda of the covariance of the least negative log likelihood. Notes the scores."""
+    others = [factor * lambda_mean for factor in _OF_MEAN]
+    [rmse] = folds.rmses(kernel, [lambda_mean])
+    found = folds.likelihoods(kernel, lambda_mean, others)
+    scores += [
+        Score(kernel.ell, lambda_mean, other, rmse if np.isfinite(one) else np.inf, one)
+        for other, one in zip(others, found, strict=True)
+    ]
+    return min(zip(found, others, strict=True))[1]
 
 
-def _rmse(folds: Sequence[_Fold], outputs: int, kernel: Kernel, penalty: float) -> float:
-    squares = []
-    for fold in folds:
-        try:
-            mean = fold.fitted(kernel, penalty, penalty).mean(fold.held_inputs)
-        except ValueError:  # not solvable to working precision: no candidate
-            return np.inf
-        squares.append((((mean - fold.held_outputs)[:, :outputs]) ** 2).sum(axis=1).mean())
-    return float(np.sqrt(np.mean(squares)))
+class _Tried(NamedTuple):
+    """Parameters, log ell of each input and log lambda, and their RMSE."""
+
+    rmse: float
+    parameters: tuple[float, ...]
 
 
-def _score(folds: Sequence[_Fold], outputs: int, kernel: Kernel, penalty: float, other: float) -> Score:
-    likelihoods = []
-    for fold in folds:
-        try:
-            prediction = fold.fitted(kernel, penalty, other).predict(fold.held_inputs)
-        except ValueError:
-            return Score(kernel.ell, penalty, other, np.inf, np.inf)
-        residual = (fold.held_outputs - prediction.mean)[:, :outputs]
-        likelihoods.append(_negative_log_likelihood(residual, prediction.covariance[:, :outputs, :outputs]))
-    return Score(kernel.ell, penalty, other, _rmse(folds, outputs, kernel, penalty), float(np.mean(likelihoods)))
+@dataclass(frozen=True)
+class _Search:
+    """For the kernel and lambda of the least RMSE, of which some may be given."""
 
+    kernel: Kernel | None
+    lambda_mean: float | None
+    one_length: bool
 
-def _negative_log_likelihood(residual: Array, covariance: Array) -> float:
-    """The mean over T points [nat]: residuals (T, O), covariances (T, O, O)."""
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, residual[:, :, None])[:, :, 0]
-    log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return float(0.5 * (log_det + (white**2).sum(axis=1) + residual.shape[1] * np.log(2 * np.pi)).mean())
+    def best(self, choices: Sequence[_Folds]) -> tuple[_Folds, Kernel, float, list[Score]]:
+        """A grid for each choice of folds; for the best of them, steps along each parameter."""
+        grids: list[list[Score]] = [[] for _ in choices]
+        found = [self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)]
+        i = min(range(len(choices)), key=lambda i: found[i])
+        folds, scores, best = choices[i], grids[i], found[i]
+        dimensions = folds.each[0].inputs.shape[1]
+        lengths = [range(dimensions)] if self.one_length else [[i] for i in range(dimensions)]
+        free = ([] if self.kernel else lengths) + ([] if self.lambda_mean else [[dimensions]])
+        for _ in range(_SWEEPS):
+            for some in free:
+                for step in (np.log(_STEP), -np.log(_STEP)):
+                    other = tuple(value + step * (n in some) for n, value in enumerate(best.parameters))
+                    best = min(best, *self._tried(folds, other[:-1], [other[-1]], scores))
+        return folds, self._kernel(folds, best.parameters[:-1]), self._penalty(best.parameters[-1]), scores
+
+    def _grid(self, folds: _Folds, scores: list[Score]) -> _Tried:
+        variances = _variances(np.concatenate([fold.held_inputs for fold in folds.each]))
+        traces = [np.trace(fold.reference.covariance, axis1=1, axis2=2).mean() for fold in folds.each]
+        variance = float(np.mean(traces)) / folds.each[0].reference.outputs
+        lengths = [0.0] if self.kernel else np.log(_ELLS)
+        penalties = [0.0] if self.lambda_mean else np.log(_LAMBDAS) - np.log(variance)
+        start = np.log(0.5 / variances)
+        return min(one for n in lengths for one in self._tried(folds, tuple(start + n), penalties, scores))
+
+    def _tried(
+        self, folds: _Folds, lengths: tuple[float, ...], penalties: Sequence[float], scores: list[Score]
+    ) -> list[_Tried]:
+        kernel, values = self._kernel(folds, lengths), [self._penalty(one) for one in penalties]
+        found = folds.rmses(kernel, values)
+        scores += [Score(kernel.ell, value, None, rmse, None) for value, rmse in zip(values, found, strict=True)]
+        return [_Tried(rmse, (*lengths, one)) for rmse, one in zip(found, penalties, strict=True)]
+
+    def _kernel(self, folds: _Folds, lengths: Sequence[float]) -> Kernel:
+        ell = np.exp(np.array(lengths))
+        return self.kernel or (VelocityKernel(float(ell[0])) if folds.channels == 2 else GaussianKernel(ell))
+
+    def _penalty(self, log: float) -> float:
+        return self.lambda_mean or float(np.exp(log))

@@ -27,12 +27,12 @@ def solved(
     size = database.reference.mean.size
     if representation == "dense" or (representation == "auto" and size <= _SMALL):
         return Dense(parameters, database).solved()
-    features, residual = Features.of(parameters.kernel, database.functionals, rank=rank, tolerance=tolerance)
+    features, residual, made = Features.made(parameters.kernel, database.functionals, rank=rank, tolerance=tolerance)
     reached = len(features.pivots) >= rank
     enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
     if representation == "auto" and not enough and size <= _LARGE:
         return Dense(parameters, database).solved()
-    solution = LowRank.fit(parameters, database, features).solved()
+    solution = LowRank.fit(parameters, database, features, made=made).solved()
     if not enough:
         warnings.warn(
             f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "

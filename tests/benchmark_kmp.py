@@ -206,6 +206,21 @@ def test_adapt_beside_a_fit(benchmark, mixture, count, inserted, replaced):
     report(benchmark, replace_s, fit_s, replaced, "a fit, for an early point replaced")
 
 
+@pytest.mark.parametrize(
+    ("count", "more", "limit"), [(200, 10, 0.6), (200, 100, 1.2), (1000, 10, 0.3), (1000, 100, 0.6)]
+)
+def test_extended_beside_a_fit(benchmark, mixture, count, more, limit):
+    data, options = database(mixture, count + more), {"kernel": GaussianKernel(0.5), "lambda_mean": 2.0}
+    first = KMP.fit(data[0][:count], data[1][:count], **options, representation="dense")
+    calls = (
+        lambda: KMP.fit(*data, **options, representation="dense"),
+        lambda: first.extended(data[0][count:], data[1][count:]),
+    )
+    benchmark.pedantic(calls[1], rounds=3)
+    fit_s, extended_s = np.min([[best(one, rounds=1) for one in calls] for _ in range(4)], axis=0)
+    report(benchmark, extended_s, fit_s, limit, "a fit of all points")
+
+
 def test_fit_100_000(benchmark, large):
     primitive, took, (before, peak) = large
     r, d = primitive.solution.w.shape

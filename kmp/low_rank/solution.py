@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, ClassVar, Literal, Self
@@ -20,12 +20,11 @@ from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.linear_algebra import kron_identity
 from kmp.low_rank.conditioned import Conditioned
 from kmp.low_rank.error_bound import error_bound
-from kmp.low_rank.features import BLOCK, Features
+from kmp.low_rank.features import BLOCK, KEPT, Features
 from kmp.solution import check_resolved
 
 RANK = 400
 TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
-KEPT = 50_000_000  # numbers of features that a fit keeps, 400 MB; more are made again for each pass
 _REFINEMENTS = 2  # of W, against the rounding of the normal equations
 
 
@@ -53,8 +52,12 @@ class LowRank(Immutable):
         database: Database,
         features: Features,
         base: LowRank | None = None,
+        *,
+        made: Sequence[Array] = (),
     ) -> LowRank:
-        """The solution. Raises ValueError if the normal equations cannot be solved.
+        """The solution, of features that were `made`, or not yet.
+
+        Raises ValueError if the normal equations cannot be solved.
 
         Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
         """
@@ -66,6 +69,8 @@ class LowRank(Immutable):
         blocks = [slice(i, i + BLOCK) for i in range(0, len(points), BLOCK)]
 
         def lifted(start: int) -> Array:
+            if made:
+                return made[start // BLOCK].T.reshape(-1, c, r)
             return features(points.take(slice(start, start + BLOCK))).T.reshape(-1, c, r)
 
         z = cache(lifted) if len(points) * c * r <= KEPT else lifted

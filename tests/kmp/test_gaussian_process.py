@@ -3,28 +3,9 @@
 import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, gaussian_process_reference
+from support.shown_skills import off, two_hands
 
 SEEDS = range(4)
-
-
-def two_hands(seed, demonstrations=6, offset=0.0):
-    """Demonstrations: both hands' positions (100, 6) along a curve, a tool (100, 2) that goes with
-    them, off by so much in each demonstration.
-    """
-    random, t = np.random.default_rng(seed), np.linspace(0, 1, 100)[:, None]
-    phases, sizes = random.uniform(0, 2 * np.pi, (3, 6)), random.uniform(0.3, 1.0, (3, 6))
-    directions, turns, weights = random.normal(size=(6, 6)) / 2, random.uniform(0, 6, 6), random.normal(size=(6, 2))
-    found = []
-    for _ in range(demonstrations):
-        shifts = phases + 0.15 * random.normal(size=(3, 6))
-        hands = sum(sizes[k] / (k + 1) * np.sin((k + 1) * np.pi * t + shifts[k]) for k in range(3))
-        found.append((hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2)))
-    return found
-
-
-def off(mean, wanted):
-    """The error over the deviation of what was wanted."""
-    return np.sqrt(np.mean((mean - wanted) ** 2)) / wanted.std()
 
 
 def within(normals, wanted):

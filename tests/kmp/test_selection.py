@@ -5,23 +5,7 @@ import pytest
 
 import kmp
 from kmp import GaussianKernel, VelocityKernel
-
-
-def driven_by_hands(seed=0, count=4):
-    """Two inputs of which only the first matters, on a long way; the second jitters."""
-    random, demonstrations = np.random.default_rng(seed), []
-    for _ in range(count):
-        t = np.linspace(0, 1, 80)
-        s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
-        xi = np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1)
-        demonstrations.append((s, xi + 0.01 * random.normal(size=(80, 2))))
-    return demonstrations
-
-
-def over_time(velocity=False):
-    random, t = np.random.default_rng(0), np.linspace(0, 2, 80)
-    paths = [np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2) for _ in range(3)]
-    return [(t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths]
+from support.shown_skills import driven_by_hands, off, over_time, two_hands
 
 
 def chosen(demonstrations=None, **options):
@@ -92,3 +76,27 @@ def test_what_cannot_be_done_is_refused_with_what_could():
             chosen(**{name: 0.0})
     alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
     assert np.isnan(alone.regression_rmse)
+
+
+def test_points_of_many_inputs_are_shown_ones_where_these_predict_better():
+    *shown, (hands, tool) = two_hands(0, demonstrations=6)
+    learned = {points: chosen(shown, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
+    misses = {points: off(one.primitive.mean(hands), tool) for points, one in learned.items()}
+    assert misses["shown"] < 0.8 * misses["drawn"]
+    rmses = {points: one.scores[0].rmse for points, one in learned.items()}
+    assert rmses["auto"] == min(rmses.values())
+    samples = np.concatenate([s for s, _ in shown])
+    for points in ("shown", "auto"):
+        assert all((samples == s).all(axis=1).any() for s in learned[points].primitive.inputs)
+    assert not (samples == learned["drawn"].primitive.inputs[0]).all(axis=1).any()
+
+
+def test_points_over_time_may_be_shown_ones_too():
+    learned = chosen(over_time(), points="shown", count=30)
+    assert np.isin(learned.primitive.inputs, np.linspace(0, 2, 80)).all()
+
+
+def test_one_scale_for_all_inputs_keeps_their_lengths_over_their_deviations():
+    ell = np.asarray(chosen(scales="one").primitive.kernel.ell)
+    variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
+    assert ell[0] * variances[0] == pytest.approx(ell[1] * variances[1], rel=1e-9)

@@ -1,0 +1,40 @@
+"""Demonstrations for what learns from them: over time, by two inputs, by two hands in space."""
+
+import numpy as np
+
+
+def driven_by_hands(seed=0, count=4):
+    """Two inputs of which only the first matters, on a long way; the second jitters."""
+    random, demonstrations = np.random.default_rng(seed), []
+    for _ in range(count):
+        t = np.linspace(0, 1, 80)
+        s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
+        xi = np.stack([np.sin(5 * s[:, 0]), np.cos(4 * s[:, 0])], axis=1)
+        demonstrations.append((s, xi + 0.01 * random.normal(size=(80, 2))))
+    return demonstrations
+
+
+def over_time(velocity=False):
+    random, t = np.random.default_rng(0), np.linspace(0, 2, 80)
+    paths = [np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2) for _ in range(3)]
+    return [(t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths]
+
+
+def two_hands(seed, demonstrations=6, offset=0.0):
+    """Demonstrations: both hands' positions (100, 6) along a curve, a tool (100, 2) that goes with
+    them, off by so much in each demonstration.
+    """
+    random, t = np.random.default_rng(seed), np.linspace(0, 1, 100)[:, None]
+    phases, sizes = random.uniform(0, 2 * np.pi, (3, 6)), random.uniform(0.3, 1.0, (3, 6))
+    directions, turns, weights = random.normal(size=(6, 6)) / 2, random.uniform(0, 6, 6), random.normal(size=(6, 2))
+    found = []
+    for _ in range(demonstrations):
+        shifts = phases + 0.15 * random.normal(size=(3, 6))
+        hands = sum(sizes[k] / (k + 1) * np.sin((k + 1) * np.pi * t + shifts[k]) for k in range(3))
+        found.append((hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2)))
+    return found
+
+
+def off(mean, wanted):
+    """The error over the deviation of what was wanted."""
+    return np.sqrt(np.mean((mean - wanted) ** 2)) / wanted.std()
