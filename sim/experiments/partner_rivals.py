@@ -7,13 +7,13 @@ hands, and says the tool, in the mean scene: carried there and back by the place
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -22,8 +22,8 @@ from sim.experiments.left_out import JUDGED_HZ, LeftOut, Predicted
 from sim.experiments.results import Array
 
 MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now
-NEIGHBOURS = 8
-PROCESS_SAMPLES = 400
+PROCESS_SAMPLES, FOLDS = 400, 4
+LENGTHS, OTHERS, NOISES = (0.15, 0.3, 0.6, 1.2), (1.0, 0.3, 3.0), (0.01, 0.1, 1.0)  # of the inputs' median distance
 HMM_STATES = 6000
 CORRELATED = 0.2  # by which an HMM trusts a sample, as the next is off alike
 RESTARTS = 1e-4  # how probable it is, at each sample, that hands are anywhere in any demonstration
@@ -117,66 +117,67 @@ def linear_in_hands(shown: Sequence[Rows]) -> Predict:
 
 
 def neighbours(shown: Sequence[Rows]) -> Predict:
-    """The mean of the tools where hands were nearest, the nearer the more."""
-    known = _together(shown)
-    tree = cKDTree(known.hands)
+    """The mean of the tools where hands were nearest in each take, the nearer the more."""
+    trees = [cKDTree(one.hands) for one in shown]
 
     def predict(asked: Rows) -> Predicted:
-        off, at = tree.query(asked.hands, k=NEIGHBOURS)
-        weights = np.square(1.0 / (np.asarray(off) + 1e-3))
-        weights /= weights.sum(axis=1, keepdims=True)
-        return Predicted(np.einsum("tk,tki->ti", weights, known.tool[at]))
+        found = [tree.query(asked.hands) for tree in trees]
+        weights = np.array([1.0 / (off + OFF_PLACE_M) ** 4 for off, _ in found])
+        tools = np.array([one.tool[at] for one, (_, at) in zip(shown, found, strict=True)])
+        return Predicted(np.einsum("kt,kti->ti", weights / weights.sum(axis=0), tools))
 
     return predict
 
 
 def process(inputs: Callable[[Rows], list[Array]]) -> Learn:
-    """A Gaussian process whose kernel has a length for each group of inputs, by maximum
-    likelihood.
+    """A Gaussian process whose length for each group of inputs and noise predict shown takes best
+    from the others; its variance is scaled to the errors there.
     """
 
     def learn(shown: Sequence[Rows]) -> Predict:
         each = max(2, PROCESS_SAMPLES // len(shown))
-        some = _together([Rows(*(x[_spread(len(x), each)] for x in one)) for one in shown])
-        groups, centre = inputs(some), some.tool.mean(axis=0)
+        thin = [Rows(*(x[_spread(len(x), each)] for x in one)) for one in shown]
+        some = _together(thin)
+        groups = inputs(some)
         squares = [cdist(x, x, "sqeuclidean") for x in groups]
-        off, count = some.tool - centre, len(some.tool)
-        usual = [max(float(np.sqrt(np.median(d))), 1e-3) for d in squares]
-
-        def cost(log: Array) -> tuple[float, Array]:
-            size, noise, *lengths = np.exp(log)
-            apart = np.sum([d / ell**2 for d, ell in zip(squares, lengths, strict=True)], axis=0)
-            kernel = np.asarray(size**2 * np.exp(-0.5 * apart))
-            root = cho_factor(kernel + (noise**2 + 1e-8) * np.eye(count), lower=True)
-            weights = cho_solve(root, off)
-            outer: Array = 0.5 * (3.0 * cho_solve(root, np.eye(count)) - weights @ weights.T)
-            by_kernel = outer * kernel
-            slopes = [2.0 * by_kernel.sum(), 2.0 * noise**2 * np.trace(outer)]
-            slopes += [(by_kernel * d).sum() / ell**2 for d, ell in zip(squares, lengths, strict=True)]
-            return float(3.0 * np.log(np.diag(root[0])).sum() + 0.5 * np.sum(weights * off)), np.array(slopes)
-
-        begin = np.log([max(float(off.std()), 0.01), 0.02, *usual])
-        bounds = [(np.log(0.01), np.log(2.0)), (np.log(0.002), np.log(0.3))]
-        bounds += [(np.log(ell / 20), np.log(ell * 20)) for ell in usual]
-        found = minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40})
-        size, noise, *lengths = np.exp(found.x)
+        usual = [max(float(np.median(d)), 1e-6) for d in squares]
+        out = np.repeat(np.arange(len(thin)) % FOLDS, [len(one.tool) for one in thin])
+        tried = []
+        for length, other, noise in itertools.product(LENGTHS, OTHERS if len(groups) > 1 else OTHERS[:1], NOISES):
+            lengths = length**2 * np.array(usual) * [1.0, *[other**2] * (len(groups) - 1)]
+            known = np.exp(-0.5 * np.sum([d / square for d, square in zip(squares, lengths, strict=True)], axis=0))
+            errors, variances = [], []
+            for fold in np.unique(out):
+                rest, held = out != fold, out == fold
+                said, left = _solved(known[np.ix_(rest, rest)], some.tool[rest], noise)(known[np.ix_(held, rest)])
+                errors.append(np.sum((some.tool[held] - said) ** 2, axis=1))
+                variances.append(left)
+            off, left = np.concatenate(errors), np.concatenate(variances)
+            tried.append((float(off.mean()), lengths, noise, float(np.mean(off / left)) / 3.0))
+        _, lengths, noise, scale = min(tried, key=lambda one: one[0])
 
         def kernel(a: list[Array], b: list[Array]) -> Array:
-            apart = [cdist(x / ell, y / ell, "sqeuclidean") for x, y, ell in zip(a, b, lengths, strict=True)]
-            return np.asarray(size**2 * np.exp(-0.5 * np.sum(apart, axis=0)))
+            apart = [cdist(x, y, "sqeuclidean") / square for x, y, square in zip(a, b, lengths, strict=True)]
+            return np.asarray(np.exp(-0.5 * np.sum(apart, axis=0)))
 
-        root = cho_factor(kernel(groups, groups) + (noise**2 + 1e-8) * np.eye(count), lower=True)
-        weights = cho_solve(root, off)
+        solved = _solved(kernel(groups, groups), some.tool, noise)
 
         def predict(asked: Rows) -> Predicted:
-            rows = kernel(inputs(asked), groups)
-            variance = size**2 + noise**2 - np.sum(rows * cho_solve(root, rows.T).T, axis=1)
-            covariance = np.maximum(variance, 1e-6)[:, None, None] * np.eye(3)
-            return Predicted(rows @ weights + centre, covariance)
+            said, left = solved(kernel(inputs(asked), groups))
+            return Predicted(said, np.maximum(scale * left, 1e-6)[:, None, None] * np.eye(3))
 
         return predict
 
     return learn
+
+
+def _solved(known: Array, tool: Array, noise: float) -> Callable[[Array], tuple[Array, Array]]:
+    """A process of unit variance whose data's kernel (N, N) and outputs (N, 3) are given: from rows
+    of the kernel (M, N) to means (M, 3) and variances (M,).
+    """
+    root, centre = cho_factor(known + noise * np.eye(len(known)), lower=True), tool.mean(axis=0)
+    weights = cho_solve(root, tool - centre)
+    return lambda rows: (rows @ weights + centre, 1.0 + noise - np.sum(rows * cho_solve(root, rows.T).T, axis=1))
 
 
 def hmm(shown: Sequence[Rows]) -> Predict:

@@ -121,9 +121,10 @@ def _service(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) 
     try:
         skill = learn(demonstrations)
     except SkillError as error:
-        return [], {"refused": str(error)}
+        return [], {"refused": [str(error)]}
     figures = msgspec.json.decode(skill.figures, type=Figures)
     said: dict[str, Any] = {
+        "refused": [],
         "model": type(skill.model).__name__,
         "error_mm": figures.all.error_mm,
         "ambiguous": figures.ambiguous / 100,
@@ -135,7 +136,7 @@ def _service(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) 
         try:
             there = adapted(skill, take.demonstration.places, tolerance=TOLERANCE_M) if told else skill
         except SkillError as error:
-            said.setdefault("adaptation_refused", []).append(str(error))
+            said["refused"].append(str(error))
             continue
         out.append(judged(take, predicted(there, take)))
     return out, said
@@ -178,19 +179,16 @@ def _numbers(found: Sequence[Found]) -> dict[str, Any]:
     }
     for name in (name for name in methods if name.startswith(SERVICE)):
         said = [part.said[name] for part in found]
-        learned = [one for one in said if "refused" not in one]
-        row: dict[str, Any] = {"refused": len(said) - len(learned)}
-        reasons = [one["refused"] for one in said if "refused" in one]
-        reasons += [reason for one in learned for reason in one.get("adaptation_refused", [])]
-        row["adaptations_refused"] = sum(len(one.get("adaptation_refused", [])) for one in learned)
-        row["reasons"] = sorted({*reasons})[:2]
-        if learned:
-            row["model"] = learned[0]["model"]
-            row["learn_says_mm"] = float(np.sqrt(np.mean([one["error_mm"] ** 2 for one in learned])))
-            row["ambiguous"] = float(np.mean([one["ambiguous"] for one in learned]))
-            row["unsafe"] = sum(bool(one["unsafe"]) for one in learned)
-            row["says"] = [*learned[0]["unsafe"], *learned[0]["warnings"]]
-        out["methods"][name] |= row
+        learned = [one for one in said if "model" in one]
+        out["methods"][name] |= {
+            "refuses": out["methods"]["mean" + name.removeprefix(SERVICE)]["takes"] - out["methods"][name]["takes"],
+            "reasons": list(dict.fromkeys(reason for one in said for reason in one["refused"]))[:2],
+            "model": learned[0]["model"] if learned else None,
+            "learn_says_mm": float(np.mean([one["error_mm"] for one in learned])) if learned else None,
+            "ambiguous": float(np.mean([one["ambiguous"] for one in learned])) if learned else None,
+            "unsafe": sum(bool(one["unsafe"]) for one in learned),
+            "says": [*learned[0]["unsafe"], *learned[0]["warnings"]] if learned else [],
+        }
     return out
 
 
@@ -223,6 +221,12 @@ def _line(rows: Sequence[Judged]) -> str:
     )
 
 
+def _label(name: str, methods: dict[str, Any], ending: str) -> str:
+    """A set's name, and how often the service refuses."""
+    ours = methods[SERVICE + ending]
+    return name + f"\n(service refuses {ours['refuses']} of {ours['takes'] + ours['refuses']})" * bool(ours["refuses"])
+
+
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
@@ -237,7 +241,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
     figure, axes = plt.subplots(
-        len(panels), 1, figsize=(7.5, 1.6 + 0.33 * sum(heights)), height_ratios=heights, squeeze=False, sharex=True
+        len(panels), 1, figsize=(7.5, 1.6 + 0.36 * sum(heights)), height_ratios=heights, squeeze=False, sharex=True
     )
     for ax, (title, rows) in zip(axes[:, 0], panels, strict=True):
         for y, (_, methods, ending) in enumerate(rows):
@@ -246,9 +250,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
                 ax.plot(methods[name + ending].get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
             ours = methods[SERVICE + ending]
             ax.plot(ours.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
-            if not ours["takes"]:
-                ax.text(0, y, " service: refused", va="center", color=ADAPTED, fontsize=8)
-        ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+        ax.set_yticks(range(len(rows)), [_label(*row) for row in rows])
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
     for label, colour, marker in SHOWN.values():
