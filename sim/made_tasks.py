@@ -26,10 +26,7 @@ from sim.scene import TOOL_ORIENTATION
 from sim.script import Array
 from sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
-KINDS = (
-    *("three", "six", "twelve", "cyclic", "thrice", "path"),
-    *("heading", "one_hand", "loose", "ahead", "long"),
-)
+KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
 RATE_HZ = 50
 REST_S, LAST_S = 1.2, 1.6  # before the first motion, after the last
 AHEAD_S = 2.0
@@ -118,7 +115,7 @@ class Scene(NamedTuple):
 
 
 def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list[Take]:
-    """So many demonstrations of each of these people, one a minute or slower; another `seed` is
+    """So many demonstrations of each of these people, one every five minutes; another `seed` is
     another task of the same kind.
 
     Raises ValueError for what is not one of KINDS.
@@ -266,8 +263,6 @@ def _usual(kind: str, seed: int) -> list[Array]:
 def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> Scene:
     """A scene of the task: each place elsewhere, where arm and hands reach it."""
     sigma = random.uniform(*MOVED_M) * np.array([1.0, 1.0, 0.5])
-    follows = np.zeros(len(usual[2]), bool)
-    follows[task.stages[task.follow > 0, 2]] = True
 
     def placed(part: int, index: int, before: Array | None) -> Array:
         for _ in range(10_000):
@@ -295,7 +290,7 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
     turns = turns[task.stages[:, 0]]
     if task.carried:
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
-    elif follows.any():
+    else:
         tool = np.where(task.follow[:, None] > 0, left + CARRIED_M, tool)
     return Scene(left, right, tool, turns)
 
