@@ -1,7 +1,7 @@
 """Modelled people at the soldering bench: their habits and their trackers, and where things are.
 
-NumPy only, each from its number alone. People come in three groups that share nobody: who
-demonstrates, who parameters are chosen on, and who is tested.
+NumPy only, each from its number alone. People come in groups that share nobody: who demonstrates,
+who parameters are chosen on, who is tested, and who does the made tasks.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from sim.scene import RIGHT_FROM_OBJECT, TOOL_FROM_OBJECT
 from sim.script import Array
 
-Group: TypeAlias = Literal["demonstrations", "tuning", "test"]
-SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3}
+Group: TypeAlias = Literal["demonstrations", "tuning", "test", "made"]
+SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
 PROJECT_SEED = 2024
 LEAST_DWELL_S, MOST_DWELL_S = 0.9, 1.8
 LONGEST_LEAD_S = 2.0

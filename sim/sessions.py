@@ -4,6 +4,7 @@ tool as a teacher who knows the scene leads it. NumPy only, each from its number
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -65,13 +66,15 @@ class Session:
 
     def hands(self, times: Array) -> Array:
         """Both hands (T, 6) [m] as they are."""
-        return np.hstack([self._at(side, times)[0] for side in (0, 1)]) + sum(self._restless(times))
+        return np.hstack([along(self.legs[side], times)[0] for side in (0, 1)]) + sum(
+            restless(self.person, self.seed, times)
+        )
 
     def progress(self, times: Array) -> Array:
         """How far the task has come by each hand's way (T, 2): 0 at the start, 1 and 2 where its
         legs end.
         """
-        return np.stack([self._at(side, times)[1] for side in (0, 1)], axis=1)
+        return np.stack([along(self.legs[side], times)[1] for side in (0, 1)], axis=1)
 
     def tool(self, times: Array, *, off: Array | None = None) -> Array:
         """The tool (T, 3) [m] as a teacher leads it who knows the scene and sees how far the hands
@@ -87,7 +90,7 @@ class Session:
         ends = ends if off is None else ends + off
         shares = np.clip(np.stack([left, left - 1.0, right - 1.0], axis=1), 0.0, 1.0)
         bumps = (4.0 * shares * (1.0 - shares)) ** 2
-        with_hand = (shares[:, :1] - shares[:, 1:2]) * self._restless(times)[0][:, :3]
+        with_hand = (shares[:, :1] - shares[:, 1:2]) * restless(self.person, self.seed, times)[0][:, :3]
         return np.asarray(ends[0] + shares @ np.diff(ends, axis=0) + bumps @ np.array(TOOL_ARCS) + with_hand)
 
     def samples(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -116,29 +119,31 @@ class Session:
     def _leg_to_handover(self) -> int:
         return max(i for i, leg in enumerate(self.legs[0]) if leg.progress[1] == 1.0)
 
-    def _at(self, side: int, times: Array) -> tuple[Array, Array]:
-        legs = self.legs[side]
-        x, progress = np.tile(legs[0].start, (len(times), 1)), np.zeros(len(times))
-        for leg in legs:
-            on = times >= leg.begin_s
-            u = np.clip((times[on] - leg.begin_s) / leg.lasts_s, 0.0, 1.0)
-            grid = np.linspace(0.0, 1.0, len(leg.share))
-            share = np.interp(u, grid, leg.share)
-            off = np.stack([np.interp(u, grid, column) for column in leg.deviation.T], axis=1)
-            x[on] = leg.start + share[:, None] * (leg.end - leg.start) + off
-            done = np.clip(share, 0.0, 1.0)
-            progress[on] = leg.progress[0] + done * (leg.progress[1] - leg.progress[0])
-        return x, progress
 
-    def _restless(self, times: Array) -> tuple[Array, Array]:
-        """Sway and tremor, (T, 6) [m] each."""
-        random = np.random.default_rng([*self.seed, 2])
+def along(legs: Sequence[Leg], times: Array) -> tuple[Array, Array]:
+    """A hand that goes these legs: where it is (T, 3) [m], and the progress of the task (T,)."""
+    x, progress = np.tile(legs[0].start, (len(times), 1)), np.full(len(times), float(legs[0].progress[0]))
+    for leg in legs:
+        on = times >= leg.begin_s
+        u = np.clip((times[on] - leg.begin_s) / leg.lasts_s, 0.0, 1.0)
+        grid = np.linspace(0.0, 1.0, len(leg.share))
+        share = np.interp(u, grid, leg.share)
+        off = np.stack([np.interp(u, grid, column) for column in leg.deviation.T], axis=1)
+        x[on] = leg.start + share[:, None] * (leg.end - leg.start) + off
+        done = np.clip(share, 0.0, 1.0)
+        progress[on] = leg.progress[0] + done * (leg.progress[1] - leg.progress[0])
+    return x, progress
 
-        def waves(rms: float, low: float, high: float) -> Array:
-            hz, phases = random.uniform(low, high, (4, 1, 6)), random.uniform(0, 2 * np.pi, (4, 1, 6))
-            return np.asarray(rms * np.sqrt(0.5) * np.sin(2 * np.pi * hz * times[:, None] + phases).sum(axis=0))
 
-        return waves(self.person.sway, 0.1, 0.5), waves(self.person.tremor, 8.0, 10.0)
+def restless(who: Person, seed: Sequence[int], times: Array) -> tuple[Array, Array]:
+    """Sway and tremor of both hands, (T, 6) [m] each."""
+    random = np.random.default_rng([*seed, 2])
+
+    def waves(rms: float, low: float, high: float) -> Array:
+        hz, phases = random.uniform(low, high, (4, 1, 6)), random.uniform(0, 2 * np.pi, (4, 1, 6))
+        return np.asarray(rms * np.sqrt(0.5) * np.sin(2 * np.pi * hz * times[:, None] + phases).sum(axis=0))
+
+    return waves(who.sway, 0.1, 0.5), waves(who.tremor, 8.0, 10.0)
 
 
 def session(who: Person, number: int, *, group: Group, sigma_m: float = 0.0, moved_m: float = MOST_MOVED) -> Session:
@@ -175,7 +180,7 @@ def played(
     def go(
         side: int, at: float, lasts_s: float, ends: Array, progress: tuple[float, float], *, leg: int | None = None
     ) -> float:
-        share, deviation = _shape(who, ends, None if leg is None else who.bows[side, leg], random)
+        share, deviation = shape(who, ends, None if leg is None else who.bows[side, leg], random)
         hands[side].append(Leg(at, lasts_s, ends[0], ends[1], share, deviation, progress))
         return at + lasts_s
 
@@ -295,7 +300,7 @@ def _away(place: Array, distance_m: float, random: np.random.Generator) -> Array
             return np.asarray(there)
 
 
-def _shape(who: Person, ends: Array, bow: Array | None, random: np.random.Generator) -> tuple[Array, Array]:
+def shape(who: Person, ends: Array, bow: Array | None, random: np.random.Generator) -> tuple[Array, Array]:
     """The tables of a leg between ends (2, 3): shares of the way, and deviations from it [m]."""
     way = ends[1] - ends[0]
     length = float(np.linalg.norm(way))

@@ -107,6 +107,17 @@ def broken(kind: str) -> list[Source]:
     return found
 
 
+def partners(group: str, task: str, told: str = "") -> list[Source]:
+    """A row of a table of `partners`: ours, unless all is refused; what is refused; and rivals."""
+    found = result("partners")[group][task]["methods"]
+    ours, takes = found["service" + told], found["mean" + told]["takes"]
+    row: list[Source] = [word for word in NUMBER.findall(task) if word in WORDS]
+    if ours["takes"]:
+        row += [ours["rms_mm"], ours["shifted_rms_mm"], 100 * ours["coverage"][5], 100 * ours["held"]]
+    rivals = ("linear", "same elapsed time", "Gaussian process", "with 2 s of memory", "HMM over demonstrations")
+    return [*row, ours["refuses"], takes, *(found[name + told]["rms_mm"] for name in rivals)]
+
+
 def most(path: str, scale: float = 1.0, *, least: bool = False) -> float:
     """The largest or least of the numbers in a dictionary or list."""
     name, *keys = path.split("/")
@@ -175,6 +186,10 @@ SOURCES: dict[str, list[Source]] = {
         people("ours", "success_on_the_way"),
         people("look_up"),
         people("gaussian_process"),
+    ],
+    "| `partners`": [
+        *(partners("made", kind, ", told")[at] for at, kind in ((0, "heading"), (1, "three"))),
+        *(partners("made", kind, ", told")[-2] for kind in ("heading", "three", "cyclic")),
     ],
     "| `motion`": [
         follows("error_rms_mm", "clean")[0],
@@ -303,6 +318,17 @@ SOURCES: dict[str, list[Source]] = {
     "| paths bowed": ["10", *broken("paths bowed by 10 cm")],
     "| right hand": ["2", *broken("right hand 2 s early")],
     "| iron 10 cm": ["10", *broken("iron 10 cm elsewhere")],
+    "`partners` asks": [*("95", "2")],
+    "With `--data": ["3"],
+    "Made tasks": [
+        of("partners/demonstrators"),
+        of("partners/tested_people"),
+        *("0.05", "0.35", "5", "10", "three", "six", "twelve", "2"),
+    ],
+    "A skill is learned between": ["three"],
+    **{f"| {task} |": partners("recorded", task) for task in result("partners")["recorded"]},
+    "| give, told |": partners("recorded", "give", ", told"),
+    **{f"| `{kind}` |": partners("made", kind, ", told") for kind in result("partners")["made"]},
     "`motion`": [
         "100",
         follows("error_rms_mm", "clean")[0],

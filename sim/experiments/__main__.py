@@ -22,6 +22,7 @@ ABOUT = {
     "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
     "statistics": "100 random scenes whose places are taught, side by side with rivals, some without any demonstration",
     "people": "learned skills on modelled people who did not demonstrate, beside seven rivals told the same places",
+    "partners": "learned skills on recordings of real third hands, and on made tasks that are not soldering",
     "motion": "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
     "separation": "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
     "faults": "what happens when service, tracker, network, router, scribe or disk fail: time to rest, way, loss",
@@ -61,6 +62,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR",
         type=Path,
         help="recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and right [m]",
+    )
+    p.add_argument(
+        "--data",
+        metavar="DIR",
+        type=Path,
+        help="recorded takes for `partners`, without which it does the made tasks alone: robot_*.npz, give_P*.npz and "
+        "walk_*.npz with t [s], left, right and tool [m]",
     )
     p.add_argument(
         "--set",
@@ -106,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
-    options = Options(letters=args.letters, hands=args.hands, group=args.set, workers=args.workers, share=args.share)
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share)
     try:
         pyplot()  # what is missing is said now, not after an hour
         for name in ABOUT if args.name == "all" else [args.name]:

@@ -49,6 +49,7 @@ class Options:
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
     hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
+    data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
     group: Literal["tuning", "test"] = "test"  # of people, for `people`
     workers: int = 1  # processes
     share: float = 1.0  # of the full size, for a quick look

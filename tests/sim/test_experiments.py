@@ -186,6 +186,7 @@ def test_every_experiment_has_a_test() -> None:
     assert set(ABOUT) == {
         "faults",  # in test_faults.py
         "motion",
+        "partners",  # in test_partners.py
         "people",  # in test_people.py
         "letters",
         "promp",

@@ -1,0 +1,195 @@
+"""Takes that were left out, as the service's core sees them and predicts their tool, and what is
+judged of that.
+
+Hands go sample by sample through the core's stages `intake` and `skill`, each take from a fresh
+state. Nothing is clamped: recordings lie outside of the arm's reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from service.config import Reach, Settings
+from service.contract.records import SIDES
+from service.contract.requests import Hands, ViaPoint
+from service.core.controller import start_state
+from service.core.frame import Event, blank, frame_layout
+from service.core.intake.intake import HANDS_KNOWN, Intake
+from service.core.skill.skill import Skill, SkillStage
+from service.learning.demonstration import Demonstration
+from service.shipped import shipped_skill
+from sim.closed_loop import START_NS, hand_event
+from sim.experiments.results import Array, ExperimentError
+from sim.experiments.trials import LEVELS
+
+RATE_HZ, JUDGED_HZ = 125, 25
+LONGEST_SHIFT_S = 1.0
+FAR_M = 1e3  # the corner of a workspace that clamps nothing
+PLACE_STD_M = 0.003  # of a place that is where a take begins or ends
+
+
+class LeftOut(NamedTuple):
+    """A take: its name, whom or what it is left out with, and what intake makes of it."""
+
+    name: str
+    group: str
+    demonstration: Demonstration
+    times: Array  # (T,) [s], JUDGED_HZ
+    hands: Array  # (T, 6) [m]; of one that conducts alone, twice
+    velocities: Array  # (T, 6) [m/s]
+    tool: Array  # (T, 3) [m] the teacher's
+
+
+class Predicted(NamedTuple):
+    """Means (T, 3) [m], covariances (T, 3, 3) [m²] if any are said, and where it holds (T,)."""
+
+    mean: Array
+    covariance: Array | None = None
+    held: NDArray[np.bool_] | None = None
+
+
+class Judged(NamedTuple):
+    """What is judged of a take: sums of its samples' squares [m²]; those that are inside the region
+    of each of LEVELS.
+    """
+
+    samples: int
+    squares: float
+    shifted: float  # with the time shift that makes this least
+    shift_s: float  # more than 0: the prediction is ahead of the teacher
+    worst_m: float
+    inside: tuple[int, ...] | None
+    held: int | None
+
+
+@cache
+def _settings() -> Settings:
+    reach = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
+    return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ, reach=reach)
+
+
+def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
+    """A take, once through intake."""
+    times, moving, _ = _through_core(demonstration, None)
+    stamps = (demonstration.stamps_ns - demonstration.stamps_ns[0]) * 1e-9
+    tool = np.stack([np.interp(times, stamps, column) for column in demonstration.tool[:, :3].T], axis=1)
+    return LeftOut(name, group, demonstration, times, moving[:, 0], moving[:, 1], tool)
+
+
+def predicted(skill: Skill, take: LeftOut) -> Predicted:
+    """What the core predicts of a take with a skill."""
+    return _through_core(take.demonstration, skill)[2]
+
+
+def _through_core(demonstration: Demonstration, skill: Skill | None) -> tuple[Array, Array, Predicted]:
+    """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and what a skill predicts.
+
+    While no hands are known, it holds what it predicted last.
+    """
+    settings, used = _settings(), shipped_skill() if skill is None else skill
+    used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
+    intake, stage, state = Intake(settings), SkillStage(settings, used), start_state(settings, used)
+    frame = blank(frame_layout(len(settings.joints.names)))
+    alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
+    inboxes = _inboxes(demonstration, range(2) if alone is None else [alone])
+    every = RATE_HZ // JUDGED_HZ
+    moving, means, covariances, held = [], [], [], []
+    for tick, inbox in enumerate(inboxes):
+        known = intake.step(state, frame, 1, inbox)
+        hands = state["hands"]
+        if alone is not None:
+            known = HANDS_KNOWN * bool(frame["hand_ages"][alone] < intake.stale_ticks)
+            hands = hands[[alone, alone]]
+        goes = bool(known & HANDS_KNOWN)
+        if skill is not None and goes:
+            goes = stage.step(state, frame).gate_m <= used.threshold
+        if tick % every == 0:
+            moving.append(hands[:, :2].transpose(1, 0, 2).reshape(2, 6))
+            means.append(frame["target"].copy())
+            covariances.append(frame["covariance"].copy())
+            held.append(not goes)
+    times = np.arange(len(moving)) / JUDGED_HZ
+    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), np.array(held))
+
+
+def _inboxes(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
+    """What comes of a take's hands at each tick."""
+    since = demonstration.stamps_ns - demonstration.stamps_ns[0]
+    inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * RATE_HZ) + 1)]
+    for side in sides:
+        poses = (demonstration.left, demonstration.right)[side].tolist()
+        for ns, (x, y, z, *turn) in zip(since.tolist(), poses, strict=True):
+            if (tick := int(np.ceil(ns * 1e-9 * RATE_HZ - 1e-6))) < len(inboxes):
+                inboxes[tick].append(hand_event(SIDES[side], (x, y, z), START_NS + ns, tuple(turn)))
+    return inboxes
+
+
+def judged(take: LeftOut, said: Predicted) -> Judged:
+    """What is judged of what was predicted of a take."""
+    count, errors = len(take.tool), take.tool - said.mean
+    shifted = []
+    for shift in range(-round(LONGEST_SHIFT_S * JUDGED_HZ), round(LONGEST_SHIFT_S * JUDGED_HZ) + 1):
+        if abs(shift) <= count // 2:
+            wanted = take.tool[max(0, shift) : count + min(0, shift)]
+            off = wanted - said.mean[max(0, -shift) : count - max(0, shift)]
+            shifted.append((float(np.mean(np.sum(off**2, axis=1))), abs(shift), shift))
+    least, _, shift = min(shifted)
+    inside = None
+    if said.covariance is not None:
+        squares = np.einsum("ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0])
+        inside = tuple(int((squares <= quantile).sum()) for quantile in np.asarray(chi2.ppf(LEVELS, 3)))
+    return Judged(
+        count,
+        float(np.sum(errors**2)),
+        count * least,
+        shift / JUDGED_HZ,
+        float(np.linalg.norm(errors, axis=1).max()),
+        inside,
+        None if said.held is None else int(said.held.sum()),
+    )
+
+
+def read(path: Path, *, named: bool = False) -> Demonstration:
+    """A recorded take: `.npz` with t (T,) [s], and left, right and tool (T, 3) [m]; a hand that was
+    not seen is NaN throughout, the other conducts alone then. `named`: where it begins and ends are
+    its places.
+
+    Raises ExperimentError.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            times, left, right, tool = (np.asarray(data[name], np.float64) for name in ("t", "left", "right", "tool"))
+    except (KeyError, ValueError, OSError) as error:
+        raise ExperimentError(f"{path}: not a recording of hands and tool: {error}") from None
+    conducts: Hands = "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
+    left, right = (right, right) if conducts == "right" else (left, left) if conducts == "left" else (left, right)
+    if not all(np.isfinite(part).all() for part in (times, left, right, tool)):
+        raise ExperimentError(f"{path}: holds numbers that are not finite, beside a hand that was not seen at all")
+    rows = [
+        {
+            "name": name,
+            **{part: x[i].tolist() for part, x in (("left", left), ("right", right), ("tool", tool))},
+            "std": PLACE_STD_M,
+            "radius": 0.03,
+        }
+        for name, i in (("start", 0), ("end", -1))
+    ]
+    untold = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    of_left, of_right, of_tool = (np.hstack([x, untold]) for x in (left, right, tool))
+    return Demonstration(
+        np.round(1e9 * (times - times[0] + 1.0)).astype(np.int64),
+        of_left,
+        of_right,
+        of_tool,
+        places=msgspec.convert(rows, tuple[ViaPoint, ...]) if named else (),
+        conducts=conducts,
+    )

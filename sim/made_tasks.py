@@ -1,0 +1,381 @@
+"""Made tasks that are not soldering: demonstrations of a dozen kinds of task by modelled people, in
+scenes whose places lie differently in each take. NumPy and SciPy only, each from its numbers alone.
+
+A task is a list of stages: where both hands are, and where the tool is then. A person's hands go
+from one to the next, and a teacher leads the tool as the hand that is behind has come, a little
+late.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from service.config import Reach
+from service.contract.requests import ViaPoint
+from service.learning.demonstration import Demonstration
+from sim.people import PROJECT_SEED, SEEDS, Person, person
+from sim.scene import TOOL_ORIENTATION
+from sim.script import Array
+from sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
+
+KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
+RATE_HZ = 50
+REST_S, LAST_S = 1.2, 1.6  # before the first motion, after the last
+AHEAD_S = 2.0
+MOVED_M = (0.05, 0.10)  # least and most deviation of a scene's places; half as much up and down
+TOLD_M, TOOL_SCATTER_M, TOOL_NOISE_M = 0.004, 0.0025, 0.0005  # 3-D rms; of each axis
+HAND_OFF_M = (0.005, 0.010)  # by which a person's hand always stops off its places
+HAND_SCATTER_M = 0.002  # of that, each axis, each take
+LATE_S = (0.05, 0.35)  # the teacher's reaction
+NOISE_M = (0.001, 0.002)  # of a tracker, each axis; 1.5 mm in the mean
+TURNS_RAD = (0.6, 0.15, 0.15)  # deviations of what a hand carries: yaw, pitch, roll
+GRIP_RAD, TURN_NOISE_RAD = 0.03, 0.01
+CARRIED_M = (-0.10, 0.0, 0.12)  # the tool, seen from the hand that it is fixed to or goes beside
+CURVE_M = 0.07  # how far the path that the tool follows sways to either side
+ARC_M = 0.04  # that the tool gains on its way
+SMOOTHED_S = 0.08  # of the teacher's hand
+PAUSES, STRAYS = 0.12, 0.15  # how probable a hand does so in a leg
+MARGIN_M = 0.05  # of the tool's places inside the arm's reach
+LEAST_WAY_M = 0.10  # of a hand or tool from one place to the next
+HANDS_BOX = np.array([[[0.55, -0.42, 0.07], [0.95, -0.02, 0.25]], [[0.55, 0.02, 0.07], [0.95, 0.42, 0.25]]])
+CARRYING_BOX = np.array([[0.55, -0.30, 0.07], [0.70, 0.05, 0.18]])
+TOOL_BOX = np.array([[0.35, -0.36, 0.15], [0.60, 0.36, 0.40]])
+FARTHEST = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # of a hand
+RESTS = np.array([[0.52, -0.05, 0.04], [1.00, 0.50, 0.20]])  # of a right hand that has nothing to do
+
+
+class Take(NamedTuple):
+    """Whose demonstration it is, and the demonstration."""
+
+    person: int
+    demonstration: Demonstration
+
+
+class Plan(NamedTuple):
+    """A task: of each stage its name and which of the places of left hand, right hand and tool it
+    is at; how much the tool goes with the left hand there; and how hands and tool go.
+    """
+
+    names: tuple[str, ...]
+    stages: Array  # (N, 3) of int
+    follow: Array  # (N,) 0 or 1
+    left_leads: bool = False  # the tool heeds the left hand alone
+    carried: bool = False  # the tool is fixed to what the left hand carries
+    curved: int = -1  # the stage from which the left hand goes a curve
+    ahead_s: float = 0.0
+    dwells: tuple[float, float] = (0.7, 1.6)
+
+
+def plan(kind: str) -> Plan:
+    """The task of one of KINDS."""
+    once = {"three": 3, "six": 6, "twelve": 12, "loose": 6, "ahead": 3, "heading": 3, "long": 24}
+    if kind in once:
+        count = once[kind]
+        names, stages = tuple(f"stage {i + 1}" for i in range(count)), [(i, i, i) for i in range(count)]
+    elif kind in ("cyclic", "thrice"):
+        names = ("start", "left out", "work", "left out again", "work again", "left out a third time")
+        stages = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (2, 1, 4), (1, 0, 5)]
+        names, stages = (names, stages) if kind == "thrice" else (names[:4], stages[:4])
+    elif kind == "path":
+        names, stages = ("start", "path begins", "path ends"), [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
+    elif kind == "one_hand":
+        names, stages = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
+    else:
+        raise ValueError(f"{kind!r}: no kind of made task; there are {', '.join(KINDS)}")
+    follow = {"path": [0.0, 1.0, 1.0], "heading": [1.0] * 3}.get(kind, [0.0] * len(names))
+    return Plan(
+        names,
+        np.array(stages),
+        np.array(follow),
+        left_leads=kind in ("path", "heading", "one_hand"),
+        carried=kind == "heading",
+        curved=1 if kind == "path" else -1,
+        ahead_s=AHEAD_S if kind == "ahead" else 0.0,
+        dwells=(4.5, 7.0) if kind == "long" else (0.7, 1.6),
+    )
+
+
+class Scene(NamedTuple):
+    """Where hands and tool are at each stage (N, 3) [m], and how what the left hand carries is
+    turned (N, 3): yaw, pitch and roll [rad].
+    """
+
+    left: Array
+    right: Array
+    tool: Array
+    turns: Array
+
+
+def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list[Take]:
+    """So many demonstrations of each of these people, one every five minutes; another `seed` is
+    another task of the same kind.
+
+    Raises ValueError for what is not one of KINDS.
+    """
+    return [Take(who, run(kind, who, number, seed=seed).demonstration()) for who in people for number in range(each)]
+
+
+def run(kind: str, who: int, number: int, *, seed: int = 0) -> Run:
+    """How a person does a task once."""
+    task, usual = plan(kind), _usual(kind, seed)
+    key = (PROJECT_SEED, SEEDS["made"], KINDS.index(kind), seed, who, number + 1)
+    random = np.random.default_rng(key)
+    habits = person("made", who)
+    habits = habits._replace(tremor=0.4 * habits.tremor, lead_s=task.ahead_s or 0.2 * habits.lead_s)
+    scene = _moved(task, usual, random)
+    right_rests = _within(RESTS, random)
+    if kind == "one_hand":  # where it rests says nothing
+        scene = scene._replace(right=np.tile(right_rests, (len(task.names), 1)))
+    order = _order(len(task.names), random) if kind == "loose" else [(i, False) for i in range(len(task.names))]
+    return Run(
+        task, scene, habits, who, tuple(stage for stage, _ in order), key, _legs(task, scene, habits, order, key)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A person's way through a task."""
+
+    task: Plan
+    scene: Scene
+    habits: Person
+    number: int
+    order: tuple[int, ...]  # of the stages
+    key: tuple[int, ...]
+    legs: tuple[tuple[Leg, ...], tuple[Leg, ...]]
+
+    @property
+    def lasts_s(self) -> float:
+        """From begin to end."""
+        return max(legs[-1].begin_s + legs[-1].lasts_s for legs in self.legs) + LAST_S
+
+    def hands(self, times: Array) -> Array:
+        """Both hands (T, 6) [m] as they are."""
+        sway, tremor = restless(self.habits, self.key, times)
+        return np.hstack([along(legs, times)[0] for legs in self.legs]) + sway + tremor
+
+    def tool(self, times: Array) -> tuple[Array, Array]:
+        """The tool (T, 3) [m] at evenly spaced times as the teacher leads it, and how what the left
+        hand carries was turned then (T, 3).
+        """
+        random = np.random.default_rng([*self.key, 3])
+        late = times - random.uniform(*LATE_S)
+        (left, by_left), (_, by_right) = (along(legs, late) for legs in self.legs)
+        rate_hz = 1.0 / float(times[1] - times[0])
+        progress = by_left if self.task.left_leads else np.minimum(by_left, by_right)
+        progress = gaussian_filter1d(progress, SMOOTHED_S * rate_hz, mode="nearest")
+        order = np.array(self.order)
+        nodes = np.arange(len(order))
+
+        def between(values: Array) -> Array:
+            return np.stack([np.interp(progress, nodes, column) for column in values[order].T], axis=1)
+
+        turns = between(self.scene.turns)
+        if self.task.carried:
+            return left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M), turns
+        scatter = TOOL_SCATTER_M * random.standard_normal(self.scene.tool.shape)
+        share = progress - np.floor(progress)
+        arc = np.outer(ARC_M * 64.0 * (share * (1.0 - share)) ** 3, (0.0, 0.0, 1.0))
+        follow = between(self.task.follow[:, None])
+        beside = follow * (left - between(self.scene.left))
+        return between(self.scene.tool + scatter) + arc * (1.0 - follow) + beside, turns
+
+    def demonstration(self) -> Demonstration:
+        """What a tracker and the arm make of it, with the places as they are perceived."""
+        random = np.random.default_rng([*self.key, 4])
+        habit = np.random.default_rng([*self.key[:2], self.number])
+        steps = np.arange(int(self.lasts_s * RATE_HZ))
+        times, count = steps / RATE_HZ, len(steps)
+        hands = self.hands(times) + habit.uniform(*NOISE_M) * random.standard_normal((count, 6))
+        tool, late = self.tool(times)
+        (_, by_left), _ = (along(legs, times) for legs in self.legs)
+        nodes = np.arange(len(self.order))
+        turns = np.stack([np.interp(by_left, nodes, c) for c in self.scene.turns[list(self.order)].T], axis=1)
+        grips = GRIP_RAD * habit.standard_normal((2, 3))
+        noise = TURN_NOISE_RAD * random.standard_normal((2, count, 3))
+        left = Rotation.from_euler("ZYX", turns) * Rotation.from_euler("ZYX", grips[0] + noise[0])
+        right = Rotation.from_euler("ZYX", np.array([np.pi, 0.0, 0.0]) + grips[1] + noise[1])
+        usual = Rotation.from_quat(TOOL_ORIENTATION)
+        turned = Rotation.from_euler("ZYX", late) * usual if self.task.carried else usual
+        return Demonstration(
+            steps * (1_000_000_000 // RATE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
+            np.hstack([hands[:, :3], _quaternions(left, count)]),
+            np.hstack([hands[:, 3:], _quaternions(right, count)]),
+            np.hstack([tool + TOOL_NOISE_M * random.standard_normal(tool.shape), _quaternions(turned, count)]),
+            places=self._told(random),
+        )
+
+    def _told(self, random: np.random.Generator) -> tuple[ViaPoint, ...]:
+        """The places, each off by TOLD_M; one that is visited again is seen but once."""
+        parts = []
+        for part, column in zip(self.scene[:3], self.task.stages.T, strict=True):
+            off = TOLD_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
+            parts.append(np.round(part + off[column], 6))
+        rows = [
+            {
+                "name": name,
+                **{side: at.tolist() for side, at in zip(("left", "right", "tool"), ends, strict=True)},
+                "std": 0.003,
+                "radius": 0.03,
+                "follow": "left" if follow else "none",
+            }
+            for name, follow, *ends in zip(self.task.names, self.task.follow, *parts, strict=True)
+        ]
+        return msgspec.convert(rows, tuple[ViaPoint, ...])
+
+
+def _quaternions(turned: Rotation, count: int) -> Array:
+    return np.array(np.broadcast_to(turned.as_quat(), (count, 4)))
+
+
+def _within(box: Array, random: np.random.Generator) -> Array:
+    return np.asarray(random.uniform(*box))
+
+
+def _usual(kind: str, seed: int) -> list[Array]:
+    """The usual places of left hand, right hand and tool, and turns of each of the left's."""
+    task = plan(kind)
+    random = np.random.default_rng([PROJECT_SEED, SEEDS["made"], KINDS.index(kind), seed])
+    boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
+    out = []
+    for box, column in zip(boxes, task.stages.T, strict=True):
+        found: list[Array] = []
+        apart, way = 0.16, 0.22  # from all others, and from the one before
+        while len(found) <= column.max():
+            tried = _within(box, random)
+            if all(np.linalg.norm(tried - one) > apart for one in found) and (
+                not found or np.linalg.norm(tried - found[-1]) > way
+            ):
+                found.append(tried)
+            apart, way = 0.998 * apart, 0.999 * way  # as many as there are find room
+        out.append(np.array(found))
+    return [*out, np.array(TURNS_RAD) * random.standard_normal((len(out[0]), 3))]
+
+
+def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> Scene:
+    """A scene of the task: each place elsewhere, where arm and hands reach it."""
+    sigma = random.uniform(*MOVED_M) * np.array([1.0, 1.0, 0.5])
+
+    def placed(part: int, index: int, before: Array | None) -> Array:
+        for _ in range(10_000):
+            tried = usual[part][index] + sigma * random.standard_normal(3)
+            if before is not None and np.linalg.norm(tried - before) < LEAST_WAY_M:
+                continue
+            low, high = FARTHEST if part < 2 else np.array([[-1.0] * 3, [1.0] * 3])
+            carries = part == 0 and task.follow.any()
+            if (
+                ((tried >= low) & (tried <= high)).all()
+                and (part < 2 or _reached(tried))
+                and (not carries or _reached(tried + CARRIED_M))
+            ):
+                return np.asarray(tried)
+        raise ValueError(f"no room for place {index} near {usual[part][index]}")  # the boxes above leave it
+
+    parts = []
+    for part in range(3):
+        places: list[Array] = []
+        for index in range(len(usual[part])):
+            places.append(placed(part, index, places[-1] if places else None))
+        parts.append(np.array(places))
+    turns = usual[3] + np.array(TURNS_RAD) * random.standard_normal(usual[3].shape)
+    left, right, tool = (at[column] for at, column in zip(parts, task.stages.T, strict=True))
+    turns = turns[task.stages[:, 0]]
+    if task.carried:
+        tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
+    else:
+        tool = np.where(task.follow[:, None] > 0, left + CARRIED_M, tool)
+    return Scene(left, right, tool, turns)
+
+
+def _reached(tool: Array) -> bool:
+    reach = Reach()
+    away = float(np.linalg.norm(tool - reach.centre))
+    return (
+        reach.inner + MARGIN_M <= away <= reach.outer - MARGIN_M
+        and tool[0] >= reach.min_x + MARGIN_M
+        and tool[2] >= reach.min_z + MARGIN_M
+    )
+
+
+def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
+    """In which order the stages come, and whether hands break off on the way to one: as taught, or
+    with one left out, one repeated, or one interrupted.
+    """
+    order = [(i, False) for i in range(count)]
+    at, how = int(random.integers(1, count - 1)), int(random.integers(4))
+    if how == 1:
+        order.pop(at)
+    elif how == 2:
+        order[at + 1 : at + 1] = [(at - 1, False), (at, False)]
+    elif how == 3:
+        order[at] = (at, True)
+    return order
+
+
+def _legs(
+    task: Plan, scene: Scene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
+) -> tuple[tuple[Leg, ...], tuple[Leg, ...]]:
+    """Both hands' legs from stage to stage: each waits for the other but for its lead."""
+    random = np.random.default_rng([*key, 5])
+    habit = np.random.default_rng([*key[:2], key[-2], 6])
+    ends = np.stack([scene.left, scene.right])
+    for side, column in enumerate(task.stages[:, :2].T):
+        off = habit.standard_normal((len(task.names), 3))
+        off *= habit.uniform(*HAND_OFF_M, (len(off), 1)) / np.linalg.norm(off, axis=1, keepdims=True)
+        ends[side] += (off + HAND_SCATTER_M * random.standard_normal(off.shape))[column]
+    legs: tuple[list[Leg], list[Leg]] = ([], [])
+    free = [0.5, 0.5]  # when each hand is free to go
+    both = REST_S + max(who.lead_s, 0.0)
+
+    def go(
+        side: int, at: float, way: Array, progress: tuple[float, float], bow: Array | None, *, curve: bool = False
+    ) -> None:
+        length = float(np.linalg.norm(way[1] - way[0]))
+        lasts = (5.0 if curve else 0.9 + 1.6 * length) / who.speed * random.uniform(0.9, 1.1)
+        share, deviation = shape(who, way, None if bow is None else bow * min(1.0, length / 0.4), random)
+        if curve:
+            along_way = (way[1] - way[0]) / length
+            across = np.cross((0.0, 0.0, 1.0), along_way)
+            deviation = deviation + CURVE_M * np.outer(np.sin(2 * np.pi * share), across)
+        legs[side].append(Leg(at, lasts, way[0], way[1], share, deviation, progress))
+        free[side] = at + lasts
+
+    for i, ((a, _), (b, breaks)) in enumerate(itertools.pairwise(order)):
+        if breaks:  # both turn back to where they rested at first, and take it up again
+            for way, progress in (((a, 0), (i, i)), ((0, a), (i, i))):
+                for side in (0, 1):
+                    if not np.array_equal(ends[side, way[0]], ends[side, way[1]]):
+                        go(side, both, ends[side, list(way)], progress, None)
+                both = max(*free, both) + random.uniform(1.0, 2.0)
+        for side in (0, 1):
+            begin = max(free[side] + 0.1, both - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
+            if task.stages[a, side] == task.stages[b, side]:  # it stays, and is waited for by nobody
+                here = ends[side, a]
+                begin, at_once = max(free[side], begin - 0.6), np.linspace(0, 1, SHAPE_STEPS)
+                legs[side].append(Leg(begin, 0.1, here, here, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))
+                free[side] = begin + 0.1
+                continue
+            here, there, bow = ends[side, a], ends[side, b], who.bows[side, i % 2]
+            if random.random() < STRAYS and not who.lead_s > 1.0:
+                stray = here + random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.3)
+                go(side, begin, np.array([here, stray]), (i, i), None)
+                go(side, free[side] + 0.1, np.array([stray, here]), (i, i), None)
+                begin = free[side] + 0.2
+            if random.random() < PAUSES and i != task.curved:
+                half = here + random.uniform(0.35, 0.65) * (there - here)
+                go(side, begin, np.array([here, half]), (i, i + 0.5), bow)
+                go(side, free[side] + random.uniform(0.5, 1.5), np.array([half, there]), (i + 0.5, i + 1), bow)
+            else:
+                go(side, begin, np.array([here, there]), (i, i + 1), bow, curve=i == task.curved and side == 0)
+        both = max(free) + random.uniform(*task.dwells)
+        if random.random() < PAUSES:
+            both += random.uniform(1.0, 3.0)
+    return tuple(legs[0]), tuple(legs[1])
