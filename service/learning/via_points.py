@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp import ViaPointMissed
 from service.config import ToolSettings
@@ -21,6 +22,7 @@ from service.learning.skill_file import SkillError, StoredSkill, with_file
 
 MAX_GAIN = ToolSettings().max_gain
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
+TOLD_APART = 0.5  # of a hand's shares: so much more of it belongs to one place than to another
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
 
 
@@ -31,7 +33,8 @@ def adapted(
 
     Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
     tool would have to move more than `max_gain` times as far as the hands contradict each other:
-    hands at rest tremble, and the tool would shake so many times as much.
+    hands at rest tremble, and the tool would shake so many times as much. Places of a task do not
+    where it tells them apart: there a hand that trembles is at one of them all the same.
     """
     if not tolerance >= 0:
         names = [point.name for point in via_points]
@@ -40,7 +43,7 @@ def adapted(
         via_points = [_of_one(point, skill.conductor) for point in via_points]
     inputs, outputs, deviations = neighbourhoods(via_points)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
-    _check_agreement(owners, inputs, outputs, deviations, max_gain)
+    _check_agreement(owners, inputs, outputs, deviations, max_gain, _told_apart(skill, owners))
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
@@ -65,20 +68,38 @@ def _of_one(point: ViaPoint, conductor: int) -> ViaPoint:
 
 
 def _check_agreement(
-    owners: Sequence[ViaPoint], inputs: Vector, outputs: Vector, deviations: Vector, max_gain: float
+    owners: Sequence[ViaPoint],
+    inputs: Vector,
+    outputs: Vector,
+    deviations: Vector,
+    max_gain: float,
+    told_apart: NDArray[np.bool_],
 ) -> None:
     """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
-    contradict each other; `owners` are those via-points.
+    contradict each other, but for pairs (V, V) that are told apart; `owners` are those via-points.
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
     allowed = max_gain * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
-    for i, j in np.argwhere(tools > allowed)[:1].tolist():
+    for i, j in np.argwhere((tools > allowed) & ~told_apart)[:1].tolist():
         raise SkillError(
             f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
             f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
             f"{max_gain:g} times the hands' distance and what their std allow"
         )
+
+
+def _told_apart(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
+    """Which pairs (V, V) of points are of two places of the skill's task that it has inputs of
+    their own for.
+    """
+    named = np.array([point.name in skill.model.names for point in owners], bool)
+    if not named.any():
+        return np.zeros((len(owners), len(owners)), bool)
+    at = np.array([[*point.left, *point.right] for point in owners])
+    shares = skill.model.through(owners, tolerance=0.0, weight=1.0).inputs(at)
+    apart = np.abs(shares[:, None] - shares).max(axis=2) > TOLD_APART
+    return np.asarray(apart & named & named[:, None])
 
 
 def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:

@@ -188,3 +188,27 @@ def test_its_file_holds_it_exactly_and_what_does_not_fit_is_refused(between: Ski
     assert "nominal has nan" in refusal(nominal=np.full((4, 9), np.nan))
     assert "are not numbered through" in refusal(shares=np.array([[0, 2, 2], [3, 3, 4]]))
     assert "no skill has" in refusal(more=np.zeros(3))
+
+
+def test_places_near_each_other_are_taught_where_the_task_tells_them_apart(between: Skill) -> None:
+    """Hands at rest are at one place or the other, however near: the tool does not shake."""
+    model = between.model
+    assert isinstance(model, TaskParameterized)
+    at = model.nominal.at.copy()
+    one, other = 1, 2
+    corners = model.task.corners
+    for side in (0, 1):
+        here = slice(3 * side, 3 * side + 3)
+        for row in np.flatnonzero(corners[:, side] == corners[other, side]):
+            at[row, here] = at[one, here] + (0.05, 0.0, 0.02)
+    at[other, 6:] = at[one, 6:] + (0.0, 0.5, 0.0)
+    places = [
+        ViaPoint(name, tuple(row[:3]), tuple(row[3:6]), tuple(row[6:]), std=0.001)
+        for name, row in zip(model.names, at.tolist(), strict=True)
+    ]
+    taught = adapted(between, places, tolerance=0.05)
+    assert all(point.missed_by_m < 0.005 for point in in_force(taught))
+    for point in places:
+        hands = np.array([[*point.left, *point.right]])
+        steps = 1e-3 * np.concatenate([np.eye(6), -np.eye(6)])
+        assert np.linalg.norm(taught.mean(hands + steps) - taught.mean(hands), axis=1).max() < 2e-3
