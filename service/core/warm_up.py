@@ -21,6 +21,8 @@ from service.core.frame import Event, Tick, order
 from service.core.intake.intake import still_ticks
 from service.core.limiter.limiter import Limiter
 from service.core.separation.separation import Separation
+from service.core.skill import ORDER
+from service.core.skill.memory import moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
 
@@ -50,11 +52,14 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
 
 
 def _rarely(settings: Settings, urdf: str) -> None:
-    """What the loop runs only near the tool's greatest speed, and on a way out."""
+    """What the loop runs only near the tool's greatest speed, on a way out, and with a skill that
+    remembers.
+    """
     limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
     still = np.zeros(len(posture))
     limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
     Separation(settings, urdf).share(still)
+    moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), np.empty((3, 6 * (1 + ORDER))))
 
 
 def _as_sent(skill: Skill) -> Skill:

@@ -16,12 +16,14 @@ import numpy as np
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
 from service.core.frame import Vector
+from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.memory import features
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
 from service.learning.ambiguity import same_hands_m
 from service.learning.baselines import left_out, linear, look_up
-from service.learning.choice import Choice
+from service.learning.choice import CLEARLY, Choice, rms
 from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
 from service.learning.gate import CEILING_M, gate_between, nonsense
 from service.learning.judgement import Figures, HeldOut, figures, repeated
@@ -30,6 +32,7 @@ from service.learning.skill_file import HIGHEST_GATE_M, SkillError, StoredSkill,
 from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
+WORTH_M = 0.005  # by which a memory must better predict, else it is left out
 ELL, PENALTY = 5.0, 2.0  # of the paper's way, in metres
 
 
@@ -45,7 +48,7 @@ class Evidence(NamedTuple):
 
 
 Looked = TypeVar("Looked")
-LINEAR, LOOK_UP, NO_PLACES = "linear", "look-up", "without places"
+LINEAR, LOOK_UP, NO_PLACES, NO_MEMORY = "linear", "look-up", "without places", "without memory"
 Fit = Callable[[int | None], KMP]  # the primitive of all demonstrations but one, or of all
 
 
@@ -85,7 +88,7 @@ def learn(
     repeats = "".join(f"; {remark}" for remark in remarks)
     kept = [i for i in range(len(pairs)) if i not in twins]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
-    paths = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept]
+    paths, poses = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept], [pairs[i][1][:, 3:] for i in kept]
     closures = _of_each(names, closure_in_phase, demonstrations)
     if len(kept) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
@@ -110,6 +113,16 @@ def learn(
             if components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
                 fit = _from_demonstrations(paths, points, ell)
+                if ell is None and len(paths) > 1:
+                    progress("whether where the hands were tells more")
+                    past = [(features(one.hands, one.period_s, ORDER), one.tool[:, :3]) for one in demonstrations]
+                    remembering, without = _from_demonstrations(past, points, None), _errors(paths, fit)
+                    error, usual = (rms(np.concatenate(some)) for some in (_errors(past, remembering), without))
+                    if error < min(CLEARLY * usual, usual - WORTH_M):
+                        beside = {NO_MEMORY: without, **beside}
+                        fit, paths = remembering, past
+                        poses = [one.tool[:, 3:] for one in demonstrations]
+                        closures = [one.gripper for one in demonstrations]
             else:
                 fit = _from_mixture(
                     paths,
@@ -124,7 +137,7 @@ def learn(
         posed = learned_pose(
             found.inputs,
             [hands for hands, _ in paths],
-            [pairs[i][1][:, 3:] for i in kept],
+            poses,
             closures,
             names,
             points=points,
@@ -188,7 +201,12 @@ def _learned(
     held_out = list(_held_out(paths, fit, progress))
     reached = np.concatenate([one.gate_m for one in held_out])
     some = np.concatenate([one[:: max(1, len(one) // 50)] for one in hands])
-    wrong = [standard_deviations(primitive.predict(one).covariance) for one in nonsense(some)]
+    behind = some[:, 6:].reshape(len(some), -1, 2, 3)
+    swapped = behind[:, :, ::-1].reshape(len(some), -1)
+    wrong = [
+        standard_deviations(primitive.predict(np.hstack([one, was.repeat(len(one) // len(some), axis=0)])).covariance)
+        for one, was in zip(nonsense(some[:, :6]), (swapped, some[:, 6:], some[:, 6:]), strict=True)
+    ]
     calibration = _calibration(held_out) if calibrated else 1.0  # of deviations, where the ceiling is of errors
     ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
     return Learned(HandsKMP(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), hands)
@@ -234,6 +252,11 @@ def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callab
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
         predicted = fit(h if len(paths) > 1 else None).predict(hands)
         yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
+
+
+def _errors(paths: Sequence[tuple[Vector, Vector]], fit: Fit) -> list[Vector]:
+    """By how much (T, 3) [m] each demonstration is missed by what the others tell."""
+    return [tool - fit(h).mean(inputs) for h, (inputs, tool) in enumerate(paths)]
 
 
 def _calibration(held_out: Sequence[HeldOut]) -> float:

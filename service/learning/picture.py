@@ -56,7 +56,7 @@ def draw(evidence: Evidence, path: Path) -> None:
 
     hands = np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in evidence.paths])
     shown = {"held-out demonstrations": (np.concatenate([one.gate_m for one in held_out]), OFF)}
-    for (name, colour), wrong in zip(NONSENSE.items(), nonsense(hands), strict=True):
+    for (name, colour), wrong in zip(NONSENSE.items(), nonsense(hands[:, :6]), strict=True):
         shown[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.config import Settings, robot_description
 from service.core.controller import Controller, run
-from service.core.frame import Frame, Record, Tick
+from service.core.frame import Frame, Tick
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Known, Prediction, Skill, clamp
@@ -90,7 +90,7 @@ class Rival(Skill):
         stillness: Array = STILL,
         *,
         before: Known | None = None,
-        memory: Record | None = None,
+        past: Array | None = None,
     ) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
         said = self.says(hands.reshape(6), velocities.reshape(6), accelerations.reshape(6))

@@ -1,18 +1,16 @@
-"""What every model of a skill does, whichever it is; and that one which remembers has its place."""
+"""What every model of a skill does, whichever it is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from service.contract.records import Field
-from service.core.frame import Record, Vector
-from service.core.skill import MODEL_STATE
-from service.core.skill.hands_kmp import HandsKMP
+from service.core.frame import Vector
+from service.core.skill import ORDER
 from service.core.skill.model import Model, Motion
-from service.core.skill.skill import MODELS, STATE_FIELDS, Skill
+from service.core.skill.skill import MODELS, Skill
 from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from sim.scene import Scene
@@ -68,7 +66,7 @@ def test_a_covariance_that_is_known_is_handed_back_and_changes_nothing_else(skil
 
 def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
     model, velocity = skill.model, np.array([0.1, 0.2, 0.0, 0.0, -0.1, 0.2])
-    at, moves = model.moving_inputs(np.stack([hands, velocity, np.zeros(6)]), STILL[0])
+    at, moves = model.moving_inputs(np.stack([hands, velocity, np.zeros(6)]), STILL[0], np.tile(hands, (ORDER, 1)))
     assert at.shape == (model.shape[0],)
     np.testing.assert_array_equal(at, model.inputs(hands[None])[0])
     behind, ahead = model.inputs(hands + H * np.array([[-1.0], [1.0]]) * velocity)
@@ -95,7 +93,6 @@ def test_models_are_told_apart_by_their_words_and_formats() -> None:
     assert all(len({words(model) for model in MODELS}) == len(MODELS) for words in (measure, units))
     formats = [number for model in MODELS for number in model.formats]
     assert len(set(formats)) == len(formats)
-    assert STATE_FIELDS == MODEL_STATE  # the state has them, whichever model is in force
 
 
 def measure(model: type[Model]) -> str:
@@ -106,27 +103,3 @@ def measure(model: type[Model]) -> str:
 def units(model: type[Model]) -> str:
     assert "[m]" in model.units
     return model.units
-
-
-@dataclass(frozen=True, eq=False)
-class Lagging(HandsKMP):
-    """Says what the mean was when it was asked last."""
-
-    state_fields = (Field("lagged", "float64", (3,)),)
-
-    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
-        assert memory is not None
-        found = super().predict(moving, stillness, known, memory)
-        before = memory["lagged"].copy()
-        memory["lagged"] = found.position
-        return found._replace(position=before)
-
-
-def test_a_model_may_remember_in_fields_of_the_state_that_it_owns() -> None:
-    learned = decoded((RECORDINGS / FILES["HandsKMP"]).read_bytes(), origin="a recording")
-    lagging, layout = replace(learned, model=Lagging(learned.model.primitive)), Lagging.state_fields
-    state: Record = np.zeros(1, [(field.name, field.type, field.shape) for field in layout])[0]
-    one, other = learned.hands[0], learned.hands[1]
-    assert not predicted(lagging, one, np.zeros(6), memory=state).position.any()
-    was = predicted(lagging, other, np.zeros(6), memory=state).position
-    np.testing.assert_array_equal(was, predicted(learned, one, np.zeros(6)).position)

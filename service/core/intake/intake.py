@@ -223,7 +223,8 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Sets in a state of zeros what no sample has reported yet."""
-        state["tick"] = state["hand_ticks"] = state["arm_tick"] = state["arm_still_tick"] = state["sample_ticks"] = -1
+        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks"):
+            state[field] = -1
         self._estimator.begin(state)
 
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from service.contract.records import Field, Layout
+from service.contract.records import Field
 
-MODEL_STATE: Layout = ()  # what a model that remembers declares
+ORDER = 4  # filters of a hand's memory in a row: the last one tells of where it was 2 s ago, blurred by 1 s
 
 STATE = (
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample; zeros: none
     Field("orientation_covariance", "float64", (3, 3)),
     Field("closure", "float64"),
     Field("skill", "uint8", (16,)),  # digest of the skill in force, which is recorded apart
-    *MODEL_STATE,
+    Field("memory", "float64", (ORDER, 2, 3)),  # of where the left and the right hand were [m]
+    Field("memory_ticks", "int64", (2,)),  # at which each hand entered it last; -1: not yet
 )
 FRAME = (
     Field("target", "float64", (3,)),  # what the skill predicts, clamped [m]

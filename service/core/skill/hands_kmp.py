@@ -1,4 +1,4 @@
-"""The paper's skill: a KMP from where the hands are to where the tool should be."""
+"""The paper's skill: a KMP from where the hands are, or also were, to where the tool should be."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from kmp import KMP, Gaussians
 from kmp.compiled import compiled
-from service.contract.records import Layout
 from service.contract.requests import ViaPoint
-from service.core.frame import Record, Vector
+from service.core.frame import Vector
 from service.core.geometry import round_to
+from service.core.skill import ORDER
+from service.core.skill.memory import moving_features
 from service.core.skill.model import (
     COVARIANCE_ROUND_TO,
     MOTION_ROUND_TO,
@@ -28,7 +29,8 @@ from service.core.skill.via_points import neighbourhoods
 
 @dataclass(frozen=True, eq=False)
 class HandsKMP:
-    """A model whose inputs are both hands' positions (6) [m], whose outputs are the tool's (3) [m].
+    """A model whose inputs are both hands' positions (6) [m], then how far behind them rows of
+    their memory are (6 each) [m], whose outputs are the tool's (3) [m].
 
     How still a hand is makes no difference. See `Model`.
     """
@@ -39,19 +41,27 @@ class HandsKMP:
     formats: ClassVar[tuple[int, ...]] = (1, 2)
     units: ClassVar[str] = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {}
-    state_fields: ClassVar[Layout] = ()
     gripper_ell: ClassVar[float] = 1000.0  # 2 cm of a hand
-    shape: ClassVar[tuple[int, int]] = (6, 3)
     names: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def hands(self) -> Vector:
-        return self.primitive.inputs
+    def order(self) -> int:
+        """How many rows of the memory are inputs."""
+        return min(max(int(self.primitive.inputs.shape[1]) // 6 - 1, 0), ORDER)
 
-    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
+    @property
+    def shape(self) -> tuple[int, int]:
+        return 6 * (1 + self.order), 3
+
+    @property
+    def hands(self) -> Vector:
+        return self.primitive.inputs[:, :6]
+
+    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, past: Vector) -> Motion:
         """Equation (8) of Huang et al. 2019, its derivatives along the motion, and its covariance,
         which takes as long as all else.
         """
+        moving = self._moving(moving, past)
         found = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
         covariance = found.covariance if known is None else known
         assert covariance is not None
@@ -60,23 +70,33 @@ class HandsKMP:
         return Motion(out[0], out[1], out[2], out[3:], deviation)
 
     def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
-        return self.primitive.mean(hands)
+        return self.primitive.mean(self.inputs(hands))
 
     def covariances(self, hands: Vector, stillness: Vector | None = None) -> Vector:
-        return self.primitive.predict(hands).covariance
+        return self.primitive.predict(self.inputs(hands)).covariance
 
     def gates_m(self, hands: Vector) -> Vector:
         return standard_deviations(self.covariances(hands))
 
     def inputs(self, hands: Vector) -> Vector:
-        return hands
+        return np.pad(hands, ((0, 0), (0, 6 * self.order))) if self.order else hands
 
-    def moving_inputs(self, moving: Vector, stillness: Vector) -> tuple[Vector, Vector]:
+    def moving_inputs(self, moving: Vector, stillness: Vector, past: Vector) -> tuple[Vector, Vector]:
+        moving = self._moving(moving, past)
         return moving[0], moving[1]
+
+    def _moving(self, moving: Vector, past: Vector) -> Vector:
+        """The inputs of hands that move so (3, 6), and how these move (3, I)."""
+        if not self.order:
+            return moving
+        out = np.empty((3, self.shape[0]))
+        moving_features(moving, past[: self.order], out)
+        return out
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> HandsKMP:
         """Algorithm 1 of the paper."""
-        inputs, outputs, deviations = neighbourhoods(via_points)
+        hands, outputs, deviations = neighbourhoods(via_points)
+        inputs = self.inputs(hands)
         desired = Gaussians(outputs, weight * deviations[:, None, None] ** 2 * np.eye(3))
         return replace(self, primitive=self.primitive.base.adapt(inputs, desired, tolerance=tolerance))
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from kmp import KMP
 from kmp.compiled import compiled
-from service.contract.records import Layout
 from service.contract.requests import ViaPoint
-from service.core.frame import Record, Vector
+from service.core.frame import Vector
 
 MOTION_ROUND_TO = 1e6  # [1/m] micrometres, to which positions and their derivatives are rounded
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] the same for covariances
@@ -48,8 +47,6 @@ class Model(Protocol):
     """Of its primitive, as its file says them."""
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]]
     """Least, greatest and unit of the numbers in each array that it stores beside its primitive."""
-    state_fields: ClassVar[Layout]
-    """What it remembers from tick to tick: fields of the state that it owns."""
     gripper_ell: ClassVar[float]
     """[1 / (unit of the inputs)²] of a gripper's kernel: it opens and closes where hands arrive."""
 
@@ -69,15 +66,15 @@ class Model(Protocol):
     def names(self) -> tuple[str, ...]:
         """The via-points that it learned by their names."""
 
-    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
+    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, past: Vector) -> Motion:
         """The motion of the tool for hands with this position, velocity and acceleration (3, 6).
 
-        A covariance (3, 3) that is `known` is handed back; it takes long to find. `memory` is the
-        state, of which it reads and writes its own fields.
+        A covariance (3, 3) that is `known` is handed back; it takes long to find. `past` (ORDER, 6)
+        [m] is the memory of the hands, as `remember` keeps it.
         """
 
     def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
-        """The tool (T, 3) [m]."""
+        """The tool (T, 3) [m] for hands that have been where they are; so in all that follows."""
 
     def covariances(self, hands: Vector, stillness: Vector | None = None) -> Vector:
         """How sure `mean` is, (T, 3, 3) [m²]."""
@@ -88,7 +85,7 @@ class Model(Protocol):
     def inputs(self, hands: Vector) -> Vector:
         """The primitives' inputs (T, I)."""
 
-    def moving_inputs(self, moving: Vector, stillness: Vector) -> tuple[Vector, Vector]:
+    def moving_inputs(self, moving: Vector, stillness: Vector, past: Vector) -> tuple[Vector, Vector]:
         """The primitives' input (I,) for hands that move so (3, 6), and its velocity (I,)."""
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> Self:

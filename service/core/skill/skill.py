@@ -15,9 +15,11 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Reach, Settings
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.frame import Record, Vector
+from service.core.frame import Record, Vector, as_array
 from service.core.intake.hand_estimator import STILL
+from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.memory import remember
 from service.core.skill.model import Model
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.task_parameterized import TaskParameterized
@@ -129,8 +131,6 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 
 MODELS: tuple[type[Model], ...] = (HandsKMP, TaskParameterized)
 """All that a skill may predict with."""
-STATE_FIELDS = tuple(field for model in MODELS for field in model.state_fields)
-"""What skills remember from tick to tick: the state has these fields, whichever is in force."""
 
 Known: TypeAlias = tuple[Vector, Vector, float]
 """What was predicted at the newest sample of a hand: covariances of position (3, 3) [m²] and
@@ -178,30 +178,32 @@ class Skill:
         stillness: Vector = STILL,
         *,
         before: Known | None = None,
-        memory: Record | None = None,
+        past: Vector | None = None,
     ) -> Prediction:
         """The prediction for hands (2, 3) [m] that move so, and are so still (2,).
 
         Covariances take as long as all else; what was predicted just `before` may be given.
-        `memory` is the state, for a model that remembers.
+        `past` (ORDER, 2, 3) [m] is the memory of the hands; they have been there all along where it
+        is not given.
 
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
         """
-        stacked = np.empty((3, 2, 3))
+        stacked = np.empty((3 + ORDER, 2, 3))
         stacked[0], stacked[1], stacked[2] = hands, velocities, accelerations
+        stacked[3:] = hands if past is None else past
         if self.conductor is not None:
             stacked[:, 1 - self.conductor] = stacked[:, self.conductor]
             stillness = stillness[[self.conductor] * 2]
-        moving = stacked.reshape(3, 6)
-        motion = self.model.predict(moving, stillness, None if before is None else before[0], memory)
+        moving, behind = stacked[:3].reshape(3, 6), stacked[3:].reshape(ORDER, 6)
+        motion = self.model.predict(moving, stillness, None if before is None else before[0], behind)
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)
-        return Prediction(*motion, *self._beside(moving, stillness, before))
+        return Prediction(*motion, *self._beside(moving, stillness, behind, before))
 
-    def _beside(self, moving: Vector, stillness: Vector, before: Known | None) -> tuple[Turn, float]:
+    def _beside(self, moving: Vector, stillness: Vector, past: Vector, before: Known | None) -> tuple[Turn, float]:
         """The orientation, learned or constant, and the closure of the gripper."""
-        at, velocity = self.model.moving_inputs(moving, stillness)
+        at, velocity = self.model.moving_inputs(moving, stillness, past)
         turn = self.constant_turn
         if self.turn is not None:
             turn = self.turn.predict(at, velocity, covariance=None if before is None else before[1])
@@ -249,7 +251,7 @@ class SkillStage:
     """The skill in force; what it predicted at the newest sample of a hand is kept in the state."""
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
-        self.skill, self._reach = skill, settings.reach
+        self.skill, self._reach, self._period_s = skill, settings.reach, settings.period_s
 
     def adopt(self, state: Record, skill: Skill) -> None:
         """Another skill from now on."""
@@ -262,11 +264,12 @@ class SkillStage:
 
         Covariances and the gripper are predicted anew only when a sample of a hand has come.
         """
+        remember(as_array(state), self._period_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
         is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
         before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
         found = self.skill.predict(
-            hands[:, 0], hands[:, 1], hands[:, 2], state["hand_stillness"], before=before, memory=state
+            hands[:, 0], hands[:, 1], hands[:, 2], state["hand_stillness"], before=before, past=state["memory"]
         )
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.compiled import compiled
 from kmp.kernel_row import add_weighted
-from service.contract.records import Layout
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, structured
 from service.core.geometry import nearest_between, round_to
@@ -325,7 +324,6 @@ class TaskParameterized:
     formats: ClassVar[tuple[int, ...]] = (3,)
     units: ClassVar[str] = TASK_UNITS
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = TASK_RANGES
-    state_fields: ClassVar[Layout] = ()
     gripper_ell: ClassVar[float] = 60.0
 
     @property
@@ -353,7 +351,7 @@ class TaskParameterized:
         parameters = self.task.parameters(self.nominal.moved(self.via_points))
         return TaskInstance.of(self.task, parameters, self.primitive, self.errors)
 
-    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, memory: Record | None) -> Motion:
+    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, past: Vector) -> Motion:
         """Equation (8) of Huang et al. 2019, differences along the motion, scatter of errors."""
         return self.instance.motion(moving, stillness, known)
 
@@ -369,7 +367,7 @@ class TaskParameterized:
     def inputs(self, hands: Vector) -> Vector:
         return self.instance.inputs(hands)[0]
 
-    def moving_inputs(self, moving: Vector, stillness: Vector) -> tuple[Vector, Vector]:
+    def moving_inputs(self, moving: Vector, stillness: Vector, past: Vector) -> tuple[Vector, Vector]:
         return self.instance.moving_inputs(moving, stillness)
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> TaskParameterized:
