@@ -116,8 +116,10 @@ def learn(
                 if ell is None and len(paths) > 1:
                     progress("whether where the hands were tells more")
                     past = [(features(one.hands, one.period_s, ORDER), one.tool[:, :3]) for one in demonstrations]
-                    remembering, without = _from_demonstrations(past, points, None), _errors(paths, fit)
-                    error, usual = (rms(np.concatenate(some)) for some in (_errors(past, remembering), without))
+                    remembering = _from_demonstrations(past, points, None)
+                    without = [one.errors for one in _held_out(paths, fit, progress)]
+                    error = rms(np.concatenate([one.errors for one in _held_out(past, remembering, progress)]))
+                    usual = rms(np.concatenate(without))
                     if error < min(CLEARLY * usual, usual - WORTH_M):
                         beside = {NO_MEMORY: without, **beside}
                         fit, paths = remembering, past
@@ -252,11 +254,6 @@ def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callab
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
         predicted = fit(h if len(paths) > 1 else None).predict(hands)
         yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
-
-
-def _errors(paths: Sequence[tuple[Vector, Vector]], fit: Fit) -> list[Vector]:
-    """By how much (T, 3) [m] each demonstration is missed by what the others tell."""
-    return [tool - fit(h).mean(inputs) for h, (inputs, tool) in enumerate(paths)]
 
 
 def _calibration(held_out: Sequence[HeldOut]) -> float:

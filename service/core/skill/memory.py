@@ -10,10 +10,18 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
-from service.core.skill import ORDER
 
 LAG_S = 0.5  # of each: with twice as much or half, recorded partners are predicted no better
+STEP_S = 0.004  # of the filters along a demonstration: as fine as the service's own periods
 LONGEST_S = 0.1  # that passes from one step to the next: while a hand is not seen, nothing is forgotten
+
+
+@compiled
+def _follow(now: float, share: float, rows: Vector) -> None:
+    """Each of a row of filters (K,) goes a share of its way to the one before, the first to now."""
+    for row in range(len(rows)):
+        rows[row] += share * (now - rows[row])
+        now = rows[row]
 
 
 @compiled
@@ -23,14 +31,13 @@ def remember(states: Records, period_s: float) -> None:
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
-        passed_s = LONGEST_S if state.memory_ticks[side] < 0 else (state.tick - state.memory_ticks[side]) * period_s
-        share = 1.0 if state.memory_ticks[side] < 0 else 1.0 - math.exp(-min(passed_s, LONGEST_S) / LAG_S)
+        share = 1.0
+        if state.memory_ticks[side] >= 0:
+            passed_s = (state.tick - state.memory_ticks[side]) * period_s
+            share = 1.0 - math.exp(-min(passed_s, LONGEST_S) / LAG_S)
         state.memory_ticks[side] = state.tick
         for i in range(3):
-            before = state.hands[side, 0, i]
-            for row in range(ORDER):
-                state.memory[row, side, i] += share * (before - state.memory[row, side, i])
-                before = state.memory[row, side, i]
+            _follow(state.hands[side, 0, i], share, state.memory[:, side, i])
 
 
 @compiled
@@ -56,25 +63,18 @@ def moving_features(moving: Vector, memory: Vector, out: Vector) -> None:
 @compiled
 def _remembered(hands: Vector, period_s: float, order: int, steps: int, out: Vector) -> None:
     share, width = 1.0 - math.exp(-period_s / steps / LAG_S), hands.shape[1]
-    memory = np.empty((order, width))
+    memory = np.zeros((order, width))
     for t in range(len(hands)):
         for step in range(steps):
             for i in range(width):
                 now = hands[t, i]
                 if t:
                     now = hands[t - 1, i] + (step + 1) / steps * (hands[t, i] - hands[t - 1, i])
-                for row in range(order):
-                    if t == 0:
-                        memory[row, i] = now
-                    memory[row, i] += share * (now - memory[row, i])
-                    now = memory[row, i]
+                _follow(now, share if t else 1.0, memory[:, i])
         for i in range(width):
             out[t, i] = hands[t, i]
             for row in range(order):
                 out[t, (row + 1) * width + i] = memory[row, i] - hands[t, i]
-
-
-STEP_S = 0.004  # of the filters along a demonstration: as fine as the service's own periods
 
 
 def features(hands: Vector, period_s: float, order: int) -> Vector:
