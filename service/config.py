@@ -173,6 +173,12 @@ class Table(Section, frozen=True):
     half_size: tuple[Positive, Positive] = (0.45, 0.60)  # [m] along x and y
 
 
+class SkillSettings(Section, frozen=True):
+    """How the skill is followed."""
+
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # [s] by which the tool is ahead of the teacher's
+
+
 class Files(Section, frozen=True):
     """Where skills are read, and via-points, recordings and viewer files are written."""
 
@@ -201,6 +207,7 @@ class Settings(Section, frozen=True):
     obstacles: Obstacles = msgspec.field(default_factory=Obstacles)
     network: Network = msgspec.field(default_factory=Network)
     files: Files = msgspec.field(default_factory=Files)
+    skill: SkillSettings = msgspec.field(default_factory=SkillSettings)
 
     def __post_init__(self) -> None:
         if problems := list(self._problems()):

@@ -27,6 +27,7 @@ from sim.script import Array
 from sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
 KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
+TAUGHT = "visits"  # what the tutorial teaches; no experiment counts it
 RATE_HZ = 50
 REST_S, LAST_S = 1.2, 1.6  # before the first motion, after the last
 AHEAD_S = 2.0
@@ -72,6 +73,7 @@ class Plan(NamedTuple):
     curved: int = -1  # the stage from which the left hand goes a curve
     ahead_s: float = 0.0
     dwells: tuple[float, float] = (0.7, 1.6)
+    pauses: float = PAUSES  # how probable it is that a hand pauses in a leg, or both after it
 
 
 def plan(kind: str) -> Plan:
@@ -84,6 +86,9 @@ def plan(kind: str) -> Plan:
         names = ("start", "left out", "work", "left out again", "work again", "left out a third time")
         stages = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (2, 1, 4), (1, 0, 5)]
         names, stages = (names, stages) if kind == "thrice" else (names[:4], stages[:4])
+    elif kind == TAUGHT:
+        names = ("start", "tray", "work", "tray again", "done")
+        stages = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (3, 0, 4)]
     elif kind == "path":
         names, stages = ("start", "path begins", "path ends"), [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
     elif kind == "one_hand":
@@ -99,7 +104,8 @@ def plan(kind: str) -> Plan:
         carried=kind == "heading",
         curved=1 if kind == "path" else -1,
         ahead_s=AHEAD_S if kind == "ahead" else 0.0,
-        dwells=(4.5, 7.0) if kind == "long" else (0.7, 1.6),
+        dwells={"long": (4.5, 7.0), TAUGHT: (0.7, 1.1)}.get(kind, (0.7, 1.6)),
+        pauses=0.0 if kind == TAUGHT else PAUSES,  # live, a rest ends the take
     )
 
 
@@ -123,14 +129,14 @@ def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list
     return [Take(who, run(kind, who, number, seed=seed).demonstration()) for who in people for number in range(each)]
 
 
-def run(kind: str, who: int, number: int, *, seed: int = 0) -> Run:
-    """How a person does a task once."""
-    task, usual = plan(kind), _usual(kind, seed)
-    key = (PROJECT_SEED, SEEDS["made"], KINDS.index(kind), seed, who, number + 1)
+def run(kind: str, who: int, number: int, *, seed: int = 0, scene: Scene | None = None) -> Run:
+    """How a person does a task once, in a scene of its own if none is given."""
+    task = plan(kind)
+    key = (PROJECT_SEED, SEEDS["made"], (*KINDS, TAUGHT).index(kind), seed, who, number + 1)
     random = np.random.default_rng(key)
     habits = person("made", who)
     habits = habits._replace(tremor=0.4 * habits.tremor, lead_s=task.ahead_s or 0.2 * habits.lead_s)
-    scene = _moved(task, usual, random)
+    scene = scene or _moved(task, _usual(kind, seed), random)
     right_rests = _within(RESTS, random)
     if kind == "one_hand":  # where it rests says nothing
         scene = scene._replace(right=np.tile(right_rests, (len(task.names), 1)))
@@ -369,13 +375,13 @@ def _legs(
                 go(side, begin, np.array([here, stray]), (i, i), None)
                 go(side, free[side] + 0.1, np.array([stray, here]), (i, i), None)
                 begin = free[side] + 0.2
-            if random.random() < PAUSES and i != task.curved:
+            if random.random() < task.pauses and i != task.curved:
                 half = here + random.uniform(0.35, 0.65) * (there - here)
                 go(side, begin, np.array([here, half]), (i, i + 0.5), bow)
                 go(side, free[side] + random.uniform(0.5, 1.5), np.array([half, there]), (i + 0.5, i + 1), bow)
             else:
                 go(side, begin, np.array([here, there]), (i, i + 1), bow, curve=i == task.curved and side == 0)
         both = max(free) + random.uniform(*task.dwells)
-        if random.random() < PAUSES:
+        if random.random() < task.pauses:
             both += random.uniform(1.0, 3.0)
     return tuple(legs[0]), tuple(legs[1])

@@ -11,7 +11,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -26,10 +26,10 @@ from service.contract.requests import ViaPoint
 from service.demonstrations.demonstration_reader import write_demonstration
 from service.described_arm import SettingsError
 from service.learning.demonstration import Demonstration
-from sim import sessions
+from sim import made_tasks, sessions
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
-from sim.script import Clock, HandScript, Teacher
+from sim.script import Array, Clock, HandScript, Teacher
 
 RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
 EXAMPLE = """example:
@@ -38,6 +38,13 @@ EXAMPLE = """example:
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
 BEFORE_S, AFTER_S = 0.5, 3.0  # of rest
+TRAY, BESIDE = (0.95, -0.15, 0.12), (0.95, 0.35, 0.07)  # [m] where the left hand comes twice; where the right one rests
+VISITED = made_tasks.Scene(
+    np.array([(0.60, -0.30, 0.07), TRAY, (0.70, 0.02, 0.22), TRAY, (0.75, -0.42, 0.25)]),
+    np.array([BESIDE, BESIDE, (0.78, 0.20, 0.20), BESIDE, BESIDE]),
+    np.array([(0.42, -0.28, 0.35), (0.62, -0.20, 0.30), (0.50, 0.15, 0.25), (0.38, -0.05, 0.40), (0.45, 0.30, 0.22)]),
+    np.zeros((5, 3)),
+)
 
 
 def demonstrate(
@@ -118,13 +125,51 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 def perform(
     scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
 ) -> bool:
-    """Publishes one demonstration in real time, as a tracker of hands and tool would, from when
-    somebody listens to the hands until nobody does: they rest for BEFORE_S first, and AFTER_S at
-    the end.
+    """Publishes one demonstration of the soldering scene, see `publish`."""
+    script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
+
+    def poses(t: float) -> tuple[Array, ...]:
+        return (*script.sample(t), teacher.sample(t))
+
+    return publish(
+        poses, script.duration_s, BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
+    )
+
+
+def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float) -> bool:
+    """Publishes how a person does the task that visits a place twice, see `publish`."""
+    shown = visits(number)
+    times = shown.period_s * np.arange(len(shown.tool)) / speed
+
+    def poses(t: float) -> tuple[Array, ...]:
+        row = int(np.clip(np.searchsorted(times, t), 0, len(times) - 1))
+        at = ([np.interp(t, times, column) for column in part[:, :3].T] for part in shown[1:4])
+        return tuple(np.append(one, part[row, 3:]) for one, part in zip(at, shown[1:4], strict=True))
+
+    return publish(poses, float(times[-1]), BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
+
+
+def visits(number: int) -> Demonstration:
+    """The demonstration of that task of this number, from 1; each is another person's."""
+    return made_tasks.run(made_tasks.TAUGHT, number - 1, 0, scene=VISITED).demonstration()
+
+
+def publish(
+    poses: Callable[[float], Sequence[Array]],
+    lasts_s: float,
+    before_s: float,
+    *,
+    connect: Sequence[str],
+    cell: str,
+    wait_s: float,
+    rate_hz: int = 100,
+) -> bool:
+    """Publishes hands and tool in real time, as their tracker would, from when somebody listens to
+    the hands until nobody does: they rest for `before_s` first, and AFTER_S at the end. `poses` are
+    those at a time [s] from the begin, (7,) each.
 
     Whether somebody listened to its end. Raises UnreachableError.
     """
-    script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
     with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
         publishers = [session.declare_publisher(key(cell, name)) for name in names]
@@ -133,14 +178,13 @@ def perform(
             if time.monotonic() > until:
                 return False
             time.sleep(0.02)
-        before_s = BEFORE_S / speed
-        begin, step, lasts_s = time.monotonic() + before_s, 0, script.duration_s
+        begin, step = time.monotonic() + before_s, 0
         while _are_heard(of_hands):
             t = time.monotonic() - begin
             if t > lasts_s + AFTER_S:
                 return True
             stamp_ns = time.time_ns()
-            for publisher, pose in zip(publishers, (*script.sample(t), teacher.sample(t)), strict=True):
+            for publisher, pose in zip(publishers, poses(t), strict=True):
                 row = pose.tolist()
                 publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))))
             step += 1
@@ -190,6 +234,14 @@ def main(arguments: list[str] | None = None) -> int:
         action="store_true",
         help="by modelled people, two of each, with things moved and named: what is learned between places",
     )
+    p.add_argument(
+        "--visits",
+        action="store_true",
+        help="another task, between five named via-points, with one place visited twice; with --live or --places",
+    )
+    p.add_argument(
+        "--places", metavar="FILE", type=Path, help="with --visits: write where they are, as `record --places` takes it"
+    )
     p.add_argument("--cell", help="prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument("--gripper", action="store_true", help="tell what the gripper does, too")
     args = p.parse_args(arguments)
@@ -197,8 +249,10 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
-    if args.live == (args.output is not None):
-        p.error("--output DIR or --live needed, and one of them")
+    if [args.live, args.output is not None, args.places is not None].count(True) != 1:
+        p.error("--output DIR, --live or --places FILE needed, and one of them")
+    if args.visits == (args.output is not None) and (args.visits or args.places):
+        p.error("--visits goes with --live or --places, and --places with --visits")
     if args.live and args.people:
         p.error("--people goes with --output: people show nothing live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
@@ -206,6 +260,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
         reach = client_settings(connect=args.connect, cell=args.cell)
+        if args.places:
+            points = msgspec.json.encode({"op": "add", "points": visits(1).places})
+            args.places.write_bytes(msgspec.json.format(points) + b"\n")
+            return 0
         if args.live:
             return _perform_all(scene, args, reach)
         args.output.mkdir(parents=True, exist_ok=True)
@@ -231,9 +289,8 @@ def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) 
     """The exit code: 1 where nobody listened to the end of each."""
     seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
-        heard = perform(
-            scene, seed=1000 * seed + number, connect=reach.connect, cell=reach.cell, speed=args.speed, wait_s=args.wait
-        )
+        to = {"connect": reach.connect, "cell": reach.cell, "speed": args.speed, "wait_s": args.wait}
+        heard = perform_visits(number, **to) if args.visits else perform(scene, seed=1000 * seed + number, **to)
         if not heard:
             print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)
             return 1

@@ -188,8 +188,10 @@ SOURCES: dict[str, list[Source]] = {
         people("gaussian_process"),
     ],
     "| `partners`": [
-        *(partners("made", kind, ", told")[at] for at, kind in ((0, "heading"), (1, "three"))),
-        *(partners("made", kind, ", told")[-2] for kind in ("heading", "three", "cyclic")),
+        partners("made", "six", ", told")[1],
+        "six",
+        *(partners("made", kind, ", told")[0] for kind in ("cyclic", "heading")),
+        *(partners("made", kind, ", told")[-2] for kind in ("six", "cyclic", "heading")),
     ],
     "| `motion`": [
         follows("error_rms_mm", "clean")[0],
@@ -325,7 +327,6 @@ SOURCES: dict[str, list[Source]] = {
         of("partners/tested_people"),
         *("0.05", "0.35", "5", "10", "three", "six", "twelve", "2"),
     ],
-    "A skill is learned between": ["three"],
     **{f"| {task} |": partners("recorded", task) for task in result("partners")["recorded"]},
     "| give, told |": partners("recorded", "give", ", told"),
     **{f"| `{kind}` |": partners("made", kind, ", told") for kind in result("partners")["made"]},

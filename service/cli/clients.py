@@ -1,4 +1,4 @@
-"""`thirdhand via-points`, `hold`, `resume` and `reset`: requests to a running daemon."""
+"""`thirdhand via-points`, `stage`, `hold`, `resume`, `reset`: requests to a running daemon."""
 
 from __future__ import annotations
 
@@ -61,6 +61,14 @@ def _add(args: argparse.Namespace) -> Any:
     fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
     point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
+
+
+def stage(args: argparse.Namespace) -> int:
+    """Exit code 0 once the task is known to have come to the via-point; prints the mode then."""
+    reply = ask(args, "stage", {"name": args.name})
+    mode, reason = (reply.get(name, "") for name in ("mode", "reason"))
+    print(f"at {args.name} since tick {reply['tick']}: {in_brief(mode, reason)}")
+    return 0
 
 
 def hold(args: argparse.Namespace) -> int:

@@ -28,7 +28,7 @@ from service.described_arm import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
-    **dict.fromkeys(("via-points", "hold", "resume", "reset"), "cli.clients"),
+    **dict.fromkeys(("via-points", "stage", "hold", "resume", "reset"), "cli.clients"),
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
@@ -37,7 +37,7 @@ ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itse
 GROUPS = {
     "run": ("demo", "serve", "sim", "play"),
     "stop and go on": ("hold", "resume", "reset"),
-    "teach": ("record", "learn", "via-points"),
+    "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
     "set up": ("certificates", "completion"),
@@ -210,6 +210,9 @@ def parser() -> argparse.ArgumentParser:
     _reach(a)
     _reach(described(actions, "list", "the via-points in force", f"{example} list"))
     _reach(described(actions, "clear", "forget all via-points", f"{example} clear"))
+
+    c = _reach(command("stage", "Tells that the task has come to a via-point.", "thirdhand stage handover"))
+    c.add_argument("name", metavar="NAME", help="of a via-point of the task")
 
     c = _reach(command("status", "What a running daemon does.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")

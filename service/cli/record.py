@@ -27,6 +27,8 @@ from service.demonstrations.demonstration_files import (
 )
 from service.recording.mcap_file import RecordingError
 
+LONGEST_PERSON = 64  # letters of who demonstrates
+
 
 def record(args: argparse.Namespace) -> int:
     """Exit code 0 once a demonstration is written, or an existing one shown, trimmed or deleted."""
@@ -87,6 +89,8 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     for name, low, high in (("seconds", 1, 3600), ("wait", 0, 3600), ("rest", 0.2, 60)):
         if not low <= getattr(args, name) <= high:
             raise UsageError(f"--{name} {getattr(args, name):g}: {low:g} to {high:g} s accepted")
+    if len(args.person or "") > LONGEST_PERSON:
+        raise UsageError(f"--person of {len(args.person)} letters: up to {LONGEST_PERSON} accepted")
     path = path_of(args.folder, args.name)
     if path.exists():
         raise DemonstrationNameError(f"{path} is there already: another name needed, or --delete it first")
@@ -118,6 +122,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             until=args.until,
             rest_s=args.rest,
             conducts=args.hands,
+            person=args.person or "",
             is_ended=ended,
             wait_s=args.wait,
             longest_s=args.seconds,

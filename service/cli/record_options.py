@@ -14,6 +14,7 @@ ABOUT = (
 )
 EXAMPLE = """thirdhand record take-1
   thirdhand record take-1 --hands left
+  thirdhand record take-2 --person Ada
   thirdhand record take-1 --trim 0.3 9
   thirdhand record --list"""
 
@@ -25,6 +26,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
     hands = "that conduct the tool: of one, only it is recorded, and what is learned heeds no other"
     option(c, "--hands", None, hands, "both", choices=("both", "left", "right"))
+    person = "who demonstrates; of two or more, `learn` leaves out all takes of one at once"
+    option(c, "--person", "WHO", person)
     until = (
         "it ends with Enter or Ctrl-C, or also once hands and tool rest after they moved: all stay within 15 mm, "
         "joints within 0.02 rad (rest before and after is then left out but for 0.3 s)"

@@ -124,6 +124,7 @@ def rows(now: Status) -> dict[str, str]:
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
         if now.target_m is not None
         else f"none: it needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
+        "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
         "turned": _turned(now),
         "gripper": now.gripper + (f", {now.closure:.0%} closed is predicted" if now.closure is not None else ""),
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)

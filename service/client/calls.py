@@ -43,6 +43,10 @@ class Client:
         """Ends a fault; returns once that is in force."""
         return self._typed("reset", None, Reply)
 
+    def set_stage(self, name: str) -> Reply:
+        """Tells that the task has come to this via-point; returns once that is in force."""
+        return self._typed("stage", requests.StageRequest(name), Reply)
+
     def status(self) -> Status:
         """The daemon's status."""
         return self._typed("status", None, Status)

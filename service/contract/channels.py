@@ -117,6 +117,8 @@ CHANNELS = (
     Channel("reset", _request(requests.Nothing), "request",
             "end a fault; confirm that the arm is to leave what it stands in",
             event=EventKind(6, STRING), queryable=True),
+    Channel("stage", _request(requests.StageRequest), "request", "the task has come to a via-point, whatever it seems",
+            event=EventKind(9, STRING), queryable=True),
     Channel("fault", STRING, "recording", "what of the service itself failed", event=EventKind(7, STRING)),
     Channel("way", STRING, "recording", "postures out of a place where it was stuck", event=EventKind(8, STRING)),
     Channel("tick", TICK, "recording", "index and event kinds", rate="every tick", every=1),

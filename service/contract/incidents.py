@@ -172,6 +172,9 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "joints at their ends, or things around it, keep the tool from its target, wherever it goes"
             remedy = "a way out is looked for, and gone; where none is found it tries again for another target"
             found = _stuck(seen.stuck)
+        case Reason.AMBIGUOUS:
+            about = "two stages of the task go with the hands as they are, and the tool is elsewhere in each"
+            remedy = "go on: the hands will tell; or say it, `thirdhand stage NAME`"
         case Reason.ARM_ERROR:
             about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
             remedy = "see what blocked or pushed it, then `thirdhand reset`"
@@ -217,6 +220,9 @@ def _flag(flag: Flag) -> tuple[str, str]:
         case Flag.STUCK:
             about = "the tool has come no nearer to its target for 0.8 s; a way out is looked for"
             return about, "wait, or bring the hands elsewhere"
+        case Flag.UNSURE:
+            about = "the region that holds the right target 95 times in 100 reaches farther than 10 cm"
+            return about, "watch the tool; demonstrate more of what the hands do here"
         case _:
             assert_never(flag)
 

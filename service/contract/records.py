@@ -39,6 +39,7 @@ class Reason(enum.IntEnum):
     TWO_SOURCES = 10  # of one hand or of the arm, which contradict each other
     SERVICE = 11  # a part of the service failed; the log says which
     BLOCKED = 12  # joints at their ends or things around keep the tool from its target: it leaves, or waits
+    AMBIGUOUS = 13  # which stage of the task it is: the tool should be in one place or in another
 
 
 class Flag(enum.IntFlag):
@@ -49,6 +50,7 @@ class Flag(enum.IntFlag):
     NEAR_JOINT_LIMIT = 4
     SEPARATION = 8  # a hand, the table, a thing or the arm itself is near
     STUCK = 16  # the tool comes no nearer to its target; a way out is looked for
+    UNSURE = 32  # the tool may belong elsewhere by more than 10 cm
 
 
 class Cause(enum.IntEnum):

@@ -93,6 +93,12 @@ class SkillRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"\A\w[\w .-]*\Z", extra=_NAMES)]
 
 
+class StageRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The task has come to the via-point of this name."""
+
+    name: Name
+
+
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The empty request of hold, resume and reset."""
 
@@ -209,6 +215,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     turn_std_rad: float | None = None  # of how the target is turned; None: the skill did not learn it
     gripper: str = ""  # `open` or `closed`, as commanded; empty: the skill knows of none
     closure: float | None = None  # of the gripper as predicted, 0 to 1
+    stage: tuple[str, ...] = ()  # of the task: the via-points it comes from and goes to; empty: not known
+    stage_belief: float = 0.0  # how probable that is
     deviation_m: float | None = None  # of the hands from what the skill knows
     threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`

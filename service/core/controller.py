@@ -13,9 +13,19 @@ from typing import TypeAlias
 import numpy as np
 
 from service.config import Settings
+from service.contract import cdr
 from service.contract.records import GONE_S, Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
-from service.core.decision.decision import ALONE, FOLLOW, INSIDE, INSIDE_M, READY, STARTS_MEASURED, Decision
+from service.core.decision.decision import (
+    ALONE,
+    FOLLOW,
+    INSIDE,
+    INSIDE_M,
+    READY,
+    STARTS_MEASURED,
+    TORN,
+    Decision,
+)
 from service.core.frame import (
     Event,
     Frame,
@@ -32,12 +42,13 @@ from service.core.intake.intake import HANDS_KNOWN, Intake
 from service.core.limiter.limiter import LimiterStage
 from service.core.separation.separation import Separation
 from service.core.setpoint.setpoint import WRONG, SetpointStage
+from service.core.skill.model import Wanted
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Skill, SkillStage, Wanted
+from service.core.skill.skill import NEVER, Skill, SkillStage
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
-SEPARATED, STUCK = int(Flag.SEPARATION), int(Flag.STUCK)
+SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
 SAMPLES = ("hands/left", "hands/right", "joints/state")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -54,7 +65,7 @@ def start_state(settings: Settings, skill: Skill) -> Record:
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
     state["orientation"], state["closure"] = skill.orientation, NO_GRIPPER
-    state["skill"] = np.frombuffer(skill.digest, np.uint8)
+    state["skill"], state["trail_tick"] = np.frombuffer(skill.digest, np.uint8), NEVER
     return state
 
 
@@ -112,6 +123,7 @@ class Controller:
         lap("intake")
         known |= self._alone(frame)
         wanted = self._skill.step(state, frame) if known & HANDS_KNOWN else None
+        known |= TORN * (wanted is not None and wanted.torn)
         lap("skill")
         here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
@@ -137,6 +149,8 @@ class Controller:
                 samples.append(event)
             elif event.kind == "skill":
                 self._adopt(event.value)
+            elif event.kind == "stage":
+                self._skill.set_stage(state, cdr.decode_string(event.payload))
             else:
                 self.decision.take(state, event)
         return self.intake.step(state, frame, tick.index - int(state["tick"]), samples)
@@ -186,7 +200,7 @@ class Controller:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)
             frame["commanded"] = moved.moving
         flags = STUCK * (state["stuck"] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
-        flags |= LIMITED * (met > 0 or solution.speed_limited or moved.limited)
+        flags |= UNSURE * (state["unsure"] > 0) | LIMITED * (met > 0 or solution.speed_limited or moved.limited)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
         lap("limiter")
 

@@ -145,7 +145,6 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
 
 LEAST = 1e-9  # [m] segments nearer than this meet; [m²] shorter ones are points
 HALVINGS = 40  # of a segment, to the nearest point of a box: to 1e-12 of its length
-FLAT = 1e-6  # [m²] what a triangle's edges are taken to be longer by, as it may be none
 CAPSULE = np.dtype(
     [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]
 )
@@ -305,50 +304,6 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
     for i in range(3):
         near[6 + i] = side if i == face else 0.0
     return -least
-
-
-@compiled
-def dot_between(a: Vector, from_a: Vector, b: Vector, from_b: Vector) -> float:
-    """The inner product of the ways to two points (3,), each from another."""
-    total = 0.0
-    for i in range(3):
-        total += (a[i] - from_a[i]) * (b[i] - from_b[i])
-    return total
-
-
-@compiled
-def nearest_between(point: Vector, corners: Vector, count: int, out: Vector) -> float:
-    """Barycentric coordinates (3,), at least 0 and 1 in sum, of the point between `count` corners
-    that is nearest to a point; its distance.
-    """
-    out[:] = 0.0
-    if count == 3:
-        a, b, c = corners[0], corners[1], corners[2]
-        aa, bb, both = dot_between(b, a, b, a) + FLAT, dot_between(c, a, c, a) + FLAT, dot_between(b, a, c, a)
-        one, other = dot_between(b, a, point, a), dot_between(c, a, point, a)
-        determinant = aa * bb - both * both
-        second, third = (bb * one - both * other) / determinant, (aa * other - both * one) / determinant
-        if second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-            out[0], out[1], out[2] = 1.0 - second - third, second, third
-            square = 0.0
-            for i in range(3):
-                off = point[i] - out[0] * a[i] - second * b[i] - third * c[i]
-                square += off * off
-            return math.sqrt(square)
-    least = math.inf
-    for i in range(count):
-        for j in range(i + 1 if i + 1 < count else i, count):
-            a, b, square = corners[i], corners[j], 0.0
-            along = min(max(dot_between(point, a, b, a) / (dot_between(b, a, b, a) + FLAT), 0.0), 1.0)
-            for k in range(3):
-                off = point[k] - a[k] - along * (b[k] - a[k])
-                square += off * off
-            if square < least and (count == 1 or i != j):
-                least = square
-                out[:] = 0.0
-                out[i] = 1.0 - along
-                out[j] += along
-    return math.sqrt(least)
 
 
 @compiled

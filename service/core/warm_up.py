@@ -24,7 +24,7 @@ from service.core.separation.separation import Separation
 from service.core.skill import ORDER
 from service.core.skill.memory import moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
-from service.core.skill.skill import Skill
+from service.core.skill.skill import UNTOLD, Skill
 
 FOLLOWED_TICKS = 30  # after the arm is believed
 SAMPLE_EVERY = 5  # ticks, of the hands
@@ -59,7 +59,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
     still = np.zeros(len(posture))
     limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
     Separation(settings, urdf).share(still)
-    moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), np.empty((3, 6 * (1 + ORDER))))
+    moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 
 def _as_sent(skill: Skill) -> Skill:

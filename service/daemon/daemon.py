@@ -43,6 +43,7 @@ from service.daemon.clock import (
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
+from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints, state_folder
 from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
 from service.daemon.skill_worker import SkillWorker
@@ -123,6 +124,9 @@ class Daemon:
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._own: deque[Event] = deque()  # events of the service's own: faults, ways out
+        self._saved_stage = SavedStage(settings)
+        if came_to := self._saved_stage.read(stored):
+            self._own.append(order("stage", came_to))
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
         self._notes = (0, 0)  # a second, and the number of notes in it
         self._failed_at: int | None = None
@@ -312,6 +316,10 @@ class Daemon:
                 self._scribe.supervise()
             except OSError as error:  # a lack of descriptors or memory may pass
                 errors.append(f"the scribe cannot be supervised: {error}")
+            try:
+                self._saved_stage.keep(self._controller.skill, status.stage, status.stage_belief)
+            except OSError as error:
+                errors.append(f"the stage of the task cannot be kept over a restart: {error}")
             for error_text in errors:
                 if error_text not in logged_errors:
                     logged_errors.append(error_text)

@@ -28,6 +28,7 @@ from service.contract.requests import (
     Reply,
     RequestError,
     SkillRequest,
+    StageRequest,
     ViaPoint,
     encode_json,
 )
@@ -226,6 +227,8 @@ class Queryables:
         match request:
             case SkillRequest(name):
                 return self._load(name)
+            case StageRequest(name):
+                return self._set_stage(name)
             case List():
                 return Reply(int(self._frame()["tick"]), self._in_force)
             case Add() | Remove() | Clear():
@@ -255,6 +258,14 @@ class Queryables:
         elif suffix == "resume" and mode is Mode.FAULT:
             note = "a fault is ended by reset, not by resume"
         return Reply(tick, mode=word(mode), reason=word(reason), note=note)
+
+    def _set_stage(self, name: str) -> Reply:
+        if name not in (names := self._skill.model.names):
+            known = ", ".join(names) or "none, as the skill was not learned between via-points"
+            raise RequestError(f"$.name: no via-point {name!r} of the task. There are: {known}")
+        tick = self._through_the_loop(order("stage", name))
+        mode, reason = outcome(self._frame())
+        return Reply(tick, mode=word(mode), reason=word(reason))
 
     def _through_the_loop(self, event: Event) -> int:
         pending = PendingEvent(event)

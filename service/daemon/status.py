@@ -79,6 +79,8 @@ class CellStatus(NamedTuple):
             turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
+            stage=skill.model.names[frame["stage"] : frame["stage"] + 2] if frame["stage_belief"] else (),
+            stage_belief=round(float(frame["stage_belief"]), 3),
             deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,

@@ -58,8 +58,10 @@ class Sample(NamedTuple):
 class Capture:
     """The samples of one demonstration, of the hands that conduct; subscribed until closed."""
 
-    def __init__(self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both") -> None:
-        self.cell, self.settings, self.conducts = cell, settings, conducts
+    def __init__(
+        self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both", person: str = ""
+    ) -> None:
+        self.cell, self.settings, self.conducts, self.person = cell, settings, conducts, person
         self.hands = HANDS if conducts == "both" else (ENDINGS[conducts],)
         self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD if key not in HANDS or key in self.hands}
         self.malformed: dict[str, int] = {}
@@ -196,7 +198,8 @@ class Capture:
             messages.append((min(messages)[0], PLACES, text))
         with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
-            file.writer.add_metadata("thirdhand", {"cell": self.cell, "hands": self.conducts, **machine()})
+            told = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
+            file.writer.add_metadata("thirdhand", told)
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
             file.attach("arm.urdf", urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
@@ -230,6 +233,7 @@ def capture(
     until: Until,
     rest_s: float,
     conducts: Hands = "both",
+    person: str = "",
     is_ended: Callable[[], bool],
     wait_s: float,
     longest_s: float,
@@ -241,7 +245,7 @@ def capture(
 
     Raises CaptureError where they are not received within `wait_s` [s].
     """
-    captured, others = Capture(session, cell, settings, conducts), Overheard(session, *ELSEWHERE)
+    captured, others = Capture(session, cell, settings, conducts, person), Overheard(session, *ELSEWHERE)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()

@@ -109,7 +109,8 @@ def _still(demonstration: Demonstration) -> list[str]:
     found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
     moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
     return [
-        f"{name}: no more than {1000 * m:.1f} mm of motion, of which nothing is learned ({1000 * LEAST_M:g} needed)"
+        f"{name}: no more than {1000 * m:.1f} mm of motion; of takes that are all so nothing is learned "
+        f"({1000 * LEAST_M:g} needed)"
         for name, m in moved
         if m < LEAST_M
     ]
@@ -138,6 +139,8 @@ def table(found: Summary) -> str:
         f"{one.gap_at_s:.1f} s  frame {one.frame or 'not named'}"
         for one in found.streams
     ]
+    if found.demonstration.person:
+        lines.append(f"  by {found.demonstration.person}")
     if found.demonstration.places:
         lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
     lines += [f"  {remark}" for remark in found.remarks]

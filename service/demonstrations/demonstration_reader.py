@@ -45,8 +45,9 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         if stream.shape != shape or not np.isfinite(stream).all():
             raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
     with McapFile(Path(path), joints=0, attached=False) as file:
-        if demonstration.conducts != "both":
-            file.writer.add_metadata("thirdhand", {"hands": demonstration.conducts})
+        told = {"hands": demonstration.conducts, "person": demonstration.person}
+        if told := {name: word for name, word in told.items() if word not in ("both", "")}:
+            file.writer.add_metadata("thirdhand", told)
         streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for _, stream in streams), strict=True)
@@ -137,6 +138,7 @@ def read_demonstration(
         recorded.places,
         recorded.closures(stamps, logged=bool(clocks)),
         recorded.conducts,
+        recorded.person,
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from service.learning.demonstration import Demonstration
-from service.learning.tasks import FAR_M, FOLLOW, off_via_point
+from service.learning.division import FAR_M, FOLLOW, off_via_point
 
 REST_M = 0.015  # [m] motion of hands and tool at rest: trackers are noisy, and hands tremble
 DWELL_S = 0.5  # a shorter rest is a pause on the way

@@ -86,6 +86,7 @@ class Recorded:
         self.urdf = ""
         self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
         self.conducts: Hands = "both"  # which hands, in a take
+        self.person = ""  # who demonstrated, if a take says so
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
         self._is_ros_1 = self.path.suffix == ".bag"
@@ -109,8 +110,9 @@ class Recorded:
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES}"):
                 self.places = self._decoded_places(message.data)
         self.faults = messages.faults
-        told = messages.metadata.get("thirdhand", {}).get("hands", "both")
-        self.conducts = next((who for who in get_args(Hands) if who == told), "both")
+        told = messages.metadata.get("thirdhand", {})
+        self.conducts = next((who for who in get_args(Hands) if who == told.get("hands")), "both")
+        self.person = told.get("person", "")
         if "settings.json" in messages.attachments:
             try:
                 self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)

@@ -10,7 +10,7 @@ what people do differently and what nobody showed: both are scaled to those resi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 
 ELLS = 2.0 ** np.arange(-1.0, 4.0)  # [1/m²] beyond these, via-points bend everything or nothing
+NARROW = 2.0 ** np.arange(-1.0, 6.0)  # [1/m²] of more inputs than positions: hands are farther from each other there
 NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # a reference point's variance over the kernel's, for the mean
 SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # the same, for the covariance
 AS_LIKELY = 0.05  # [nat] less likely is as good: then what grows most off the data
@@ -32,6 +33,7 @@ SHARED = 0.15  # of the scatter that is everywhere the same, as few demonstratio
 REGIONS = (2.366, 7.815)  # chi-square of three degrees of freedom: the 50 and 95 % regions of a normal in space
 CLEARLY = 0.9  # a linear mean must have less than this share of a constant one's error: it extrapolates
 RIDGE_M = 0.005  # along which hands hardly moved, as trackers and fingers tremble, the tool is said to stay
+RIDGES = (RIDGE_M, 0.05)  # [m] of more inputs than positions, of which some tell nothing that others do not
 MAX_GAIN = ToolSettings().max_gain  # of a linear mean, as of the way between via-points
 NOISE_M = 0.001  # of a good tracker, each axis: demonstrations without noise tell no more of people
 DWELL = 0.25  # share of the reference points that goes by time, the rest by the hands' way
@@ -44,7 +46,7 @@ class Parameters(NamedTuple):
     noise: float  # a reference point's variance over the kernel's, for the mean
     spread: float  # the same, for the covariance
     deviation: float  # [m] standard deviation far from all data
-    is_linear: bool = False  # the prior mean
+    ridge_m: float | None = None  # of the linear prior mean; None: it is constant
 
 
 def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
@@ -57,22 +59,42 @@ def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
     return hands[kept], tool[kept]
 
 
+def in_time(inputs: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
+    """About `count` of the samples (T, I), (T, 3), evenly in time, as an error counts at any."""
+    kept = np.unique(np.linspace(0.0, len(inputs) - 1, count).round().astype(int))
+    return inputs[kept], tool[kept]
+
+
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Reference points of H demonstrations: inputs (N, 6), outputs (N, 3) [m], and owners (N,)."""
+    """Reference points of H demonstrations: inputs (N, I), outputs (N, 3) [m], and owners (N,),
+    which are left out one after the other: a demonstration, or those of a person.
+    """
 
     inputs: Vector
     outputs: Vector
     owner: NDArray[np.intp]
     alike: bool = False  # whether each point is as sure about all outputs: a covariance is found in a ninth of the time
+    even: bool = False  # whether the points are even in time, and the mean beneath chosen with the kernel
 
     @classmethod
-    def of(cls, pairs: Sequence[tuple[Vector, Vector]], points: int, *, alike: bool = False) -> Choice:
-        """About so many points of the demonstrations' hands (T, 6) and tools (T, 3) [m]."""
+    def of(
+        cls,
+        pairs: Sequence[tuple[Vector, Vector]],
+        points: int,
+        *,
+        together: NDArray[np.intp] | None = None,
+        alike: bool = False,
+        even: bool = False,
+    ) -> Choice:
+        """About so many points of the demonstrations' inputs (T, I) and tools (T, 3) [m], of which
+        those are left out `together` (H,) that have the same number; each alone, if not given.
+        """
         each = max(4, points // len(pairs))
-        parts = [thinned(hands, tool, each) for hands, tool in pairs]
-        owner = np.repeat(np.arange(len(parts), dtype=np.intp), [len(hands) for hands, _ in parts])
-        return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner, alike)
+        parts = [(in_time if even else thinned)(hands, tool, each) for hands, tool in pairs]
+        numbers = np.arange(len(parts), dtype=np.intp) if together is None else together
+        owner = np.repeat(numbers, [len(hands) for hands, _ in parts])
+        return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner, alike, even)
 
     @cached_property
     def _constant(self) -> Vector:
@@ -83,13 +105,15 @@ class Choice:
 
     @cached_property
     def _squares(self) -> Vector:
-        return np.asarray(((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2))
+        norms = (self.inputs**2).sum(axis=1)
+        squares = norms[:, None] + norms - 2.0 * self.inputs @ self.inputs.T
+        return np.asarray(np.maximum(0.5 * (squares + squares.T), 0.0))
 
-    def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
-        """Those that predict best a demonstration left out, with this ell or the best; over a
-        linear mean, where it may be, only if they do so clearly better.
+    def mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
+        """The root mean square error [m] and the parameters of the mean that predicts best a
+        demonstration left out, with this ell or the best; `spread` and `deviation` say nothing yet.
 
-        Raises SkillError for fewer than two demonstrations.
+        Raises SkillError where nothing can be left out.
         """
         count = len(np.unique(self.owner))
         if count < 2:
@@ -97,48 +121,76 @@ class Choice:
                 f"{count} demonstration given: at least 2 needed, as what is learned from the others must predict "
                 "each; record another"
             )
-        ells = ELLS if ell is None else (ell,)
-        error, ell, noise = min((rms(self.residuals(one, noise)), one, noise) for one in ells for noise in NOISES)
-        residuals, is_linear = self.residuals(ell, noise), False
-        spread = self._spread(ell, residuals)
-        if may_be_linear:
-            # The kernel's length and the spread stay: off the data the covariance grows as fast,
-            # and the gate holds what it would hold over a constant, however straight the way was.
-            least, best = min((rms(self.residuals(ell, one, is_linear=True)), one) for one in NOISES)
-            if least < CLEARLY * error:
-                noise, residuals, is_linear = best, self.residuals(ell, best, is_linear=True), True
-        unscaled = Parameters(ell, noise, spread, 1.0, is_linear)
+        ells, ridges = (NARROW, RIDGES) if self.even else (ELLS, (RIDGE_M,))
+        ells = ells if ell is None else np.array([ell])
+        constant = min(self._tried(ells, (None,)), key=lambda one: one[0])
+        if not may_be_linear:
+            return constant
+        # Of positions the kernel's length stays: off the data the covariance grows as fast, and the
+        # gate holds what it would hold over a constant, however straight the way was.
+        linear = min(self._tried(ells if self.even else np.array([constant[1].ell]), ridges), key=lambda one: one[0])
+        return linear if linear[0] < (1.0 if self.even else CLEARLY) * constant[0] else constant
+
+    def _tried(self, ells: Vector, ridges: Sequence[float | None]) -> Iterator[tuple[float, Parameters]]:
+        for ell in ells.tolist():
+            for noise in NOISES.tolist():
+                inverse = self._inverse(ell, noise)
+                for ridge_m in ridges:
+                    yield rms(self._residuals(inverse, ridge_m)), Parameters(ell, noise, 1.0, 1.0, ridge_m)
+
+    def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
+        """Those that predict best a demonstration left out, with this ell or the best; over a
+        linear mean, where it may be, only if they do so clearly better.
+
+        Raises SkillError where nothing can be left out.
+        """
+        _, unscaled = self.mean(ell, may_be_linear=may_be_linear)
+        over = unscaled if self.even or unscaled.ridge_m is None else self.mean(unscaled.ell)[1]
+        spread = self._spread(unscaled.ell, self.residuals(over.ell, over.noise, over.ridge_m))
+        unscaled = unscaled._replace(spread=spread)
+        residuals = self.residuals(unscaled.ell, unscaled.noise, unscaled.ridge_m)
         squares, floors = [], []
-        for left_out in range(count):
+        owners = np.unique(self.owner)
+        for left_out in owners.tolist():
             mine = self.owner == left_out
             found = self.primitive(unscaled, residuals, without=left_out).predict(self.inputs[mine])
             squares.append(mahalanobis(self.outputs[mine] - found.mean, found.covariance))
             floors.append(NOISE_M**2 * np.trace(np.linalg.inv(found.covariance), axis1=1, axis2=2))
         # Of H demonstrations each is predicted by H - 1 whose scatter was measured on the same few.
-        few = (count + 1) / (count - 1)
+        few = (len(owners) + 1) / (len(owners) - 1)
         scale = max(few * np.concatenate(squares).mean(), np.concatenate(floors).mean()) / 3
         return unscaled._replace(deviation=float(np.sqrt(scale)))
 
-    def residuals(self, ell: float, noise: float, *, is_linear: bool = False) -> Vector:
+    def residuals(self, ell: float, noise: float, ridge_m: float | None = None) -> Vector:
         """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""
-        inverse = np.linalg.inv(np.exp(-ell * self._squares) + noise * np.eye(len(self.inputs)))
-        weighted, out = inverse @ (self.outputs - self._constant), np.empty_like(self.outputs)
-        for h in np.unique(self.owner):
+        return self._residuals(self._inverse(ell, noise), ridge_m)
+
+    def _inverse(self, ell: float, noise: float) -> Vector:
+        return np.asarray(np.linalg.inv(np.exp(-ell * self._squares) + noise * np.eye(len(self.inputs))), np.float64)
+
+    def _residuals(self, inverse: Vector, ridge_m: float | None) -> Vector:
+        out = np.empty_like(self.outputs)
+        for h, departures in self._departures(ridge_m).items():
             mine = self.owner == h
-            if is_linear:
-                weighted = inverse @ self._departures[h]
-            out[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], weighted[mine])
+            out[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], inverse[mine] @ departures)
         return out
 
+    def _departures(self, ridge_m: float | None) -> dict[int, Vector]:
+        """By how much outputs (N, 3) depart from the mean beneath, without each demonstration."""
+        if ridge_m not in self._known:
+            owners = np.unique(self.owner).tolist()
+            self._known[ridge_m] = {h: self._departing(ridge_m, self._kept(h)) for h in owners}
+        return self._known[ridge_m]
+
     @cached_property
-    def _departures(self) -> dict[int, Vector]:
-        """By how much outputs (N, 3) depart from the linear mean without each demonstration."""
-        out = {}
-        for h in np.unique(self.owner).tolist():
-            kept = self._kept(h)
-            mean = ridge(self.inputs[kept], self.outputs[kept])
-            out[h] = self.outputs - self.inputs @ mean.matrix.T - mean.offset
-        return out
+    def _known(self) -> dict[float | None, dict[int, Vector]]:
+        return {}
+
+    def _departing(self, ridge_m: float | None, kept: NDArray[np.bool_]) -> Vector:
+        if ridge_m is None:
+            return np.asarray(self.outputs - self._constant)
+        mean = ridge(self.inputs[kept], self.outputs[kept], ridge_m)
+        return np.asarray(self.outputs - self.inputs @ mean.matrix.T - mean.offset)
 
     def primitive(self, parameters: Parameters, residuals: Vector, *, without: int | None = None) -> KMP:
         """The primitive of all demonstrations but one.
@@ -155,7 +207,9 @@ class Choice:
             kernel=GaussianKernel(parameters.ell),
             lambda_mean=parameters.noise / size,
             lambda_covariance=lambda_covariance,
-            prior_mean=ridge(self.inputs[kept], self.outputs[kept]) if parameters.is_linear else self._constant,
+            prior_mean=self._constant
+            if parameters.ridge_m is None
+            else ridge(self.inputs[kept], self.outputs[kept], parameters.ridge_m),
         )
 
     def _scatter(self, residuals: Vector, kept: NDArray[np.bool_]) -> Vector:
@@ -200,13 +254,13 @@ class Choice:
         return 0.5 * (out + out.transpose(0, 2, 1))
 
 
-def ridge(hands: Vector, tool: Vector) -> AffineMean:
-    """The linear mean of a tool (N, 3) [m] for hands (N, 6) [m], by ridge regression; its gain is
+def ridge(hands: Vector, tool: Vector, ridge_m: float = RIDGE_M) -> AffineMean:
+    """The linear mean of a tool (N, 3) [m] for inputs (N, I) [m], by ridge regression; its gain is
     MAX_GAIN at most.
     """
     centre, middle = hands.mean(axis=0), tool.mean(axis=0)
     off = hands - centre
-    square = off.T @ off + len(hands) * RIDGE_M**2 * np.eye(hands.shape[1])
+    square = off.T @ off + len(hands) * ridge_m**2 * np.eye(hands.shape[1])
     u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (tool - middle)).T, full_matrices=False)
     matrix = (u * np.minimum(gains, MAX_GAIN)) @ v
     return AffineMean(matrix, middle - matrix @ centre)

@@ -15,7 +15,7 @@ from service.core.frame import Vector
 
 HELD_OUT_TIMES = 2.0  # the gate is at most so many times what held-out demonstrations reach
 CEILING_M = 0.15  # and no tool is followed that may be so far off, each axis: a thing held is as large
-FLOOR_M = 0.02  # nor does a hand count as off its places that only looks so: twice the noisiest tracker's deviation
+FLOOR_M = 0.02  # nor does a hand count as off its ways that only looks so: twice the noisiest tracker's deviation
 MISSED = 0.05  # of the nonsense may pass, and
 FALSE = 0.02  # of the time may a gate hold that does not separate the two
 BESIDE_M = 0.3

@@ -5,7 +5,7 @@ and what makes it unsafe.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -13,13 +13,19 @@ import numpy as np
 from service.config import Reach
 from service.contract.messages import BASE
 from service.core.frame import Vector
+from service.core.skill.model import LEVELS, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import is_reachable
 from service.learning.ambiguity import COMPARED, ambiguity, lengths
-from service.learning.choice import NOISE_M, REGIONS, mahalanobis, rms
+from service.learning.choice import NOISE_M, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
 
+if TYPE_CHECKING:
+    from service.learning.regions import Apart
+    from service.learning.stages import Delay
+
+SAME_TIME = "same elapsed time"  # the way to predict that heeds no hand
 SAME_M = 0.003  # demonstrations nearer to each other, root mean square, are one that was repeated
 APART_M = 0.10  # tools so far apart contradict each other where the hands are the same
 STANDS_OUT = 2.5  # times the median error of all demonstrations, and
@@ -28,6 +34,8 @@ NOTED, UNSAFE = 1.0, 10.0  # [%] of the samples that contradict others
 CAUGHT, CAUGHT_UNSAFE = 95.0, 50.0  # [%] of nonsense
 HELD, HELD_UNSAFE = 5.0, 20.0  # [%] of the time that the gate holds what was demonstrated
 BEYOND_UNSAFE = 20.0  # [%] of the tool's way that the arm cannot reach
+LEAST_DELAY_S = 0.005  # below it a teacher was not late
+OTHER_MM = 1.0  # an error at the moment that differs so from the error is told beside it
 COVERAGE = ((30.0, 80.0), (88.0, 100.0))  # [%] beyond these a region is not what it says
 
 
@@ -59,7 +67,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     error_mm: float  # root mean square
     worst_mm: float
-    predicted_mm: float  # what the covariance says of the error
+    moment_mm: float = 0.0  # root mean square at that moment, its lag left in, by what it had no part in
+    predicted_mm: float  # what the covariance says of that, scaled without it
     within_50: float  # [%] of the samples inside the region that should hold 50 %
     within_95: float
     held: float  # [%] of the time that the gate would hold
@@ -82,6 +91,11 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     gripper_right: float | None = None  # [%] of held-out samples
     warnings: tuple[str, ...] = ()
     unsafe: tuple[str, ...] = ()  # reasons not to use it
+    tried_mm: dict[str, float] = {}  # what all that the tool could be a function of missed it by, left out
+    taken: str = ""  # which of these
+    by_person: bool = False  # whether all of a person's demonstrations were left out at once
+    delay_s: float | None = None  # how late the teacher was; None: it was not learned
+    delay_std_s: float = 0.0  # of that, from demonstration to demonstration
 
 
 def figures(
@@ -89,20 +103,27 @@ def figures(
     paths: Sequence[tuple[Vector, Vector]],
     names: Sequence[str],
     held_out: Sequence[HeldOut],
+    told: Sequence[tuple[Apart, Regions]],
     gate: Gate,
     posed: Posed,
     *,
     beside: Mapping[str, Sequence[Vector]],
+    tried: Mapping[str, float],
+    taken: str,
+    by_person: bool,
     near_m: float,
+    delay: Delay | None,
     reach: Reach,
     remarks: Sequence[str],
 ) -> Figures:
     """The figures of a skill: its demonstrations, their hands (T, 6) and tools (T, 3) [m] in phase,
-    what was predicted of each, its gate, what it learned besides, and errors (T, 3) [m] of other
-    ways to predict each demonstration, `beside` it. `near_m` is as in `ambiguity`.
+    what was predicted of each, also at the moment with the regions of which the others tell, its
+    gate, what it learned besides, and errors (T, 3) [m] of other ways to predict each
+    demonstration, `beside` it. `tried` is what all inputs among which this was `taken` missed the
+    tool by [m]. `near_m` is as in `ambiguity`, `delay` the teacher's.
     """
     rows = tuple(
-        _row(name, one, gate.threshold, {way: errors[i] for way, errors in beside.items()})
+        _row(name, one, told[i : i + 1], gate.threshold, {way: errors[i] for way, errors in beside.items()})
         for i, (name, one) in enumerate(zip(names, held_out, strict=True))
     )
     total = HeldOut(*(np.concatenate(parts) for parts in zip(*held_out, strict=True)))
@@ -120,7 +141,7 @@ def figures(
     out = np.array([not is_reachable(at, reach) for _, tool in paths for at in tool[:: max(1, len(tool) // COMPARED)]])
     found = Figures(
         demonstrations=rows,
-        all=_row("all", total, gate.threshold, {way: np.concatenate(errors) for way, errors in beside.items()}),
+        all=_row("all", total, told, gate.threshold, {way: np.concatenate(errors) for way, errors in beside.items()}),
         held_std=float(np.std([row.held for row in rows])),
         gate_mm=1000 * gate.threshold,
         swapped=100 * gate.caught.swapped,
@@ -130,6 +151,11 @@ def figures(
         beyond_reach=100 * float(out.mean()),
         orientation_error_deg=posed.turn_error_deg,
         gripper_right=posed.gripper_right,
+        tried_mm={name: 1000 * error for name, error in tried.items()},
+        taken=taken if tried else "",
+        by_person=by_person,
+        delay_s=delay.mean_s if delay else None,
+        delay_std_s=delay.std_s if delay else 0.0,
     )
     warnings, unsafe = _verdicts(found, demonstrations, contradiction, gate=gate)
     return msgspec.structs.replace(
@@ -152,16 +178,23 @@ def repeated(pairs: Sequence[tuple[Vector, Vector]]) -> dict[int, int]:
     return out
 
 
-def _row(name: str, one: HeldOut, threshold: float, beside: Mapping[str, Vector]) -> Row:
-    distances = mahalanobis(one.errors, one.covariance)
+def _row(
+    name: str,
+    one: HeldOut,
+    told: Sequence[tuple[Apart, Regions]],
+    threshold: float,
+    beside: Mapping[str, Vector],
+) -> Row:
+    inside = 100 * np.mean([apart.inside(regions) for apart, regions in told], axis=0)
     lengths = np.linalg.norm(one.errors, axis=1)
     return Row(
         name=name,
         error_mm=1000 * rms(one.errors),
         worst_mm=1000 * float(lengths.max()),
-        predicted_mm=1000 * float(np.sqrt(np.trace(one.covariance, axis1=1, axis2=2).mean())),
-        within_50=100 * float((distances <= REGIONS[0]).mean()),
-        within_95=100 * float((distances <= REGIONS[1]).mean()),
+        moment_mm=1000 * rms(np.concatenate([apart.errors for apart, _ in told])),
+        predicted_mm=1000 * rms(np.concatenate([apart.deviations(regions) for apart, regions in told])[:, None]),
+        within_50=float(inside[LEVELS.index(0.5)]),
+        within_95=float(inside[LEVELS.index(0.95)]),
         held=100 * float((one.gate_m > threshold).mean()),
         other_mm={way: 1000 * rms(errors) for way, errors in beside.items()},
     )
@@ -196,7 +229,14 @@ def _verdicts(
             bad=overall.error_mm > UNSAFE_MM,
         )
     for way, error_mm in overall.other_mm.items():
-        if round(error_mm) < round(overall.error_mm):
+        if round(error_mm) >= round(overall.error_mm):
+            continue
+        if way == SAME_TIME and error_mm <= min([*overall.other_mm.values(), *found.tried_mm.values()]):
+            say(
+                f"the task is a timetable: where the tool was after as much time misses it by {error_mm:.0f} mm, by "
+                f"the hands it is missed by {overall.error_mm:.0f}"
+            )
+        else:
             say(f"{way}, held-out demonstrations are missed by less: {error_mm:.0f} mm, not {overall.error_mm:.0f}")
     usual = float(np.median([row.error_mm for row in found.demonstrations]))
     for row in found.demonstrations:
@@ -234,13 +274,18 @@ def _verdicts(
 def table(found: Figures) -> str:
     """The figures as a short table for a terminal."""
     which = "held out" if len(found.demonstrations) > 1 else "learned from"
+    which += " by person" if found.by_person else ""
     width = max(len(text) for text in (which, *(row.name for row in (*found.demonstrations, found.all))))
     ways = "".join(f"   {way}" for way in found.all.other_mm)
-    lines = [f"{which:<{width}}   error  predicted   worst   in 50 %  in 95 %   held{ways}"]
-    for row in (*found.demonstrations, found.all):
+    rows = (*found.demonstrations, found.all)
+    is_other = any(abs(row.moment_mm - row.error_mm) >= OTHER_MM for row in rows)
+    moment = "  at the moment" if is_other else ""
+    lines = [f"{which:<{width}}   error   worst{moment}  predicted   in 50 %  in 95 %   held{ways}"]
+    for row in rows:
+        moment = f"        {row.moment_mm:4.0f} mm" if is_other else ""
         lines.append(
-            f"{row.name:<{width}}  {row.error_mm:4.0f} mm    {row.predicted_mm:4.0f} mm {row.worst_mm:4.0f} mm"
-            f"   {row.within_50:5.0f} %  {row.within_95:5.0f} %  {row.held:4.1f} %"
+            f"{row.name:<{width}}  {row.error_mm:4.0f} mm {row.worst_mm:4.0f} mm{moment}"
+            f"    {row.predicted_mm:4.0f} mm   {row.within_50:5.0f} %  {row.within_95:5.0f} %  {row.held:4.1f} %"
             + "".join(f"   {f'{mm:.0f} mm':>{len(way)}}" for way, mm in row.other_mm.items())
         )
     helds = [row.held for row in found.demonstrations]
@@ -256,5 +301,15 @@ def table(found: Figures) -> str:
         lines.append(f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms")
     if found.gripper_right is not None:
         lines.append(f"the gripper is right in {found.gripper_right:.0f} % of the samples")
+    if found.delay_s is not None:
+        late = f"{found.delay_s:.2f} s" if found.delay_s >= LEAST_DELAY_S else "not"
+        then = ": the tool is as late; [skill] lead_s takes it back" if found.delay_s >= LEAST_DELAY_S else ""
+        lines.append(
+            f"the teacher was {late} late (standard deviation {found.delay_std_s:.2f} s over demonstrations){then}"
+        )
+    if found.tried_mm:
+        wide = max(map(len, found.tried_mm))
+        lines.append(f"what the tool can be a function of, missed when left out; {found.taken} taken:")
+        lines += (f"  {name:<{wide}}  {mm:4.0f} mm" for name, mm in found.tried_mm.items())
     lines += (f"warning: {text}" for text in found.warnings)
     return "\n".join([*lines, *(f"unsafe: {text}" for text in found.unsafe)])

@@ -7,32 +7,42 @@ regression at sampled inputs, a KMP of that with parameters as given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.config import Reach
+from service.contract.records import SIDES
 from service.core.frame import Vector
-from service.core.skill import ORDER
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import features
 from service.core.skill.model import standard_deviations
 from service.core.skill.task import Task
 from service.learning.ambiguity import same_hands_m
-from service.learning.baselines import left_out, linear, look_up
-from service.learning.choice import CLEARLY, Choice, rms
-from service.learning.demonstration import Demonstration, closure_in_phase, fingerprint, in_phase
+from service.learning.baselines import left_out, linear, look_up, same_time
+from service.learning.demonstration import (
+    LEAST_M,
+    Demonstration,
+    as_shown,
+    closure_in_phase,
+    fingerprint,
+    groups,
+    in_phase,
+    moved_m,
+)
+from service.learning.division import task_of, via_points_never_reached
 from service.learning.gate import CEILING_M, gate_between, nonsense
-from service.learning.judgement import Figures, HeldOut, figures, repeated
+from service.learning.inputs import POSITIONS, Fit, Inputs, Pairs, chosen, fitted
+from service.learning.judgement import SAME_TIME, Figures, HeldOut, figures, repeated
 from service.learning.pose import learned_pose
+from service.learning.regions import Apart, calibrated, folds, of_held_out, of_models, of_the_others
 from service.learning.skill_file import HIGHEST_GATE_M, SkillError, StoredSkill, with_file
-from service.learning.tasks import Learned, learned, task_of, via_points_never_reached
+from service.learning.stages import Learned, learned
+from service.learning.via_points import of_one
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
-WORTH_M = 0.005  # by which a memory must better predict, else it is left out
 ELL, PENALTY = 5.0, 2.0  # of the paper's way, in metres
 
 
@@ -43,13 +53,15 @@ class Evidence(NamedTuple):
 
     skill: StoredSkill
     figures: Figures
-    paths: Sequence[tuple[Vector, Vector]]
+    paths: Pairs
     held_out: Sequence[HeldOut]
+    inside: Vector  # shares of all their samples in the regions of LEVELS, found without them
+    periods_s: Sequence[float]  # between the samples of each demonstration
+    beliefs: Sequence[Vector]  # (T, K) in each of K stages along each; none where there are no stages
 
 
 Looked = TypeVar("Looked")
-LINEAR, LOOK_UP, NO_PLACES, NO_MEMORY = "linear", "look-up", "without places", "without memory"
-Fit = Callable[[int | None], KMP]  # the primitive of all demonstrations but one, or of all
+LINEAR, LOOK_UP, NO_PLACES = "linear", "look-up", "without places"
 
 
 def learn(
@@ -82,52 +94,50 @@ def learn(
     if components is None and penalty is not None:
         raise SkillError("a penalty goes with a number of components: without them it is chosen")
     names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
-    pairs = _of_each(names, in_phase, demonstrations)
-    twins = repeated(pairs)
-    remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
+    demonstrations, names, remarks = _worth_learning(demonstrations, names)
     repeats = "".join(f"; {remark}" for remark in remarks)
-    kept = [i for i in range(len(pairs)) if i not in twins]
-    demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
-    paths, poses = [(pairs[i][0], pairs[i][1][:, :3]) for i in kept], [pairs[i][1][:, 3:] for i in kept]
-    closures = _of_each(names, closure_in_phase, demonstrations)
-    if len(kept) == 1:
+    if len(demonstrations) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
-    beside = {way: left_out(paths, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
-    near_m = same_hands_m(demonstrations)
-    alone = demonstrations[0].conducts
-    if len(who := sorted({one.conducts for one in demonstrations})) > 1:
-        raise SkillError(f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike")
-    task = task_of(demonstrations) if components is None and ell is None and alone == "both" else ""
+    together, near_m, alone = groups(demonstrations), same_hands_m(demonstrations), demonstrations[0].conducts
+    apart: list[Apart] = []
+    side = None if alone == "both" else SIDES.index(alone)
+    if side is not None:
+        demonstrations = [one._replace(places=tuple(of_one(p, side) for p in one.places)) for one in demonstrations]
+    task = task_of(demonstrations) if components is None and ell is None else ""
+    is_open = components is None and ell is None and not isinstance(task, Task) and len(set(together.tolist())) > 1
+    at_once = is_open or isinstance(task, Task)  # nothing is shifted: what knows of time tells when
+    shown = _of_each(names, as_shown if at_once else in_phase, demonstrations)
+    closures = [one.gripper if at_once else closure_in_phase(one) for one in demonstrations]
+    paths: Pairs = [(hands, tool[:, :3]) for hands, tool in shown]
+    beside = {way: left_out(paths, together, predict) for way, predict in ((LINEAR, linear), (LOOK_UP, look_up))}
+    beside[SAME_TIME] = same_time(demonstrations, together)
+    inputs = POSITIONS
+    tried: dict[str, float] = {}
     try:
         if isinstance(task, Task):
             remarks += via_points_never_reached(task, demonstrations, names)
             progress(f"learning between the via-points {', '.join(task.names)}")
-            found = learned(task, demonstrations, paths, progress)
+            found = learned(task, demonstrations, folds(together), progress)
             progress("learning without the places, to set beside it")
-            fit = _from_demonstrations(paths, points, ell)
-            beside = {NO_PLACES: [one.errors for one in _held_out(paths, fit, progress)], **beside}
+            fit = fitted(POSITIONS, paths, together, points, ell)
+            beside = {NO_PLACES: [one.errors for one in _held_out(paths, together, fit, progress)], **beside}
         else:
             remarks += [task] if task else []
-            if alone != "both" and any(one.places for one in demonstrations):
-                remarks.append(f"the places that are named are not used: the {alone} hand conducts alone")
-            if components is None:
+            if is_open:
+                inputs, paths, fit, tried = chosen(demonstrations, together, points, progress)
+                if inputs.alone is not None:
+                    side = inputs.alone
+                    remarks.append(
+                        f"the {SIDES[side]} hand alone tells as well where the tool is: it conducts alone, and the "
+                        "other one makes no difference, and may be absent"
+                    )
+            elif components is None:
                 progress(f"choosing parameters over {len(paths)} demonstrations")
-                fit = _from_demonstrations(paths, points, ell)
-                if ell is None and len(paths) > 1:
-                    progress("whether where the hands were tells more")
-                    past = [(features(one.hands, one.period_s, ORDER), one.tool[:, :3]) for one in demonstrations]
-                    remembering = _from_demonstrations(past, points, None)
-                    without = [one.errors for one in _held_out(paths, fit, progress)]
-                    error = rms(np.concatenate([one.errors for one in _held_out(past, remembering, progress)]))
-                    usual = rms(np.concatenate(without))
-                    if error < min(CLEARLY * usual, usual - WORTH_M):
-                        beside = {NO_MEMORY: without, **beside}
-                        fit, paths = remembering, past
-                        poses = [one.tool[:, 3:] for one in demonstrations]
-                        closures = [one.gripper for one in demonstrations]
+                fit = fitted(POSITIONS, paths, together, points, ell)
             else:
                 fit = _from_mixture(
                     paths,
+                    together,
                     components=components,
                     points=points,
                     ell=ell or ELL,
@@ -135,13 +145,25 @@ def learn(
                     spread_m=spread_m,
                     seed=seed,
                 )
-            found = _learned(paths, fit, progress, calibrated=bool(components))
+            found = _learned(inputs, paths, together, fit, progress, calibrated=bool(components))
+            if components is None and len(set(together.tolist())) > 2:
+                progress("how sure it may be")
+                apart = of_models(
+                    demonstrations,
+                    paths,
+                    together,
+                    lambda kept: inputs.model(
+                        fitted(inputs, [paths[i] for i in kept], together[kept], points, ell)(None)
+                    ),
+                )
+        apart = apart or of_held_out(demonstrations, paths, found.held_out)
         posed = learned_pose(
             found.inputs,
-            [hands for hands, _ in paths],
-            poses,
+            found.known,
+            [tool[:, 3:] for _, tool in shown],
             closures,
             names,
+            together,
             points=points,
             gripper_ell=found.model.gripper_ell,
             near_m=near_m,
@@ -150,19 +172,25 @@ def learn(
         if isinstance(error, SkillError):
             raise SkillError(f"{error}{repeats}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
+    told = list(of_the_others(apart, together))
     judged = figures(
         demonstrations,
-        paths,
+        list(zip(found.known, (tool for _, tool in paths), strict=True)),
         names,
         found.held_out,
+        told,
         found.gate,
         posed,
-        beside=beside if len(paths) > 1 else {},
+        beside=beside if len(set(together.tolist())) > 1 else {},
+        tried=tried,
+        taken=inputs.name,
+        by_person=len(set(together.tolist())) < len(paths),
         near_m=near_m,
+        delay=found.delay,
         reach=reach or Reach(),
         remarks=remarks,
     )
-    tools = np.concatenate([pairs[i][1] for i in kept])
+    tools = np.concatenate([tool for _, tool in shown])
     skill = StoredSkill(
         name=name,
         model=found.model,
@@ -174,11 +202,33 @@ def learn(
         learned_from=fingerprint(demonstrations),
         components=components or 0,
         figures=msgspec.json.encode(judged).decode(),
-        conductor=None if alone == "both" else ("left", "right").index(alone),
+        conductor=side,
+        regions=calibrated(apart, together),
     )
     skill = with_file(skill)
-    show(Evidence(skill, judged, paths, found.held_out))
+    inside = np.mean([one.inside(sure) for one, sure in told], axis=0)
+    periods_s = [one.period_s for one in demonstrations]
+    show(Evidence(skill, judged, paths, found.held_out, inside, periods_s, found.beliefs))
     return skill
+
+
+def _worth_learning(
+    demonstrations: Sequence[Demonstration], names: Sequence[str]
+) -> tuple[list[Demonstration], list[str], list[str]]:
+    """Those that repeat no other, their names, and remarks on the others. Raises SkillError where
+    nothing can be learned of them.
+    """
+    twins = repeated(_of_each(names, as_shown, demonstrations))
+    remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
+    kept = [i for i in range(len(demonstrations)) if i not in twins]
+    demonstrations = [demonstrations[i] for i in kept]
+    if max(map(moved_m, demonstrations)) < LEAST_M:
+        raise SkillError(
+            f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"
+        )
+    if len(who := sorted({one.conducts for one in demonstrations})) > 1:
+        raise SkillError(f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike")
+    return demonstrations, [names[i] for i in kept], remarks
 
 
 def _of_each(
@@ -195,35 +245,33 @@ def _of_each(
 
 
 def _learned(
-    paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callable[[str], None], *, calibrated: bool
+    inputs: Inputs,
+    paths: Pairs,
+    together: NDArray[np.intp],
+    fit: Fit,
+    progress: Callable[[str], None],
+    *,
+    calibrated: bool,
 ) -> Learned:
     """What demonstrations tell where they name no via-points."""
     progress(f"learning from all {len(paths)}")
-    primitive, hands = fit(None), [hands for hands, _ in paths]
-    held_out = list(_held_out(paths, fit, progress))
+    primitive, shown = fit(None), [some for some, _ in paths]
+    held_out = _held_out(paths, together, fit, progress)
     reached = np.concatenate([one.gate_m for one in held_out])
-    some = np.concatenate([one[:: max(1, len(one) // 50)] for one in hands])
-    behind = some[:, 6:].reshape(len(some), -1, 2, 3)
-    swapped = behind[:, :, ::-1].reshape(len(some), -1)
+    some = np.concatenate([one[:: max(1, len(one) // 50)] for one in shown])
+    behind = (inputs.swapped(some)[:, 6:], some[:, 6:], some[:, 6:])
     wrong = [
         standard_deviations(primitive.predict(np.hstack([one, was.repeat(len(one) // len(some), axis=0)])).covariance)
-        for one, was in zip(nonsense(some[:, :6]), (swapped, some[:, 6:], some[:, 6:]), strict=True)
+        for one, was in zip(nonsense(some[:, :6]), behind, strict=True)
     ]
     calibration = _calibration(held_out) if calibrated else 1.0  # of deviations, where the ceiling is of errors
     ceiling = min(CEILING_M * calibration, HIGHEST_GATE_M)
-    return Learned(HandsKMP(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), hands)
-
-
-def _from_demonstrations(paths: Sequence[tuple[Vector, Vector]], points: int, ell: float | None) -> Fit:
-    choice = Choice.of(paths, points)
-    parameters = choice.parameters(ell, may_be_linear=True)
-    residuals = choice.residuals(parameters.ell, parameters.noise, is_linear=parameters.is_linear)
-
-    return lambda left_out: choice.primitive(parameters, residuals, without=left_out)
+    return Learned(inputs.model(primitive), held_out, gate_between(reached, wrong, ceiling=ceiling), shown, shown)
 
 
 def _from_mixture(
-    paths: Sequence[tuple[Vector, Vector]],
+    paths: Pairs,
+    together: NDArray[np.intp],
     *,
     components: int,
     points: int,
@@ -233,7 +281,8 @@ def _from_mixture(
     seed: int,
 ) -> Fit:
     def fit(left_out: int | None) -> KMP:
-        samples = np.concatenate([np.hstack(path) for i, path in enumerate(paths) if i != left_out])
+        kept = [np.hstack(path) for path, its in zip(paths, together, strict=True) if its != left_out]
+        samples = np.concatenate(kept)
         mixture = GaussianMixture.fit(samples, components=components, seed=seed)
         inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)
         reference = mixture.regress(inputs)
@@ -248,12 +297,20 @@ def _from_mixture(
     return fit
 
 
-def _held_out(paths: Sequence[tuple[Vector, Vector]], fit: Fit, progress: Callable[[str], None]) -> Iterator[HeldOut]:
-    """What is predicted of each demonstration from the others; of a single one, from itself."""
-    for h, (hands, tool) in enumerate(paths):
+def _held_out(paths: Pairs, together: NDArray[np.intp], fit: Fit, progress: Callable[[str], None]) -> list[HeldOut]:
+    """What is predicted of each demonstration from those that are not left out with it; of those
+    beside which there are no others, from themselves.
+    """
+    several = len(set(together.tolist())) > 1
+    out: list[HeldOut] = []
+    primitives: dict[int, KMP] = {}
+    for h, ((hands, tool), group) in enumerate(zip(paths, together.tolist(), strict=True)):
         progress(f"holding out demonstration {h + 1} of {len(paths)}")
-        predicted = fit(h if len(paths) > 1 else None).predict(hands)
-        yield HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance))
+        if group not in primitives:
+            primitives[group] = fit(group if several else None)
+        predicted = primitives[group].predict(hands)
+        out.append(HeldOut(tool - predicted.mean, predicted.covariance, standard_deviations(predicted.covariance)))
+    return out
 
 
 def _calibration(held_out: Sequence[HeldOut]) -> float:

@@ -1,44 +1,61 @@
 """A picture of what a skill was judged by: errors of held-out demonstrations and what was predicted
-of them, and what the gate lets through.
+of them, what the gate lets through, and the stages of one.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from service import palette
 from service.core.frame import Vector
-from service.learning.choice import mahalanobis
+from service.core.skill.model import LEVELS
 from service.learning.gate import nonsense
+from service.learning.judgement import HeldOut
 from service.learning.learn import Evidence
 
-SHARES = np.linspace(0.05, 0.95, 19)
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
 NONSENSE = {"hands swapped": "0.7", "both 30 cm beside": "0.5", "one 30 cm beside": "0.3"}  # shades of grey
+BANDS = [palette.written(one) for one in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]  # of stages
+MOST_NAMED, LEAST_BAND = 12, 0.02  # stages in the legend; share of the time of a band that has its number
 
 
 def draw(evidence: Evidence, path: Path) -> None:
     """Writes the picture, a PNG."""
+    drawn(evidence).savefig(path, format="png")
+
+
+def drawn(evidence: Evidence) -> Figure:
+    """The picture; of a skill between via-points with the stages of one demonstration."""
     from matplotlib.figure import Figure  # heavy, and most learn without
-    from scipy.stats import chi2
 
-    figure = Figure(figsize=(11, 7.5), layout="constrained", dpi=110)
-    (above, errors), (regions, gate) = figure.subplots(2, 2)
+    mosaic = "ae;rg;ss" if evidence.beliefs else "ae;rg"
+    figure = Figure(figsize=(11, 3.75 * len(mosaic.split(";"))), layout="constrained", dpi=110)
+    parts = figure.subplot_mosaic(mosaic)
+    above, errors, regions, gate = (parts[name] for name in "aerg")
     skill, held_out = evidence.skill, evidence.held_out
+    if evidence.beliefs:
+        _draw_stages(evidence, parts["s"])
 
-    above.set(title="the tool from above: demonstrated, and predicted by the others", xlabel="x [m]", ylabel="y [m]")
+    above.set(title="the tool from above", xlabel="x [m]", ylabel="y [m]")
     for i, ((_, tool), one) in enumerate(zip(evidence.paths, held_out, strict=True)):
         predicted = tool - one.errors
         above.plot(tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None)
-        above.plot(predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label="predicted" if i == 0 else None)
+        above.plot(
+            predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label="predicted by the others" if i == 0 else None
+        )
     above.set_aspect("equal", adjustable="datalim")
     above.legend(frameon=False)
 
     grid = np.linspace(0.0, 1.0, 200)
     lengths = np.array([_along(np.linalg.norm(one.errors, axis=1), grid) for one in held_out])
-    expected = np.array([_along(np.sqrt(3.0) * one.gate_m, grid) for one in held_out])
+    expected = np.array([_along(_deviation(one), grid) for one in held_out])
     errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
     errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
     errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square")
@@ -46,10 +63,8 @@ def draw(evidence: Evidence, path: Path) -> None:
     errors.set(title="error", xlabel="share of the demonstration's time", ylabel="[mm]", ylim=(0, None), xlim=(0, 1))
     errors.legend(frameon=False)
 
-    distances = np.concatenate([mahalanobis(one.errors, one.covariance) for one in held_out])
-    inside = (distances[:, None] <= chi2.ppf(SHARES, 3)).mean(axis=0)
     regions.plot((0, 100), (0, 100), color="0.6", lw=1, label="as it should be")
-    regions.plot(100 * SHARES, 100 * inside, "o-", color=TARGET, ms=4, label="held out")
+    regions.plot(100 * np.array(LEVELS), 100 * evidence.inside, "o-", color=TARGET, ms=4, label="held out")
     regions.set(title="regions of so many per cent hold", xlabel="[%]", ylabel="of the samples [%]")
     regions.set(xlim=(0, 100), ylim=(0, 100))
     regions.legend(frameon=False)
@@ -61,8 +76,8 @@ def draw(evidence: Evidence, path: Path) -> None:
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
     gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
-    gate.set(title=f"{skill.model.measure}: what is held lies to the right", xlabel="[mm]", ylabel="of the samples [%]")
-    gate.set(xscale="log", ylim=(0, 100))
+    gate.set(title="what is held lies to the right of the gate", ylabel="of the samples [%]")
+    gate.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
     gate.legend(frameon=False, fontsize=8)
 
     overall, count = evidence.figures.all, len(held_out)
@@ -72,7 +87,40 @@ def draw(evidence: Evidence, path: Path) -> None:
         else f"one demonstration, none held out: {overall.error_mm:.0f} mm rms in what was learned"
     )
     figure.suptitle(f"{skill.name}: {told}, {overall.predicted_mm:.0f} mm predicted")
-    figure.savefig(path, format="png")
+    return figure
+
+
+def _draw_stages(evidence: Evidence, axes: Axes) -> None:
+    """One held-out demonstration over time, the one with the median error: in which stage it is,
+    most probably, as bands, and how far the tool is off.
+    """
+    names, rows = evidence.skill.model.names, evidence.figures.demonstrations
+    h = int(np.argsort([row.error_mm for row in rows])[len(rows) // 2])
+    one, most = evidence.held_out[h], evidence.beliefs[h].argmax(axis=1)
+    times = evidence.periods_s[h] * np.arange(len(most))
+    changes = np.flatnonzero(np.diff(most)) + 1
+    told: set[int] = set()
+    for first, end in zip([0, *changes], [*changes, len(most)], strict=True):
+        k, until = int(most[first]), float(times[min(end, len(times) - 1)])
+        colour = BANDS[k % len(BANDS)]
+        label = None if k in told or k >= MOST_NAMED else f"{k + 1}: {names[k]} \N{RIGHTWARDS ARROW} {names[k + 1]}"
+        axes.axvspan(float(times[first]), until, color=colour, alpha=0.3, lw=0, label=label)
+        if until - times[first] > LEAST_BAND * times[-1]:
+            middle = 0.5 * (float(times[first]) + until)
+            axes.text(middle, 0.97, str(k + 1), transform=axes.get_xaxis_transform(), ha="center", va="top")
+        told.add(k)
+    off_mm, predicted_mm = 1000 * np.linalg.norm(one.errors, axis=1), 1000 * _deviation(one)
+    axes.plot(times, off_mm, color=TOOL, lw=2, label="tool's distance from target")
+    axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="predicted")
+    highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))  # not while nothing is known yet
+    axes.set(title=f"{rows[h].name}, held out: which stage it is, most probably", xlabel="[s]", ylabel="[mm]")
+    axes.set(xlim=(0, times[-1]), ylim=(0, 1.15 * highest_mm))
+    axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=4)
+
+
+def _deviation(one: HeldOut) -> Vector:
+    """The predicted distance (T,) [m] of a tool from its target, root mean square."""
+    return np.asarray(np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)))
 
 
 def _along(values: Vector, grid: Vector) -> Vector:

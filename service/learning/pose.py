@@ -41,20 +41,21 @@ def learned_pose(
     quaternions: Sequence[Vector],
     closures: Sequence[Vector | None],
     names: Sequence[str],
+    together: NDArray[np.intp],
     *,
     points: int,
     gripper_ell: float,
     near_m: float,
 ) -> Posed:
     """What demonstrations with these inputs (T, I) of the position's primitive, hands (T, 6) [m],
-    orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell. `near_m` is as
-    in `ambiguity`.
+    orientations of the tool (T, 4) and closures of the gripper (T,), or none, tell; those with the
+    same number are left out `together` (H,). `near_m` is as in `ambiguity`.
     """
     mean = mean_orientation(np.concatenate(quaternions))
     unit = [q / np.linalg.norm(q, axis=1)[:, None] for q in quaternions]
     warnings: list[str] = []
     unsafe: list[str] = []
-    turn, turn_error, missed = _learned_turn(mean, inputs, unit, points)
+    turn, turn_error, missed = _learned_turn(mean, inputs, unit, together, points)
     if turn is not None:
         share, worst = ambiguity(
             hands,
@@ -104,7 +105,7 @@ def mean_orientation(quaternions: ArrayLike) -> Vector:
 
 
 def _learned_turn(
-    mean: Vector, inputs: Sequence[Vector], unit: Sequence[Vector], points: int
+    mean: Vector, inputs: Sequence[Vector], unit: Sequence[Vector], together: NDArray[np.intp], points: int
 ) -> tuple[LearnedOrientation | None, float | None, list[Vector]]:
     """The primitive of orientations (T, 4), None where they are constant; its error [deg], and by
     how much the others' misses those of each demonstration (T,) [rad].
@@ -112,13 +113,14 @@ def _learned_turn(
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None, []
     zetas = [log(_near(q, mean), mean) for q in unit]
-    choice = Choice.of(list(zip(inputs, zetas, strict=True)), points, alike=True)
-    parameters = choice.parameters() if len(zetas) > 1 else ALONE
+    choice = Choice.of(list(zip(inputs, zetas, strict=True)), points, together=together, alike=True)
+    several = len(set(together.tolist())) > 1
+    parameters = choice.parameters() if several else ALONE
     residuals = choice.residuals(parameters.ell, parameters.noise)
-    error_deg = math.degrees(2.0 * rms(residuals)) if len(zetas) > 1 else None
+    error_deg = math.degrees(2.0 * rms(residuals)) if several else None
     missed = []
-    for h, (at, zeta) in enumerate(zip(inputs, zetas, strict=True)):
-        others = choice.primitive(parameters, residuals, without=h if len(zetas) > 1 else None)
+    for group, at, zeta in zip(together.tolist(), inputs, zetas, strict=True):
+        others = choice.primitive(parameters, residuals, without=group if several else None)
         missed.append(2.0 * np.linalg.norm(zeta - others.mean(at), axis=1))
     return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
 

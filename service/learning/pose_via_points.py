@@ -82,7 +82,7 @@ def missed_by_rad(skill: Skill, point: ViaPoint) -> float | None:
     """The angle by which the skill misses the orientation of a via-point."""
     if point.orientation is None or skill.turn is None:
         return None
-    at = skill.model.inputs(np.array([[*point.left, *point.right]]))
+    at = skill.model.inputs(np.array([[*point.left, *point.right]]), [point.name])
     x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(at)[0].tolist()
     return _angle(point.orientation, (x, y, z, w))
 

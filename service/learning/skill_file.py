@@ -25,7 +25,7 @@ from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.model import FARTHEST_M, Model
+from service.core.skill.model import FARTHEST_M, LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
 
@@ -52,7 +52,12 @@ RANGES = {  # of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-ALL_RANGES = RANGES | {name: found for model in MODELS for name, found in model.ranges.items()}
+REGIONS, FARTHEST_RADIUS = "regions", 1e6  # a scale, a time [s] and squared distances
+ALL_RANGES = (
+    RANGES
+    | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
+    | {name: found for model in MODELS for name, found in model.ranges.items()}
+)
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
@@ -66,6 +71,7 @@ KNOWN = {
     "replaced",
     "figures",
     "conductor",
+    "turned",
     "checksum",
     "names",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
@@ -110,6 +116,8 @@ def with_file(skill: StoredSkill) -> StoredSkill:
     )
     if skill.conductor is not None:
         arrays["conductor"] = np.array(skill.conductor)
+    if skill.regions != NORMAL:
+        arrays[REGIONS] = np.array([*skill.regions[:2], *skill.regions.radii])
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
     arrays |= skill.model.own_arrays()
@@ -142,9 +150,8 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
                 raise SkillError(f"{origin}: {size} bytes unpacked, at most {LARGEST_FILE} accepted")
             arrays = dict(archive)
         if (kind := arrays["format"].item()) not in FORMATS:
-            raise SkillError(
-                f"{origin}: skill of format {kind}, {min(FORMATS)} to {POSED} needed: written by a later version?"
-            )
+            accepted = ", ".join(map(str, sorted(FORMATS)))
+            raise SkillError(f"{origin}: skill of format {kind}, of {accepted} needed: learn it anew with this version")
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
         model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
@@ -165,6 +172,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             file=bytes(data),
             digest=_digest(data),
             conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
+            regions=_regions(arrays[REGIONS].tolist()) if REGIONS in arrays else NORMAL,
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
@@ -177,6 +185,11 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     except Exception as error:  # what a damaged archive may raise is not documented by anyone
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill
+
+
+def _regions(numbers: list[float]) -> Regions:
+    scale, std_s, *radii = numbers
+    return Regions(scale, std_s, tuple(radii))
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
@@ -206,6 +219,9 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
             yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
     if (side := arrays.get("conductor", np.array(0)).tolist()) not in (0, 1):
         yield f"conductor is {side!r}: 0 for the left hand or 1 for the right one accepted"
+    if REGIONS in arrays:
+        yield from _beyond(arrays, [REGIONS], "")
+        yield from _no_regions(arrays[REGIONS])
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
@@ -229,6 +245,16 @@ def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: st
         elif array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
             worst = array.flat[np.argmax(np.where(np.isfinite(array), np.abs(array), np.inf))]
             yield f"{prefix}{name} has {worst:g}, {low:g} to {high:g} {unit}".rstrip() + " accepted"
+
+
+def _no_regions(array: NDArray[Any]) -> Iterator[str]:
+    """Why an array is none of regions."""
+    if array.shape != (2 + len(LEVELS),):
+        yield f"regions of shape {array.shape}, ({2 + len(LEVELS)},) needed"
+    elif not (array[0] > 0 and (np.diff(array[2:]) >= 0).all()):
+        yield f"regions are {array.tolist()}: a scale above 0, a time, and growing radii needed"
+    elif abs(array[2 + LEVELS.index(0.95)] - REGION_95) > 0.01:
+        yield f"a 95 % region of {array[2 + LEVELS.index(0.95)]:g}: the scale makes it {REGION_95:g}"
 
 
 def _is_json(array: NDArray[Any]) -> bool:

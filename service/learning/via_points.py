@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from kmp import ViaPointMissed
 from service.config import ToolSettings
 from service.contract.requests import ViaPoint, ViaPointInForce
-from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
@@ -22,7 +21,6 @@ from service.learning.skill_file import SkillError, StoredSkill, with_file
 
 MAX_GAIN = ToolSettings().max_gain
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
-TOLD_APART = 0.5  # of a hand's shares: so much more of it belongs to one place than to another
 NOTED_M = 0.005  # a via-point missed or moved by more is told of
 
 
@@ -33,17 +31,17 @@ def adapted(
 
     Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
     tool would have to move more than `max_gain` times as far as the hands contradict each other:
-    hands at rest tremble, and the tool would shake so many times as much. Places of a task do not
-    where it tells them apart: there a hand that trembles is at one of them all the same.
+    hands at rest tremble, and the tool would shake so many times as much. Those of a task do not:
+    what was before tells which of them hands are at.
     """
     if not tolerance >= 0:
         names = [point.name for point in via_points]
         raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
     if skill.conductor is not None:
-        via_points = [_of_one(point, skill.conductor) for point in via_points]
-    inputs, outputs, deviations = neighbourhoods(via_points)
+        via_points = [of_one(point, skill.conductor) for point in via_points]
+    inputs = neighbourhoods(via_points)[0]
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
-    _check_agreement(owners, inputs, outputs, deviations, max_gain, _told_apart(skill, owners))
+    check_agreement(via_points, max_gain, skill)
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
@@ -54,30 +52,26 @@ def adapted(
             # variance must be too.
             weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
             skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
-            at = skill.model.inputs(inputs)
+            at = skill.model.inputs(inputs, [point.name for point in owners])
             turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, turn=turn, gripper=gripper))
 
 
-def _of_one(point: ViaPoint, conductor: int) -> ViaPoint:
+def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
     """The via-point with both hands where the one is that conducts."""
     at = (point.left, point.right)[conductor]
     return msgspec.structs.replace(point, left=at, right=at)
 
 
-def _check_agreement(
-    owners: Sequence[ViaPoint],
-    inputs: Vector,
-    outputs: Vector,
-    deviations: Vector,
-    max_gain: float,
-    told_apart: NDArray[np.bool_],
-) -> None:
-    """Raises SkillError where the points that via-points are made of, (V, 6), (V, 3), (V,),
-    contradict each other, but for pairs (V, V) that are told apart; `owners` are those via-points.
+def check_agreement(via_points: Sequence[ViaPoint], max_gain: float = MAX_GAIN, skill: Skill | None = None) -> None:
+    """Raises SkillError where via-points contradict each other, but for those that a skill tells
+    apart.
     """
+    inputs, outputs, deviations = neighbourhoods(via_points)
+    owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    told_apart = np.zeros((len(owners), len(owners)), bool) if skill is None else _told_apart(skill, owners)
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
     allowed = max_gain * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
@@ -90,16 +84,11 @@ def _check_agreement(
 
 
 def _told_apart(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
-    """Which pairs (V, V) of points are of two places of the skill's task that it has inputs of
-    their own for.
+    """Which pairs (V, V) of points are of two via-points of the skill's task: its stages tell them
+    apart.
     """
-    named = np.array([point.name in skill.model.names for point in owners], bool)
-    if not named.any():
-        return np.zeros((len(owners), len(owners)), bool)
-    at = np.array([[*point.left, *point.right] for point in owners])
-    shares = skill.model.through(owners, tolerance=0.0, weight=1.0).inputs(at)
-    apart = np.abs(shares[:, None] - shares).max(axis=2) > TOLD_APART
-    return np.asarray(apart & named & named[:, None])
+    names = np.array([point.name if point.name in skill.model.names else "" for point in owners])
+    return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 
 def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
@@ -107,7 +96,7 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
     return tuple(
         ViaPointInForce(
             **msgspec.structs.asdict(point),
-            missed_by_m=math.dist(point.tool, skill.mean(np.array([[*point.left, *point.right]]))[0]),
+            missed_by_m=math.dist(point.tool, skill.mean(np.array([[*point.left, *point.right]]), [point.name])[0]),
             missed_by_rad=missed_by_rad(skill, point),
         )
         for point in skill.via_points
@@ -132,7 +121,7 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
     ]
     for point in set(before.via_points) & set(after.via_points):
         hands = np.array([[*point.left, *point.right]])
-        moved_m = math.dist(before.mean(hands)[0], after.mean(hands)[0])
+        moved_m = math.dist(before.mean(hands, [point.name])[0], after.mean(hands, [point.name])[0])
         if moved_m > NOTED_M:
             out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
     return tuple(sorted(out))

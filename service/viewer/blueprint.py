@@ -50,6 +50,7 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/error", "Tool to target [mm]", 0, 60),
             PlotView("/turn", "Tool turned from the target [°]", 0, 10),
             PlotView("/gripper", "Gripper: how far closed [%]", 0, 110, True),
+            PlotView("/stage", "Stage of the task: its number, and how probable it is", 0, 8, True),
             PlotView("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
@@ -122,7 +123,7 @@ def blueprint(
         row_shares=[4, 1],
     )
     curves = rrb.Vertical(
-        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), active_tab=0),
+        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/stage"), active_tab=0),
         plot("/deviation"),
         rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
         rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),

@@ -11,13 +11,14 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service import palette
 from service.config import Settings
 from service.contract.incidents import word
-from service.contract.records import SIDES, Mode, Reason
+from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
 from service.core.geometry import between_segments, off_target, place
 from service.core.separation.clearance import FARTHEST
-from service.core.skill.model import standard_deviations
+from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
@@ -157,6 +158,9 @@ class DynamicScene:
         )
         std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
         yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
+        staged = np.flatnonzero(frames["stage_belief"] > 0)
+        yield from scalars("/stage/number", staged, frames["stage"] + 1.0)
+        yield from scalars("/stage/probable", staged, frames["stage_belief"])
         gripping = known & (frames["closure"] >= 0)
         yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
         is_commanded = gripping & (frames["gripper"] != UNKNOWN)
@@ -255,9 +259,11 @@ class DynamicScene:
         if len(shown):
             variances, axes = np.linalg.eigh(frames["covariance"][shown])
             axes[:, :, 0] *= np.linalg.det(axes)[:, None]
-            half = np.clip(2.0 * np.sqrt(np.maximum(variances, 0.0)), 1e-4, 0.3)
+            half = np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3)
+            unsure = frames["flags"][shown] & int(Flag.UNSURE) > 0
+            colours = [palette.GATE if one else palette.TARGET for one in unsure]
             orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][shown]
-            region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations)
+            region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations, colors=colours)
             yield columns("/scene/target", shown, region)
         if len(near := rows[seen[rows].any(axis=1)]):
             lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)

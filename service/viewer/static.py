@@ -87,7 +87,7 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
         fix(f"/scene/{name}", marker)
     wireframe = rr.components.FillMode.TransparentFillMajorWireframe
     region = rr.Ellipsoids3D.from_fields(
-        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wireframe, labels=["target, 2 sigma"], show_labels=False
+        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wireframe, labels=["target, 95 %"], show_labels=False
     )
     fix("/scene/target", region)
     for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
@@ -200,6 +200,8 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/turn/std", "target, 1 σ [°]", palette.TARGET),
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
+        ("/stage/number", "number [1]", palette.TOOL),
+        ("/stage/probable", "how probable it is [1]", palette.TARGET),
         ("/deviation/target", "target, 1 σ [mm]", palette.TARGET),
         ("/deviation/hands", "hands [mm]", palette.OFF),
         ("/deviation/gate", "holds above [mm]", palette.GATE),

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from service.config import Reach, Settings
 from service.contract.records import SIDES
@@ -24,12 +23,12 @@ from service.contract.requests import Hands, ViaPoint
 from service.core.controller import start_state
 from service.core.frame import Event, blank, frame_layout
 from service.core.intake.intake import HANDS_KNOWN, Intake
-from service.core.skill.skill import Skill, SkillStage
+from service.core.skill.model import CHI_SQUARE
+from service.core.skill.skill import UNSURE_M, Skill, SkillStage
 from service.learning.demonstration import Demonstration
 from service.shipped import shipped_skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.results import Array, ExperimentError
-from sim.experiments.trials import LEVELS
 
 RATE_HZ, JUDGED_HZ = 125, 25
 LONGEST_SHIFT_S = 1.0
@@ -50,16 +49,20 @@ class LeftOut(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Means (T, 3) [m], covariances (T, 3, 3) [m²] if any are said, and where it holds (T,)."""
+    """Means (T, 3) [m], covariances (T, 3, 3) [m²] if any are said, where it holds and where it is
+    told to be unsure (T,), and squared Mahalanobis distances that the regions of LEVELS reach.
+    """
 
     mean: Array
     covariance: Array | None = None
     held: NDArray[np.bool_] | None = None
+    unsure: NDArray[np.bool_] | None = None
+    radii: tuple[float, ...] = CHI_SQUARE
 
 
 class Judged(NamedTuple):
-    """What is judged of a take: sums of its samples' squares [m²]; those that are inside the region
-    of each of LEVELS.
+    """What is judged of a take: sums of its samples' squares [m²]; numbers of those that are inside
+    the region of each of LEVELS, and so on.
     """
 
     samples: int
@@ -69,6 +72,9 @@ class Judged(NamedTuple):
     worst_m: float
     inside: tuple[int, ...] | None
     held: int | None
+    unsure: int | None
+    wrong: int  # the tool is farther off than UNSURE_M
+    told: int | None  # of these, held or unsure
 
 
 @cache
@@ -102,7 +108,7 @@ def _through_core(demonstration: Demonstration, skill: Skill | None) -> tuple[Ar
     alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
     inboxes = _inboxes(demonstration, range(2) if alone is None else [alone])
     every = RATE_HZ // JUDGED_HZ
-    moving, means, covariances, held = [], [], [], []
+    moving, means, covariances, held, unsure = [], [], [], [], []
     for tick, inbox in enumerate(inboxes):
         known = intake.step(state, frame, 1, inbox)
         hands = state["hands"]
@@ -111,14 +117,16 @@ def _through_core(demonstration: Demonstration, skill: Skill | None) -> tuple[Ar
             hands = hands[[alone, alone]]
         goes = bool(known & HANDS_KNOWN)
         if skill is not None and goes:
-            goes = stage.step(state, frame).gate_m <= used.threshold
+            wanted = stage.step(state, frame)
+            goes = wanted.gate_m <= used.threshold and not wanted.torn
         if tick % every == 0:
             moving.append(hands[:, :2].transpose(1, 0, 2).reshape(2, 6))
             means.append(frame["target"].copy())
             covariances.append(frame["covariance"].copy())
             held.append(not goes)
-    times = np.arange(len(moving)) / JUDGED_HZ
-    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), np.array(held))
+            unsure.append(bool(state["unsure"]))
+    times, told = np.arange(len(moving)) / JUDGED_HZ, (np.array(held), np.array(unsure))
+    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *told, used.regions.radii)
 
 
 def _inboxes(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
@@ -146,15 +154,20 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
     inside = None
     if said.covariance is not None:
         squares = np.einsum("ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0])
-        inside = tuple(int((squares <= quantile).sum()) for quantile in np.asarray(chi2.ppf(LEVELS, 3)))
+        inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
+    lengths = np.linalg.norm(errors, axis=1)
+    held, unsure, wrong = said.held, said.unsure, lengths > UNSURE_M
     return Judged(
         count,
         float(np.sum(errors**2)),
         count * least,
         shift / JUDGED_HZ,
-        float(np.linalg.norm(errors, axis=1).max()),
+        float(lengths.max()),
         inside,
-        None if said.held is None else int(said.held.sum()),
+        None if held is None else int(held.sum()),
+        None if unsure is None else int(unsure.sum()),
+        int(wrong.sum()),
+        None if held is None or unsure is None else int((wrong & (held | unsure)).sum()),
     )
 
 

@@ -21,7 +21,7 @@ from service.core.frame import Frame, Tick
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Known, Prediction, Skill, clamp
-from service.core.skill.task_parameterized import CALM_MPS, MAX_MPS2, STEP_S
+from service.core.skill.stages import CALM_MPS, MAX_MPS2, STEP_S
 from sim.experiments.results import Array
 
 Law: TypeAlias = Callable[[Array], Array]
@@ -91,12 +91,16 @@ class Rival(Skill):
         *,
         before: Known | None = None,
         past: Array | None = None,
+        turns: Array | None = None,
+        belief: Array | None = None,
+        period_s: float = 0.0,
+        lead_s: float = 0.0,
     ) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
         said = self.says(hands.reshape(6), velocities.reshape(6), accelerations.reshape(6))
         position, velocity, acceleration = np.round(said.motion, 6)
         turn, gate_m = self.constant_turn, float(said.far)
-        return Prediction(position, velocity, acceleration, said.covariance, gate_m, turn, NO_GRIPPER)
+        return Prediction(position, velocity, acceleration, said.covariance, gate_m, 0.0, turn, NO_GRIPPER)
 
 
 def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:

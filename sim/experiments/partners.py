@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from service.contract.requests import TOLERANCE_M
+from service.core.skill.model import LEVELS
 from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
@@ -24,7 +25,6 @@ from service.learning.via_points import adapted
 from sim.experiments.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.partner_rivals import RIVALS, left_out_by
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
-from sim.experiments.trials import LEVELS
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
 
@@ -37,6 +37,7 @@ RECORDED = {  # the beginnings of the files' names
     "give": ("give",),
     "walk": ("walk",),
 }
+PEOPLE = ("give",)  # its groups are persons
 NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
 BLOCK = 9  # takes of `walk` that are left out together
 DEMONSTRATORS, EACH, TESTED = 6, 2, 6
@@ -87,8 +88,8 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
     if len(files) < 2:
         raise ExperimentError(f"{len(files)} recordings of {task!r} in {data}: {RECORDED[task][0]}*.npz needed")
     found = [
-        left_out(path.stem, _group(task, i, path.stem), read(path, named=task in NAMES_PLACES))
-        for i, path in enumerate(files)
+        left_out(path.stem, group, read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)))
+        for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
     ]
     return found, found
 
@@ -198,7 +199,10 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
         return {"takes": 0}
     count = sum(one.samples for one in rows)
     inside = [one.inside for one in rows if one.inside is not None]
-    held = [one.held for one in rows if one.held is not None]
+    held, unsure, told = (
+        [x for x in column if x is not None] for column in zip(*((r.held, r.unsure, r.told) for r in rows), strict=True)
+    )
+    wrong = sum(one.wrong for one in rows)
     return {
         "takes": len(rows),
         "rms_mm": 1000 * float(np.sqrt(sum(one.squares for one in rows) / count)),
@@ -207,6 +211,9 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
         "worst_mm": 1000 * max(one.worst_m for one in rows),
         "coverage": [float(x) / count for x in np.sum(inside, axis=0)] if inside else None,
         "held": sum(held) / count if held else None,
+        "unsure": sum(unsure) / count if unsure else None,
+        "wrong": wrong / count,
+        "told": sum(told) / wrong if told and wrong else None,  # of the wrong ones, held or unsure
     }
 
 
@@ -217,7 +224,8 @@ def _line(rows: Sequence[Judged]) -> str:
     inside = [100 * one["coverage"][LEVELS.index(level)] for level in (0.5, 0.95)]
     return (
         f"{one['rms_mm']:.0f} mm, {one['shifted_rms_mm']:.0f} shifted, worst {one['worst_mm']:.0f}, "
-        f"inside {inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %"
+        f"inside {inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %, unsure {100 * one['unsure']:.0f} %"
+        + ("" if one["told"] is None else f", told of {100 * one['told']:.0f} % of what is 10 cm wrong")
     )
 
 

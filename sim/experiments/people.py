@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.core.skill.model import LEVELS
 from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
 from sim.experiments.recorded_people import recorded_people
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
@@ -21,7 +22,6 @@ from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Se
 from sim.experiments.trials import (
     FAST_MPS,
     FOR_S,
-    LEVELS,
     NEAR_M,
     RATE_HZ,
     SLOW_MPS,

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
 from service.core.skill.skill import Skill
-from service.core.skill.task_parameterized import STEP_S
+from service.core.skill.stages import STEP_S
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import StoredSkill
@@ -97,6 +97,8 @@ def of_model(skill: Skill, model: Model) -> Adapt:
         s = scene
         points = (s.left_start, s.right_start, s.handover, s.glass, s.soldering, s.iron, s.robot_start)
         placed = model.place(Places._make([*(np.array(point) for point in points), 0.0]))
+        if isinstance(placed, Skill):
+            return lambda bench: placed
         return lambda bench: by_law(skill, lambda hands: placed.mean(hands, np.zeros_like(hands)))
 
     return adapt

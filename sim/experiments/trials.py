@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2
 
 from service.config import Settings
 from service.contract.records import SIDES, Mode
 from service.core.frame import Event, Tick
+from service.core.skill.model import CHI_SQUARE
 from service.core.skill.skill import Skill
 from service.shipped import shipped_skill
 from sim.closed_loop import START_NS, hand_event
@@ -35,7 +35,6 @@ NEAR_M, FAST_MPS = 0.05, 0.25  # faster than this nearer than that to a hand is 
 WRONG_M = 0.10  # a target so far from the teacher's is followed falsely
 SMOOTHED = 5  # ticks over which a target's velocity is taken where a rival has a memory
 LONGEST_DELAY_S = 0.6
-LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose coverage is counted
 KEPT = 0.05  # share of the time falsely followed up to which the way was kept
 SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # until when it must be held; after it the hands' estimates are coming back
 Mask = NDArray[np.bool_]
@@ -184,6 +183,7 @@ def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
     wanted = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
     errors, covariance = (wanted - target)[good], found["covariance"][good]
     squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    radii = placed.regions.radii if isinstance(placed, Skill) else CHI_SQUARE
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
     wrong = np.linalg.norm(target - wanted, axis=1) > WRONG_M
     planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
@@ -202,7 +202,7 @@ def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
         float(planted.sum() / judged.sum()),
         float((held & planted).sum() / judged.sum()),
         float(np.minimum(likelihood, 1e3).mean()),
-        tuple(float((squares <= quantile).mean()) for quantile in np.asarray(chi2.ppf(LEVELS, 3))),
+        tuple(float((squares <= radius).mean()) for radius in radii),
         1000 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())),
         1000 * float(np.sqrt(np.sum(errors**2, axis=1).mean())),
     )

@@ -43,10 +43,11 @@ def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
     done = told("learn", *map(str, people), "--output", str(out), "--points", "80")
     assert done.returncode == 0, done.stderr
     head, *lines = done.stdout.splitlines()
-    assert head.endswith("held   without places   linear   look-up")
+    assert head.endswith("held   without places   linear   look-up   same elapsed time")
+    assert "at the moment" not in head
     figures = msgspec.json.decode(decoded(out.read_bytes(), origin="skill").figures, type=Figures)
     for line, row in zip(lines, (*figures.demonstrations, figures.all), strict=False):
-        assert line.split()[-6::2] == [f"{row.other_mm[way]:.0f}" for way in ("without places", "linear", "look-up")]
+        assert line.split()[-8::2] == [f"{mm:.0f}" for mm in row.other_mm.values()]
     helds = [row.held for row in figures.demonstrations]
     assert figures.held_std == pytest.approx(np.std(helds))
     assert f"{min(helds):.1f} to {max(helds):.1f} % of a demonstration, standard deviation" in done.stdout

@@ -1,5 +1,5 @@
 """The tutorial's commands, run in order as they stand: demonstrations recorded, learned from, and
-followed. But for the place where they meet, and haste: the person is ten times as fast.
+followed. But for the place where they meet, and haste: the person is four times as fast.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim import teach
 from support.paths import ROOT
 
 BLOCKS = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL)
-SPEED, REST_S = "10", "0.4"
+SPEED, REST_S = "4", "0.6"
 
 
 class Shell:
@@ -41,12 +41,14 @@ class Shell:
                 rest += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
                 self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(rest)), daemon=True))
                 self.teachers[-1].start()
+            case ["python", "-m", "sim.teach", *rest]:
+                assert teach.main(rest) == 0
             case ["thirdhand", "serve", *rest, "&"]:
                 command = [sys.executable, "-m", "service", "serve", *rest, "--listen", self.at]
                 self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert self.daemon.stdout is not None
                 assert self.daemon.stdout.readline().startswith("listening on ")
-            case ["thirdhand", "via-points" | "status", *_]:
+            case ["thirdhand", "via-points" | "stage" | "status", *_]:
                 assert main([*words[1:], "--connect", self.at]) == 0
             case ["thirdhand", *rest]:
                 assert main(rest) == 0
@@ -83,7 +85,11 @@ def test_the_tutorial_runs_as_it_stands(
     assert shell.codes[0] == 0
     said = capsys.readouterr()
     assert "3 takes in demonstrations" in said.err
-    assert re.search(r"^handover +tool .*missed by .* mm\n1 via-point in force", said.out, re.MULTILINE)
-    assert decoded((tmp_path / "skill.npz").read_bytes(), origin="skill").name == "skill"
+    assert "6 via-points in force" in said.out
+    assert re.search(r"^nearer +tool .*missed by .* mm$", said.out, re.MULTILINE)
+    assert re.search(r"^at done since tick \d+: ", said.out, re.MULTILINE)
+    assert re.search(r"^the teacher was .* late", said.out, re.MULTILINE)
+    skill = decoded((tmp_path / "skill.npz").read_bytes(), origin="skill")
+    assert skill.model.names == ("start", "tray", "work", "tray again", "done")
     for name in ("take-3.png", "skill.png"):
         assert (tmp_path / name).stat().st_size > 10_000

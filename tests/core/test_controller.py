@@ -4,6 +4,8 @@ going on from a state bit for bit.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from service.contract.records import Flag, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, definitions, order
 from service.core.outputs import outgoing
+from service.core.skill.model import Regions
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
@@ -269,6 +272,17 @@ def test_jumping_and_noisy_hands_never_make_a_command_outside_the_limits_nor_a_f
     assert (seen["flags"] & Flag.SPEED_LIMITED).any()
 
 
+def test_an_unsure_skill_is_told_by_a_flag_and_moves_the_arm_as_a_sure_one_does(taught: Skill) -> None:
+    ticks = list(ticks_of(HandScript(Scene(), seed=5)))[:1500]
+    skills = [replace(taught, regions=Regions(scale)) for scale in (1e-4, 1e4)]
+    sure, unsure = (frames(Controller(ASSUMED, skill, urdf=URDF), ticks) for skill in skills)
+    follows = sure["mode"] == Mode.FOLLOW
+    assert follows[-500:].all()
+    assert not (sure["flags"] & Flag.UNSURE).any()
+    assert ((unsure["flags"] & Flag.UNSURE > 0) == follows).all()
+    assert unsure["joints"].tobytes() == sure["joints"].tobytes()
+
+
 def test_missed_ticks_move_the_arm_by_one_period(taught: Skill) -> None:
     ticks = [
         Tick(t.index + (40 if t.index > 2000 else 0), t.inbox)
@@ -303,7 +317,7 @@ def test_every_kind_of_event_has_a_case_and_any_other_is_refused(taught: Skill) 
     controller = Controller(ASSUMED, taught, urdf=URDF)
     for index, kind in enumerate(channels.EVENT_NUMBERS):
         values = {"hands": hand("left", LEFT, 1).value, "joints": arm(POSTURE, 1).value, "skill": taught}
-        controller.step(Tick(index, (Event(kind, b"", values.get(kind.split("/")[0])),)))
+        controller.step(Tick(index, (Event(kind, order(kind).payload, values.get(kind.split("/")[0])),)))
     with pytest.raises(ValueError, match="nothing is done with an event of kind 'pedal'"):
         controller.step(Tick(100, (Event("pedal", b"", None),)))
 

@@ -4,14 +4,15 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
 from service.contract.records import Field
 from service.core.frame import blank
-from service.core.skill import ORDER
+from service.core.skill import ORDER, TURNS
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import LAG_S, features, moving_features, remember
+from service.core.skill.memory import LAG_S, TURN_M, features, moving_features, remember
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill, decoded
@@ -22,6 +23,8 @@ FIELDS = (
     Field("hands", "float64", (2, 3, 3)),
     Field("memory", "float64", (ORDER, 2, 3)),
     Field("memory_ticks", "int64", (2,)),
+    Field("hand_turns", "float64", (2, 9)),
+    Field("turns", "float64", (TURNS, 2, 9)),
 )
 
 
@@ -34,16 +37,25 @@ def motion(times: np.ndarray) -> np.ndarray:
 
 def remembered(hands: np.ndarray, period_s: float, unseen: range = range(0)) -> np.ndarray:
     """The memory (T, ORDER, 6) of a state that is told hands (T, 6), but for some."""
+    return both_remembered(hands, np.zeros((len(hands), 18)), period_s, unseen)[0]
+
+
+def both_remembered(
+    hands: np.ndarray, turns: np.ndarray, period_s: float, unseen: range = range(0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """That, and the rows (T, TURNS, 18) of how hands are turned, told so (T, 18)."""
     states = np.zeros(1, [(field.name, field.type, field.shape) for field in FIELDS])
-    state, out = states[0], []
+    state, out, turned = states[0], [], []
     state["hand_ticks"] = state["memory_ticks"] = -1
-    for tick, both in enumerate(hands):
+    for tick, (both, turn) in enumerate(zip(hands, turns, strict=True)):
         state["tick"] = tick
         if tick not in unseen:
             state["hand_ticks"], state["hands"][:, 0] = tick, both.reshape(2, 3)
-            remember(states, period_s)
+            state["hand_turns"] = turn.reshape(2, 9)
+            remember(states, period_s, LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
-    return np.array(out)
+        turned.append(state["turns"].reshape(TURNS, 18).copy())
+    return np.array(out), np.array(turned)
 
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
@@ -52,6 +64,15 @@ def test_the_service_remembers_what_was_learned_at_any_rate(rate_hz: int) -> Non
     live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[:: rate_hz // 50]
     behind = shown[:, 6:].reshape(-1, ORDER, 6) + shown[:, None, :6]
     assert np.abs(live - behind).max() < 0.004
+
+
+@pytest.mark.parametrize("rate_hz", [100, 250, 1000])
+def test_hands_are_turned_live_as_they_were_learned_at_any_rate(rate_hz: int) -> None:
+    turns = np.tile(motion(np.arange(0.0, 6.0, 0.02))[0], 3)
+    shown = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
+    told = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
+    live = both_remembered(told[:, :6], told, 1.0 / rate_hz)[1][:: rate_hz // 50, -1]
+    assert np.abs(TURN_M * live - shown).max() < 0.0005
 
 
 def test_hands_that_rest_are_remembered_where_they_are_and_those_that_come_first_at_once() -> None:
@@ -70,14 +91,16 @@ def test_nothing_is_forgotten_while_no_hand_is_seen() -> None:
 def test_inputs_move_as_their_velocity_and_acceleration_say() -> None:
     h = 1e-3
     times = np.arange(0.0, 4.0, h)
-    moving, memory = motion(times), remembered(motion(times)[0], h)
-    found = np.empty((len(times), 3, 6 * (1 + ORDER)))
-    for out, now, past in zip(found, moving.transpose(1, 0, 2), memory, strict=True):
-        moving_features(np.ascontiguousarray(now), past, out)
+    moving = motion(times)
+    memory, turns = both_remembered(moving[0], np.tile(moving[0], 3), h)
+    found = np.empty((len(times), 3, 6 * (1 + ORDER) + 18))
+    for out, now, past, turned in zip(found, moving.transpose(1, 0, 2), memory, turns, strict=True):
+        moving_features(np.ascontiguousarray(now), past, turned, out)
     late = slice(3000, None)
     for order in (0, 1):
         slope = np.gradient(found[:, order], h, axis=0)[late]
         assert np.abs(slope - found[late, order + 1]).max() < 0.01
+        assert np.abs(slope[:, -18:]).max() > 0.01
     assert LAG_S * ORDER == 2.0
 
 
@@ -107,7 +130,7 @@ def order(skill: StoredSkill) -> int:
 def test_learn_remembers_where_hands_alone_tell_too_little_and_nowhere_else() -> None:
     skill = learn(takes(8, remembers=True))
     assert order(skill) == ORDER
-    assert '"without memory"' in skill.figures
+    assert msgspec.json.decode(skill.figures)["taken"].startswith("memory")
     assert order(learn(takes(8, remembers=False))) == 0
     back = decoded(skill.file, origin="again")
     hands = motion(np.array([0.3]))[0].reshape(2, 3) + 0.4

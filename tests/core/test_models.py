@@ -9,14 +9,14 @@ import pytest
 
 from service.core.frame import Vector
 from service.core.skill import ORDER
-from service.core.skill.model import Model, Motion
-from service.core.skill.skill import MODELS, Skill
+from service.core.skill.model import Model, Motion, Seen
+from service.core.skill.skill import MODELS, UNTOLD, Skill
 from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from sim.scene import Scene
 from support.paths import RECORDINGS
 
-FILES = {"HandsKMP": "experiments/as-paper.npz", "TaskParameterized": "soldering.npz"}
+FILES = {"HandsKMP": "experiments/as-paper.npz", "StagedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])
 H = 0.02
 
@@ -37,14 +37,15 @@ def hands(skill: Skill) -> Vector:
 
 def predicted(skill: Skill, hands: Vector, velocity: Vector, **more: object) -> Motion:
     found = skill.predict(hands.reshape(2, 3), velocity.reshape(2, 3), np.zeros((2, 3)), STILL[0], **more)  # type: ignore[arg-type]
-    return Motion(*found[:5])
+    return Motion(*found[:6])
 
 
 def test_a_prediction_is_the_mean_rounded_with_its_derivative_along_the_motion(skill: Skill, hands: Vector) -> None:
     velocity = np.array([0.3, -0.4, 0.2, 0.4, 0.3, 0.1])
-    found = predicted(skill, hands, velocity)
-    np.testing.assert_allclose(found.position, skill.mean(hands[None], STILL)[0], rtol=0, atol=0.51e-6)
-    behind, ahead = skill.mean(hands + H * np.array([[-1.0], [1.0]]) * velocity, np.tile(STILL, (2, 1)))
+    found, belief = predicted(skill, hands, velocity), skill.model.belief(hands)
+    rest = predicted(skill, hands, np.zeros(6))
+    np.testing.assert_allclose(rest.position, skill.mean(hands[None])[0], rtol=0, atol=0.51e-6)
+    behind, ahead = (predicted(skill, hands + step * velocity, np.zeros(6), belief=belief).position for step in (-H, H))
     np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * H), atol=0.01)
     assert not predicted(skill, hands, np.zeros(6)).velocity.any()
 
@@ -66,10 +67,14 @@ def test_a_covariance_that_is_known_is_handed_back_and_changes_nothing_else(skil
 
 def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
     model, velocity = skill.model, np.array([0.1, 0.2, 0.0, 0.0, -0.1, 0.2])
-    at, moves = model.moving_inputs(np.stack([hands, velocity, np.zeros(6)]), STILL[0], np.tile(hands, (ORDER, 1)))
+    moving, past = np.stack([hands, velocity, np.zeros(6)]), np.tile(hands, (ORDER, 1))
+    seen = Seen(moving, STILL[0], past, UNTOLD, moving, model.belief(hands), 0.0)
+    at, moves = model.moving_inputs(seen)
     assert at.shape == (model.shape[0],)
     np.testing.assert_array_equal(at, model.inputs(hands[None])[0])
-    behind, ahead = model.inputs(hands + H * np.array([[-1.0], [1.0]]) * velocity)
+    behind, ahead = (
+        model.moving_inputs(seen._replace(moving=moving + step * np.outer((1, 0, 0), velocity)))[0] for step in (-H, H)
+    )
     np.testing.assert_allclose(moves, (ahead - behind) / (2 * H), atol=1e-9)
 
 

@@ -26,7 +26,7 @@ from service.core.setpoint.bounds import (
 )
 from service.core.setpoint.setpoint import SetpointGenerator, slow_down
 from service.core.setpoint.tracker import tracker_gains, waiting
-from service.core.skill.skill import Target
+from service.core.skill.model import Target
 from support.explained import Explained, margin
 from support.wam import STATE
 

@@ -71,11 +71,10 @@ def rms(values: Vector) -> float:
     return float(np.sqrt(np.mean(values**2, axis=0)).max())
 
 
-@pytest.mark.parametrize("number", [2, 11])
-def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill, number: int) -> None:
+@pytest.mark.parametrize(("number", "name"), [(2, "glass"), (11, "start")])
+def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill, number: int, name: str) -> None:
     cell = changed(cell_of("panda"), rate_hz=250, jerk=0.2, orientation="full")
-    places = taught.hands.reshape(-1, 2, 3)
-    rest = places[np.random.default_rng(number).integers(len(places))]
+    rest = taught.hands.reshape(-1, 2, 3)[taught.model.names.index(name)]
     found = accelerations(cell, taught, free_postures(cell, 1, number)[0], [rest, rest], 16.0)
     assert rms(found) < AT_REST
 

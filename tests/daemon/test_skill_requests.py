@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
-from service.client import RefusedError
+from service.cli.main import main
+from service.client import RefusedError, endpoints
+from service.contract.records import Mode, Reason
 from service.core.skill.skill import Skill
 from service.learning.skill_file import StoredSkill, with_file
 from support.request_cell import PLACES, Cell
@@ -94,3 +98,17 @@ def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -
     (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
     assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
     (taught_cell.folder / "broken.npz").unlink()
+
+
+def test_the_stage_of_the_task_is_told_by_client_and_command(
+    cell: Cell, sessions: tuple[zenoh.Session, zenoh.Session], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "There are: start, handover, glass, soldering" in cell.refusal("stage", {"name": "elsewhere"})
+    reply = cell.client.set_stage("glass")
+    assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "stage")
+    command = ["stage", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
+    for mode, reason, told in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
+        cell.mode, cell.reason = mode, reason
+        assert main(command) == 0
+        assert re.search(rf"^at soldering since tick \d+: {re.escape(told)}$", capsys.readouterr().out, re.MULTILINE)
+    assert cell.kinds()[-3:] == ["stage"] * 3

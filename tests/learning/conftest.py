@@ -28,8 +28,8 @@ def taught() -> list[Demonstration]:
 
 @pytest.fixture(scope="session")
 def learned(taught: list[Demonstration]) -> Skill:
-    """A skill of three demonstrations, its parameters chosen."""
-    return learn(taught[:3], name="soldering")
+    """A skill of three demonstrations, a function of the hands' positions."""
+    return learn(taught[:3], name="soldering", ell=8.0)
 
 
 @pytest.fixture(scope="session")

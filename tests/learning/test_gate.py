@@ -17,7 +17,7 @@ from support.taught_scene import PLACES, demonstrated, deviations
 
 @pytest.fixture(scope="module")
 def skill_of_five() -> Skill:
-    return learn([one.every(4) for one in demonstrated(5)])
+    return learn([one.every(4) for one in demonstrated(5)], ell=8.0)
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,9 @@ from service.config import Reach
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures, table
 from service.learning.learn import Evidence, learn
-from service.learning.picture import draw
+from service.learning.picture import draw, drawn
 from service.learning.skill_file import SkillError
+from sim.made_tasks import takes
 from support.taught_scene import demonstrated
 
 
@@ -87,3 +88,48 @@ def test_the_picture_is_one(good: list[Demonstration], tmp_path: Path) -> None:
     learn(good, points=80, show=seen.append)
     draw(seen[0], tmp_path / "skill.png")
     assert (tmp_path / "skill.png").read_bytes().startswith(b"\x89PNG")
+    assert not [axes for axes in drawn(seen[0]).axes if "stage" in axes.get_title()]
+
+
+def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_of_its_errors() -> None:
+    seen: list[Evidence] = []
+    learn([take.demonstration for take in takes("cyclic", people=range(2), each=2)], show=seen.append)
+    by_title = {axes.get_title(): axes for axes in drawn(seen[0]).axes}
+    (stages,) = (axes for title, axes in by_title.items() if "stage" in title)
+    name = stages.get_title().split(",")[0]
+    h = [row.name for row in seen[0].figures.demonstrations].index(name)
+    labels = [text.get_text() for text in stages.get_legend().get_texts()]
+    told = ["1: start → left out", "2: left out → work", "3: work → left out again"]
+    assert labels == [*told, "tool's distance from target", "predicted"]
+    off, predicted = (np.asarray(line.get_ydata()) for line in stages.get_lines())
+    row = seen[0].figures.demonstrations[h]
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(row.error_mm)
+    likely = seen[0].beliefs[h].argmax(axis=1)
+    shown = [patch for patch in stages.patches if patch.get_alpha()]
+    assert len(shown) == 1 + np.count_nonzero(np.diff(likely))
+    # what is predicted is of the tool, not how far hands are off their ways
+    (line,) = (line for line in by_title["error"].get_lines() if line.get_label() == "predicted")
+    variance = [np.trace(one.covariance, axis1=1, axis2=2).mean() for one in seen[0].held_out]
+    usual = 1000 * np.sqrt(np.mean(variance))
+    assert np.sqrt(np.mean(np.asarray(line.get_ydata()) ** 2)) == pytest.approx(usual, rel=0.1)
+    assert predicted.shape == off.shape
+
+
+def test_the_error_at_the_moment_stands_in_the_table_where_it_is_another(good: list[Demonstration]) -> None:
+    found = judged(good, names=["a", "b", "c", "d"])
+    for more_mm in (0.0, 7.0):
+        rows = [msgspec.structs.replace(row, moment_mm=row.error_mm + more_mm) for row in found.demonstrations]
+        total = msgspec.structs.replace(found.all, moment_mm=found.all.error_mm)
+        head, first, *_ = table(msgspec.structs.replace(found, demonstrations=tuple(rows), all=total)).splitlines()
+        assert ("at the moment" in head) == bool(more_mm)
+        told = (rows[0].error_mm, rows[0].worst_mm, *[rows[0].moment_mm] * bool(more_mm), rows[0].predicted_mm)
+        assert first.split()[1 : 2 * len(told) : 2] == [f"{mm:.0f}" for mm in told]
+
+
+def test_figures_of_earlier_skills_are_read_and_tell_of_no_delay(good: list[Demonstration]) -> None:
+    found = judged(good)
+    assert found.delay_s is None
+    assert "the teacher was" not in table(found)
+    earlier = msgspec.to_builtins(found)
+    del earlier["delay_s"], earlier["delay_std_s"]
+    assert msgspec.convert(earlier, Figures) == found

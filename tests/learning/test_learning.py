@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -76,9 +77,21 @@ def test_demonstrations_that_cannot_be_learned_from_are_refused(taught: list[Dem
     ):
         with pytest.raises(SkillError, match=message):
             learn(wrong)
-    still = one._replace(tool=np.tile(one.tool[0], (len(one.tool), 1)))
-    with pytest.raises(SkillError, match=r"^take-2: a demonstration in which hands or tool move by less than 10 mm"):
-        learn([one, still], names=["take-1", "take-2"])
+    still = [one._replace(tool=np.tile(at, (len(one.tool), 1))) for at in one.tool[[0, -1]]]
+    with pytest.raises(SkillError, match=r"^demonstrations in which hands or tool move by less than 10 mm"):
+        learn(still)
+    with pytest.raises(SkillError, match=r"^take-2: .*not finite"):
+        learn([one, one._replace(tool=np.full_like(one.tool, np.nan))], names=["take-1", "take-2"])
+
+
+def test_a_take_in_which_the_hands_rest_is_learned_from_with_others(taught: list[Demonstration]) -> None:
+    resting = taught[3].every(8)
+    resting = resting._replace(
+        left=np.tile(resting.left[0], (len(resting.left), 1)), right=np.tile(resting.right[0], (len(resting.left), 1))
+    )
+    assert lag(resting) == 0
+    skill = learn([*(one.every(4) for one in taught[:2]), resting], points=60)
+    assert len(msgspec.json.decode(skill.figures)["demonstrations"]) == 3
 
 
 def test_too_few_samples_for_a_mixture_are_counted(taught: list[Demonstration]) -> None:

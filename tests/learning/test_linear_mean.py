@@ -11,7 +11,7 @@ from kmp import KMP, AffineMean, GaussianKernel, Gaussians
 from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
 from service.learning.baselines import left_out, linear
-from service.learning.choice import MAX_GAIN, Choice, ridge, rms
+from service.learning.choice import MAX_GAIN, RIDGE_M, Choice, ridge, rms
 from service.learning.gate import nonsense
 from service.learning.learn import Evidence, learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
@@ -26,7 +26,7 @@ APART_M = 0.15  # the takes, from each other: a constant mean holds the tool bac
 @pytest.fixture(scope="module")
 def evidence() -> Evidence:
     seen: list[Evidence] = []
-    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, show=seen.append)
+    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, ell=0.5, show=seen.append)
     return seen[0]
 
 
@@ -58,7 +58,7 @@ def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant
     ]
     assert error < 0.010
     assert error < 0.6 * rms(np.concatenate(over_constant))
-    assert error < 0.75 * rms(np.concatenate(left_out(evidence.paths, linear)))
+    assert error < 0.75 * rms(np.concatenate(left_out(evidence.paths, np.arange(5), linear)))
 
 
 def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without(choice: Choice) -> None:
@@ -72,7 +72,7 @@ def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without
             prior_mean=ridge(choice.inputs[rest], choice.outputs[rest]),
         )
         expected = choice.outputs[mine] - fitted.mean(choice.inputs[mine])
-        np.testing.assert_allclose(choice.residuals(2.0, 0.1, is_linear=True)[mine], expected, atol=1e-9)
+        np.testing.assert_allclose(choice.residuals(2.0, 0.1, RIDGE_M)[mine], expected, atol=1e-9)
 
 
 def test_off_the_data_it_is_refused_as_over_a_constant(skill: StoredSkill, choice: Choice, evidence: Evidence) -> None:

@@ -12,6 +12,7 @@ from service.contract.records import Mode, Reason
 from service.contract.requests import Hands, ViaPoint
 from service.core.controller import Controller
 from service.core.frame import Records, Tick
+from service.core.skill.staged import StagedKMP
 from service.demonstrations.demonstration_files import summary
 from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
@@ -19,6 +20,7 @@ from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
+from sim.made_tasks import takes
 from support.circling import circling
 from support.in_process import ASSUMED, frames, hand
 from support.wam import URDF
@@ -49,10 +51,10 @@ def conducting(skill: StoredSkill, at: tuple[float, ...], other: tuple[float, ..
 
 def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: Path) -> None:
     for who in ("left", "right"):
-        write_demonstration(tmp_path / f"{who}.mcap", led(0, who))  # type: ignore[arg-type]
+        write_demonstration(tmp_path / f"{who}.mcap", led(0, who)._replace(person="Ada"))  # type: ignore[arg-type]
         said: list[str] = []
         got = read_demonstration(tmp_path / f"{who}.mcap", say=said.append)
-        assert got.conducts == who
+        assert (got.conducts, got.person) == (who, "Ada")
         np.testing.assert_array_equal(got.hands, led(0).hands)
         np.testing.assert_array_equal(got.tool, led(0).tool)
         assert f"the {who} hand conducts alone" in said[0]
@@ -93,12 +95,19 @@ def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: St
         adapted(skill, [point, other], tolerance=0.05)
 
 
-def test_places_that_takes_of_one_hand_name_are_said_not_to_be_used() -> None:
-    spot = ViaPoint("spot", AT, AT, (0.5, 0.2, 0.4))
-    for places, remarks in (((spot,), 1), ((), 0)):
-        learnt = learn([led(seed)._replace(places=places) for seed in range(2)], points=40)
-        said = msgspec.json.decode(learnt.figures, type=Figures).warnings
-        assert said.count("the places that are named are not used: the left hand conducts alone") == remarks
+def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() -> None:
+    shown = []
+    for seed in range(4):
+        take = takes("one_hand", people=(seed,), each=1)[0].demonstration
+        shown.append(take._replace(right=take.left, conducts="left"))
+    learnt = learn(shown)
+    assert isinstance(learnt.model, StagedKMP)
+    assert learnt.conductor == 0
+    aimed = adapted(learnt, shown[0].places, tolerance=0.05)
+    for point in shown[0].places:
+        for other in (point.right, (2.0, 2.0, 2.0)):
+            hands = np.array([[*point.left, *other]])
+            np.testing.assert_allclose(aimed.mean(hands, [point.name])[0], point.tool, atol=2e-3)
 
 
 def test_takes_of_different_hands_are_not_mixed() -> None:

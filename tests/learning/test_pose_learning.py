@@ -72,6 +72,7 @@ def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demons
         [one.tool[:, 3:] for one in (*shown, other[0])],
         [None] * 4,
         list("abcd"),
+        np.arange(4),
         points=80,
         gripper_ell=HandsKMP.gripper_ell,
         near_m=SAME_M,

@@ -131,10 +131,11 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden:
     assert held[Reason.STALE_HAND].why == "the left hand was last seen 100 ms ago"
     assert (held[Reason.OPERATOR].why, held[Reason.OPERATOR].remedy) == ("somebody asked for it", "thirdhand resume")
     far = re.fullmatch(
-        r"a hand's distance from its via-points is (.*) cm, 10.4 accepted", held[Reason.FAR_FROM_DEMONSTRATIONS].why
+        r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
+        held[Reason.FAR_FROM_DEMONSTRATIONS].why,
     )
     assert far is not None
-    assert float(far[1]) > 10.4
+    assert float(far[1]) > 11.0
     assert golden.seconds(Mode.FOLLOW) + golden.seconds(Mode.HOLD) == pytest.approx(golden.lasts_s)
     assert (golden.faults, golden.lacks) == ((), ())
 

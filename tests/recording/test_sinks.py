@@ -23,6 +23,7 @@ from service.contract import cdr
 from service.contract.messages import JointState, SceneObject
 from service.contract.records import Mode, Reason
 from service.contract.requests import ViaPoint, encode_json
+from service.core.skill.model import REGION_95
 from service.core.skill.pose import CLOSED
 from service.core.skill.skill import Skill
 from service.learning.skill_file import with_file
@@ -72,7 +73,7 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
         told[595][1]["hands"][0]
     )
     half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
-    assert sorted(half) == pytest.approx(sorted(2 * np.sqrt([4e-4, 1e-4, 2e-4])), rel=1e-4)
+    assert sorted(half) == pytest.approx(sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4)
     assert [row["StateChange:state"] for row in rows["/mode"] if row.get("tick") is not None] == [
         ["hold"],
         ["follow"],
@@ -98,7 +99,7 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
     names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
     told = [name for found in names.values() for several in found for name in several]
     assert len(told) > 30
-    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%)\]$", name) for name in told)
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:

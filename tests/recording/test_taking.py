@@ -258,7 +258,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     folder = ["--folder", str(tmp_path / "takes")]
     ended = ["--until", "rest", "--rest", "0.5"]
     (tmp_path / "places.json").write_bytes(encode_json(Add(Scene().via_points())))
-    ended += ["--places", str(tmp_path / "places.json")]
+    ended += ["--places", str(tmp_path / "places.json"), "--person", "Ada"]
     assert main(["record", "take-1", "--listen", at, *ended, *folder]) == 0
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
@@ -269,7 +269,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s behind it", said.err)
     found = summary(path)
     assert said.out.strip() == table(found)
-    assert "  places handover, glass, soldering\n" in said.out
+    assert "  by Ada\n  places handover, glass, soldering\n" in said.out
     assert 1.0 < found.lasts_s < 2.5
     assert [one.name for one in found.streams] == ["left", "right", "tool"]
     assert all(one.poses > 20 and one.frame == "base" for one in found.streams)
@@ -295,6 +295,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     with pytest.raises(RecordingError, match=r"takes is a folder: give its files, .*takes/\*\.mcap"):
         read_demonstration(path.parent)
     assert summary(path).demonstration.places == Scene().via_points()
+    assert summary(path).demonstration.person == "Ada"
     assert Recorded(path).settings == Settings()
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")

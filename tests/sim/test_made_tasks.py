@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.config import Reach
-from service.learning.tasks import FOLLOW, off_via_point
+from service.learning.division import FOLLOW, off_via_point
 from sim.made_tasks import AHEAD_S, CARRIED_M, KINDS, LATE_S, RATE_HZ, run, takes
 from sim.sessions import along
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from service.contract.records import SIDES
+from service.core.skill.model import LEVELS
 from service.learning.learn import learn
 from sim.experiments.left_out import JUDGED_HZ, LeftOut, Predicted, judged, left_out, predicted, read
 from sim.experiments.partner_rivals import MEMORY_S, RIVALS, carried, left_out_by, rows_of, scene_of
+from sim.experiments.partners import summary
 from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.trials import LEVELS
 from sim.made_tasks import takes
 
 
@@ -87,6 +88,16 @@ def test_coverage_is_what_a_covariance_says(asked: list[LeftOut]) -> None:
     found = judged(long, said)
     assert found.inside is not None
     assert np.array(found.inside) / found.samples == pytest.approx(LEVELS, abs=0.01)
+
+
+def test_told_are_moments_far_off_at_which_it_held_or_was_unsure(asked: list[LeftOut]) -> None:
+    one, off = asked[0], np.array([[0.11, 0, 0], [0.11, 0, 0], [0.2, 0, 0], [0.09, 0, 0], [0, 0, 0], [0, 0, 0]])
+    held, unsure = (np.array(flags, bool) for flags in ([1, 0, 0, 0, 1, 0], [1, 1, 0, 1, 0, 0]))
+    found = judged(one._replace(tool=off), Predicted(np.zeros((6, 3)), held=held, unsure=unsure))
+    assert (found.wrong, found.told, found.held, found.unsure) == (3, 2, 2, 3)
+    numbers = summary([found])
+    assert (numbers["wrong"], numbers["told"], numbers["unsure"]) == pytest.approx((1 / 2, 2 / 3, 1 / 2))
+    assert summary([judged(one, Predicted(one.tool))])["told"] is None
 
 
 def test_what_is_carried_to_a_place_and_back_is_where_it_was(asked: list[LeftOut]) -> None:

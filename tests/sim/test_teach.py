@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from service.cli.usage import places_in
 from service.contract import cdr, messages
+from service.core.skill.stages import NONE
+from service.learning.division import off_via_point
 from sim import teach
 from sim.scene import Scene
 
@@ -57,3 +60,25 @@ def test_bad_usage_and_failure_have_their_exit_codes(tmp_path: Path, capsys: pyt
     (tmp_path / "scene.toml").write_text("glas = [0, 0, 0]")
     assert teach.main(["--output", str(tmp_path), "--scene", str(tmp_path / "scene.toml")]) == 1
     assert "glas" in capsys.readouterr().err
+
+
+def test_the_tutorials_task_visits_the_tray_twice_in_one_scene_and_its_places_are_written(tmp_path: Path) -> None:
+    file = tmp_path / "places.json"
+    assert teach.main(["--visits", "--places", str(file)]) == 0
+    told = places_in(file)
+    assert [place.name for place in told] == ["start", "tray", "work", "tray again", "done"]
+    assert told[1].left == told[3].left
+    assert np.linalg.norm(np.subtract(told[1].tool, told[3].tool)) > 0.1
+    one, other = teach.visits(1), teach.visits(2)
+    for shown in (one, other):
+        for place in told:
+            assert off_via_point(shown, place, NONE).min() < 0.02
+    assert len(one.tool) != len(other.tool)
+
+
+@pytest.mark.parametrize("more", [["--output", "out"], ["--places", "places.json", "--live"], []])
+def test_the_tutorials_task_is_shown_live_or_its_places_written(more: list[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        teach.main(["--visits", *more])
+    with pytest.raises(SystemExit, match="2"):
+        teach.main(["--places", "places.json"])

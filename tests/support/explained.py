@@ -19,7 +19,8 @@ from service.core.setpoint.bounds import (
     speed_to_come,
 )
 from service.core.setpoint.setpoint import SetpointGenerator
-from service.core.skill.skill import Skill, Target
+from service.core.skill.model import Target
+from service.core.skill.skill import Skill
 
 
 def margin(tool: ToolSettings) -> float:

@@ -37,6 +37,7 @@ class Cell:
         self.notes: list[str] = []
         self.kept: list[bytes] = []
         self.running = True
+        self.mode, self.reason = Mode.HOLD, Reason.NO_HANDS
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
@@ -69,7 +70,7 @@ class Cell:
         return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
 
     def frame(self) -> dict[str, int]:
-        return {"tick": self._tick, "mode": Mode.HOLD, "reason": Reason.NO_HANDS}
+        return {"tick": self._tick, "mode": self.mode, "reason": self.reason}
 
     def _drain(self) -> None:
         while not self._end.wait(0.0005):

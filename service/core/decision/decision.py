@@ -35,10 +35,12 @@ HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
+AMBIGUOUS = int(Reason.AMBIGUOUS)
 ARM_ERROR, ARM_SILENT, TOOL_SPEED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT), int(Reason.TOOL_SPEED)
 STARTS_ASSUMED = 1  # what a step says: the arm is taken to be at the configured posture
 STARTS_MEASURED = 2  # the arm appeared, where it is measured
 INSIDE = 64  # beside what the intake says: a part of the arm is inside of a thing ...
+TORN = 256  # it is not known which stage of the task it is
 ALONE = 128  # and that the hand that conducts the skill alone was seen, and the other never
 INSIDE_M = 0.01  # [m] ... by more than capsules are larger than links
 
@@ -67,8 +69,8 @@ class Decision:
         """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
         STARTS_MEASURED.
 
-        known: the flags that `Intake.step` gave, INSIDE and ALONE. gate_m: what the skill compares
-        with its threshold, NaN where it predicts nothing.
+        known: the flags that `Intake.step` gave, INSIDE, TORN and ALONE. gate_m: what the skill
+        compares with its threshold, NaN where it predicts nothing.
         """
         gates = gate_m, threshold
         starts, error, speed = _step(as_array(state), as_array(frame), here, self._parameters, known, *gates)
@@ -145,7 +147,7 @@ def _step(
         reason = NO_HANDS if unseen else STALE_HAND
     else:
         ease = GATE_EASE if state.reason == FAR else 1.0
-        reason = FAR if gate_m > ease * threshold else NONE
+        reason = FAR if gate_m > ease * threshold else AMBIGUOUS if known & TORN else NONE
     if reason == NONE:
         state.stuck = _stuck(states, frames, heres, parameters)
         reason = BLOCKED if state.stuck == HELD else NONE

@@ -18,6 +18,7 @@ STATE = (
     Field("even_samples", "int64", (2,)),  # how many of the past samples are evenly spaced
     Field("noise_samples", "int64", (2,)),  # averaged in the noise variance
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
+    Field("hand_turns", "float64", (2, 9)),  # of the newest samples: rotation matrices in frame base, row by row
     Field("hand_velocity_lowpass", "float64", (2, 3)),  # without tremor [m/s]
     Field("hand_stillness", "float64", (2,)),  # 0: on its way, 1: still
     Field("mode_means", "float64", (2, MODES, 3, 3)),

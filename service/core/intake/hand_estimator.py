@@ -336,9 +336,35 @@ def is_to_and_fro(states: Records, side: int, position: Vector, interval_s: floa
 
 
 @compiled
-def take(states: Records, side: int, position: Vector, interval_s: float, anew: bool) -> None:
-    """Takes in a sample (3,) [m] of one hand, `interval_s` after the one before, or starts `anew`
-    with it.
+def _turned(turn: tuple[float, float, float, float], frame: Vector, out: Vector) -> None:
+    """Into `out` (9,) the rotation matrix in frame base of a quaternion x y z w, with the tracker's
+    axes in its unit (3, 4).
+    """
+    x, y, z, w = turn
+    s, matrix = 2.0 / (x * x + y * y + z * z + w * w), np.empty((3, 3))
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)
+    unit = math.sqrt(frame[0, 0] ** 2 + frame[1, 0] ** 2 + frame[2, 0] ** 2)
+    out[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                out[3 * i + j] += frame[i, k] / unit * matrix[k, j]
+
+
+@compiled
+def take(
+    states: Records,
+    side: int,
+    position: Vector,
+    turn: tuple[float, float, float, float],
+    frame: Vector,
+    interval_s: float,
+    anew: bool,
+) -> None:
+    """Takes in a sample of one hand, where it is (3,) [m] and how it is turned in the tracker's
+    frame (3, 4), `interval_s` after the one before, or starts `anew` with it.
     """
     state = states[0]
     means, covariances = state.mode_means[side], state.mode_covariances[side]
@@ -352,3 +378,4 @@ def take(states: Records, side: int, position: Vector, interval_s: float, anew: 
     else:
         _update(means, covariances, probabilities, variance, position, interval_s)
     _combine(means, probabilities, state.hands[side])
+    _turned(turn, frame, state.hand_turns[side])

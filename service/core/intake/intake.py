@@ -359,7 +359,7 @@ def _take_hand(
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
-    take(states, side, in_base, since * period_s, jumped or not fresh)
+    take(states, side, in_base, turn, frame, since * period_s, jumped or not fresh)
     state.jump_count[side] = state.jump_is_swap[side] = 0
     state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
     state.hand_stamps_ns[side] = stamp_ns

@@ -36,8 +36,9 @@ from service.core.setpoint.bounds import (
     what_is_wrong,
 )
 from service.core.setpoint.tracker import GAP_WIDE, gains_for, waiting
+from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Target, Wanted, decided
+from service.core.skill.skill import decided
 
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once

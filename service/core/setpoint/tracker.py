@@ -10,7 +10,7 @@ from scipy.linalg import solve_continuous_are
 from service.config import Settings
 from service.core.arm.arm import acceleration_rate
 from service.core.frame import Vector
-from service.core.skill.skill import Target
+from service.core.skill.model import Target
 
 TRACKER_SHARE = 1.1  # of the rate at which joints change their acceleration: a quicker tracker swings with them
 TRACKER_STEP = 0.6  # of the loop's rate, likewise: it acts once a tick (swings from 1)

@@ -1,9 +1,12 @@
-"""The paper's skill: a KMP from where the hands are, or also were, to where the tool should be."""
+"""The paper's skill: a KMP from where the hands are, or also were, or how they are turned, to where
+the tool should be.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,28 +17,35 @@ from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.geometry import round_to
-from service.core.skill import ORDER
-from service.core.skill.memory import moving_features
+from service.core.skill import ORDER, TURNS
+from service.core.skill.memory import TURN_M, moving_features
 from service.core.skill.model import (
     COVARIANCE_ROUND_TO,
     MOTION_ROUND_TO,
     Arrays,
     Motion,
+    Seen,
     standard_deviation,
     standard_deviations,
 )
+from service.core.skill.stages import MOST_STAGES
 from service.core.skill.via_points import neighbourhoods
+
+TURN_INPUTS = 18  # the entries of both hands' rotation matrices
 
 
 @dataclass(frozen=True, eq=False)
 class HandsKMP:
     """A model whose inputs are both hands' positions (6) [m], then how far behind them rows of
-    their memory are (6 each) [m], whose outputs are the tool's (3) [m].
+    their memory are (6 each) [m], then, where they are turned, their rotation matrices times TURN_M
+    (9 each) [m]; whose outputs are the tool's (3) [m].
 
-    How still a hand is makes no difference. See `Model`.
+    A hand of which nobody says how it is turned is turned as in the mean of the demonstrations. See
+    `Model`.
     """
 
     primitive: KMP
+    turned: bool = False  # whether how the hands are turned is an input
 
     measure: ClassVar[str] = "the target's standard deviation"
     formats: ClassVar[tuple[int, ...]] = (1, 2)
@@ -43,25 +53,38 @@ class HandsKMP:
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {}
     gripper_ell: ClassVar[float] = 1000.0  # 2 cm of a hand
     names: ClassVar[tuple[str, ...]] = ()
+    delay_s: ClassVar[float] = 0.0
 
     @property
     def order(self) -> int:
         """How many rows of the memory are inputs."""
-        return min(max(int(self.primitive.inputs.shape[1]) // 6 - 1, 0), ORDER)
+        return min(max((int(self.primitive.inputs.shape[1]) - TURN_INPUTS * self.turned) // 6 - 1, 0), ORDER)
 
     @property
     def shape(self) -> tuple[int, int]:
-        return 6 * (1 + self.order), 3
+        return 6 * (1 + self.order) + TURN_INPUTS * self.turned, 3
+
+    @cached_property
+    def _usual_turns(self) -> Vector:
+        """How hands are turned (TURN_INPUTS,) in the mean [m]; none where that is no input."""
+        return np.asarray(self.primitive.base.inputs[:, 6 * (1 + self.order) :].mean(axis=0))
 
     @property
     def hands(self) -> Vector:
         return self.primitive.inputs[:, :6]
 
-    def predict(self, moving: Vector, stillness: Vector, known: Vector | None, past: Vector) -> Motion:
+    @property
+    def remembers(self) -> bool:
+        return self.order > 0
+
+    def belief(self, hands: Vector) -> Vector:
+        return np.zeros(MOST_STAGES)
+
+    def predict(self, seen: Seen, known: Vector | None) -> Motion:
         """Equation (8) of Huang et al. 2019, its derivatives along the motion, and its covariance,
         which takes as long as all else.
         """
-        moving = self._moving(moving, past)
+        moving = self._moving(seen.moving, seen.past, seen.turns)
         found = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
         covariance = found.covariance if known is None else known
         assert covariance is not None
@@ -69,28 +92,33 @@ class HandsKMP:
         deviation = _rounded(found.mean, found.velocity, found.acceleration, covariance, out)
         return Motion(out[0], out[1], out[2], out[3:], deviation)
 
-    def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
+    def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.primitive.mean(self.inputs(hands))
 
-    def covariances(self, hands: Vector, stillness: Vector | None = None) -> Vector:
+    def covariances(self, hands: Vector) -> Vector:
         return self.primitive.predict(self.inputs(hands)).covariance
 
     def gates_m(self, hands: Vector) -> Vector:
         return standard_deviations(self.covariances(hands))
 
-    def inputs(self, hands: Vector) -> Vector:
-        return np.pad(hands, ((0, 0), (0, 6 * self.order))) if self.order else hands
+    def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
+        if not (self.order or self.turned):
+            return hands
+        usual = self._usual_turns
+        return np.hstack([hands, np.zeros((len(hands), 6 * self.order)), np.tile(usual, (len(hands), 1))])
 
-    def moving_inputs(self, moving: Vector, stillness: Vector, past: Vector) -> tuple[Vector, Vector]:
-        moving = self._moving(moving, past)
+    def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
+        moving = self._moving(seen.moving, seen.past, seen.turns)
         return moving[0], moving[1]
 
-    def _moving(self, moving: Vector, past: Vector) -> Vector:
+    def _moving(self, moving: Vector, past: Vector, turns: Vector) -> Vector:
         """The inputs of hands that move so (3, 6), and how these move (3, I)."""
-        if not self.order:
+        if not (self.order or self.turned):
             return moving
+        if self.turned and not len(turns):
+            turns = np.tile(self._usual_turns / TURN_M, (TURNS, 1))
         out = np.empty((3, self.shape[0]))
-        moving_features(moving, past[: self.order], out)
+        moving_features(moving, past[: self.order], turns, out)
         return out
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> HandsKMP:
@@ -104,11 +132,11 @@ class HandsKMP:
         return replace(self, primitive=self.primitive.base)
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        return {}
+        return {"turned": np.array(1)} if self.turned else {}
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> HandsKMP:
-        return cls(KMP.from_arrays(arrays))
+        return cls(KMP.from_arrays(arrays), "turned" in arrays)
 
 
 @compiled

@@ -1,5 +1,6 @@
 """What there is to be remembered of hands: where they were in the last seconds, as a gamma memory
-has it (de Vries and Principe 1992), a row of filters each of which follows the one before.
+has it (de Vries and Principe 1992), a row of filters each of which follows the one before; and how
+they are turned, smoothed by such a row.
 """
 
 from __future__ import annotations
@@ -10,8 +11,11 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
+from service.core.skill import TURNS
 
 LAG_S = 0.5  # of each: with twice as much or half, recorded partners are predicted no better
+TURN_LAG_S = 0.03  # of each filter of a hand's turn: trackers tell it with some hundredths of a radian of noise
+TURN_M = 0.1  # a rotation matrix's entries count as distances so far from the hand, as of a tool fixed to it
 STEP_S = 0.004  # of the filters along a demonstration: as fine as the service's own periods
 LONGEST_S = 0.1  # that passes from one step to the next: while a hand is not seen, nothing is forgotten
 
@@ -25,25 +29,31 @@ def _follow(now: float, share: float, rows: Vector) -> None:
 
 
 @compiled
-def remember(states: Records, period_s: float) -> None:
-    """Hands as they are now enter the memory; of those that come first, it is full."""
+def remember(states: Records, period_s: float, lag_s: float) -> None:
+    """Hands as they are now enter the memory, whose filters have this lag; of those that come
+    first, it is full.
+    """
     state = states[0]
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
-        share = 1.0
+        share = turn_share = 1.0
         if state.memory_ticks[side] >= 0:
             passed_s = (state.tick - state.memory_ticks[side]) * period_s
-            share = 1.0 - math.exp(-min(passed_s, LONGEST_S) / LAG_S)
+            share = 1.0 - math.exp(-min(passed_s, LONGEST_S) / lag_s) if lag_s > 0.0 else 1.0
+            turn_share = 1.0 - math.exp(-passed_s / TURN_LAG_S)
         state.memory_ticks[side] = state.tick
         for i in range(3):
             _follow(state.hands[side, 0, i], share, state.memory[:, side, i])
+        for i in range(9):
+            _follow(state.hand_turns[side, i], turn_share, state.turns[:, side, i])
 
 
 @compiled
-def moving_features(moving: Vector, memory: Vector, out: Vector) -> None:
-    """Positions, and how far behind them the rows (K, D) of a memory are, of hands that move so
-    (3, D): with velocity and acceleration into `out` (3, (1 + K) D).
+def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) -> None:
+    """Positions, how far behind them the rows (K, D) of a memory are, and how hands are turned, the
+    last of `turns` (TURNS, E) times TURN_M, of hands that move so (3, D): with velocity and
+    acceleration into `out` (3, (1 + K) D + E).
     """
     width = moving.shape[1]
     for i in range(width):
@@ -58,29 +68,57 @@ def moving_features(moving: Vector, memory: Vector, out: Vector) -> None:
             out[0, column] = value - moving[0, i]
             out[1, column] = rate - moving[1, i]
             out[2, column] = bend - moving[2, i]
+    first = (1 + len(memory)) * width
+    for i in range(out.shape[1] - first):
+        before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
+        out[0, first + i] = TURN_M * last
+        out[1, first + i] = TURN_M * (between - last) / TURN_LAG_S
+        out[2, first + i] = TURN_M * (before - 2.0 * between + last) / TURN_LAG_S**2
 
 
 @compiled
-def _remembered(hands: Vector, period_s: float, order: int, steps: int, out: Vector) -> None:
-    share, width = 1.0 - math.exp(-period_s / steps / LAG_S), hands.shape[1]
-    memory = np.zeros((order, width))
-    for t in range(len(hands)):
-        for step in range(steps):
-            for i in range(width):
-                now = hands[t, i]
-                if t:
-                    now = hands[t - 1, i] + (step + 1) / steps * (hands[t, i] - hands[t - 1, i])
-                _follow(now, share if t else 1.0, memory[:, i])
-        for i in range(width):
-            out[t, i] = hands[t, i]
-            for row in range(order):
-                out[t, (row + 1) * width + i] = memory[row, i] - hands[t, i]
-
-
-def features(hands: Vector, period_s: float, order: int) -> Vector:
-    """Positions of hands (T, D) [m], and how far behind them `order` rows of their memory are, (T,
-    (1 + order) D) [m].
+def delayed(moving: Vector, memory: Vector, late_s: float, out: Vector) -> None:
+    """Hands that move so (3, D) as they were some time ago, into `out` (3, D): by the last row of
+    a memory (K, D) whose lags come to that; or as they will be, where it is less than nothing.
     """
-    out = np.empty((len(hands), (1 + order) * hands.shape[1]))
-    _remembered(np.ascontiguousarray(hands), period_s, order, max(1, math.ceil(period_s / STEP_S)), out)
+    lag_s = late_s / len(memory)
+    out[:] = moving
+    for i in range(moving.shape[1]):
+        if late_s <= 0.0:
+            out[0, i] -= late_s * moving[1, i]
+            continue
+        for row in range(len(memory)):
+            out[2, i] = (out[1, i] - (out[0, i] - memory[row, i]) / lag_s) / lag_s
+            out[1, i] = (out[0, i] - memory[row, i]) / lag_s
+            out[0, i] = memory[row, i]
+
+
+@compiled
+def _filtered(values: Vector, share: float, steps: int, out: Vector) -> None:
+    """Into `out` (T, K, D) the rows of filters along values (T, D), so many steps apart."""
+    rows = np.zeros(out.shape[1:])
+    for t in range(len(values)):
+        for step in range(steps):
+            for i in range(values.shape[1]):
+                now = values[t, i]
+                if t:
+                    now = values[t - 1, i] + (step + 1) / steps * (values[t, i] - values[t - 1, i])
+                _follow(now, share if t else 1.0, rows[:, i])
+        out[t] = rows
+
+
+def along(values: Vector, period_s: float, lag_s: float, rows: int) -> Vector:
+    """The rows (T, K, D) of filters of this lag along values (T, D)."""
+    out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / STEP_S))
+    _filtered(np.ascontiguousarray(values), 1.0 - math.exp(-period_s / steps / lag_s), steps, out)
     return out
+
+
+def features(hands: Vector, period_s: float, order: int, turns: Vector | None = None) -> Vector:
+    """Positions of hands (T, D) [m], how far behind them `order` rows of their memory are, and how
+    they are turned, where that is given as rotation matrices (T, E): (T, (1 + order) D + E) [m].
+    """
+    parts = [hands, (along(hands, period_s, LAG_S, order) - hands[:, None]).reshape(len(hands), -1)]
+    if turns is not None:
+        parts.append(TURN_M * along(turns, period_s, TURN_LAG_S, TURNS)[:, -1])
+    return np.hstack(parts)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
@@ -14,29 +15,25 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.config import Reach, Settings
+from service.contract.records import Reason
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Record, Vector, as_array
 from service.core.intake.hand_estimator import STILL
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import remember
-from service.core.skill.model import Model
+from service.core.skill.memory import LAG_S, delayed, remember
+from service.core.skill.model import COVARIANCE_ROUND_TO, NORMAL, REGION_95, Model, Regions, Seen, Target, Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedGripper, LearnedOrientation, Turn
-from service.core.skill.task_parameterized import TaskParameterized
+from service.core.skill.staged import StagedKMP
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
 OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
 MOVES_S = 0.5  # for so long it is let be once it was told to move
 THERE_M = 0.01  # a tool that is no farther off is where it is to be
-
-
-class Target(NamedTuple):
-    """Where the tool is to go [m, m/s, m/s²], and whether that is not quite what was asked for."""
-
-    position: Vector
-    velocity: Vector
-    acceleration: Vector
-    clamped: bool
+UNSURE_M = 0.10  # a 95 % region that reaches farther is told: so far off, a tool is at another thing than was meant
+TRAIL_S = 0.2  # over which the tool's motion counts: who is late is still off when the prediction has come to rest
+NEVER = -(2**60)  # a tick so long ago that nothing is left of it
+SURE_SHARE = 0.8  # of that, under which it is told no longer: what trembles about the one changes nothing
 
 
 def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach) -> Target:
@@ -129,7 +126,9 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
     return vector
 
 
-MODELS: tuple[type[Model], ...] = (HandsKMP, TaskParameterized)
+UNTOLD = np.empty((0, 18))  # of hands of which nobody says how they are turned
+
+MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
 """All that a skill may predict with."""
 
 Known: TypeAlias = tuple[Vector, Vector, float]
@@ -143,8 +142,9 @@ class Prediction(NamedTuple):
     position: Vector  # (3,) [m]
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
-    covariance: Vector  # (3, 3) [m²]
+    covariance: Vector  # (3, 3) [m²] as the model says it: see `Regions`
     gate_m: float  # [m] what is compared with the skill's threshold, see `Model.measure`
+    torn: float  # how probable it is that the tool should be elsewhere, in another stage
     turn: Turn
     closure: float  # of the gripper, 0 (open) to 1 (closed); NO_GRIPPER where the skill has none
 
@@ -169,6 +169,7 @@ class Skill:
     tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
     digest: bytes = bytes(16)  # 16 bytes of its file that tell it from any other
     conductor: int | None = None  # side of the hand that conducts alone: the other makes no difference
+    regions: Regions = NORMAL
 
     def predict(
         self,
@@ -179,47 +180,61 @@ class Skill:
         *,
         before: Known | None = None,
         past: Vector | None = None,
+        turns: Vector | None = None,
+        belief: Vector | None = None,
+        period_s: float = 0.0,
+        lead_s: float = 0.0,
     ) -> Prediction:
-        """The prediction for hands (2, 3) [m] that move so, and are so still (2,).
+        """The prediction for hands (2, 3) [m] that move so and are so still (2,), `lead_s` earlier
+        than the teacher.
 
         Covariances take as long as all else; what was predicted just `before` may be given.
-        `past` (ORDER, 2, 3) [m] is the memory of the hands; they have been there all along where it
-        is not given.
+        `past` (ORDER, 2, 3) [m] is the memory of the hands, `belief` (MOST_STAGES,) that in each
+        stage; they have been there all along where these are not given. `turns` (TURNS, 2, 9) is
+        how they are turned, as `remember` keeps it; else as in the demonstrations. A belief that
+        is `period_s` old is brought up to date.
 
         Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
         that follows.
         """
-        stacked = np.empty((3 + ORDER, 2, 3))
-        stacked[0], stacked[1], stacked[2] = hands, velocities, accelerations
-        stacked[3:] = hands if past is None else past
+        now = self._moving(hands, velocities, accelerations)
+        behind = np.tile(now[0], (ORDER, 1)) if past is None else self._conducting(past).reshape(ORDER, 6)
+        if belief is None:
+            belief = self.model.belief(now[0])
+        moving, late_s = now, self.model.delay_s - lead_s
+        if late_s:
+            moving = np.empty((3, 6))
+            delayed(now, behind, late_s, moving)
         if self.conductor is not None:
-            stacked[:, 1 - self.conductor] = stacked[:, self.conductor]
             stillness = stillness[[self.conductor] * 2]
-        moving, behind = stacked[:3].reshape(3, 6), stacked[3:].reshape(ORDER, 6)
-        motion = self.model.predict(moving, stillness, None if before is None else before[0], behind)
+        told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
+        seen = Seen(moving, stillness, behind, told, now, belief, period_s)
+        motion = self.model.predict(seen, None if before is None else before[0])
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)
-        return Prediction(*motion, *self._beside(moving, stillness, behind, before))
-
-    def _beside(self, moving: Vector, stillness: Vector, past: Vector, before: Known | None) -> tuple[Turn, float]:
-        """The orientation, learned or constant, and the closure of the gripper."""
-        at, velocity = self.model.moving_inputs(moving, stillness, past)
+        at, velocity = self.model.moving_inputs(seen)
         turn = self.constant_turn
         if self.turn is not None:
             turn = self.turn.predict(at, velocity, covariance=None if before is None else before[1])
         if self.gripper is None or before is not None:
-            return turn, NO_GRIPPER if before is None else before[2]
-        return turn, self.gripper.predict(at)
+            return Prediction(*motion, turn, NO_GRIPPER if before is None else before[2])
+        return Prediction(*motion, turn, self.gripper.predict(at))
 
-    def mean(self, hands: Vector, stillness: Vector | None = None) -> Vector:
-        """The tool (T, 3) [m] for hands (T, 6) [m] that are so still (T, 2), or wholly."""
-        return self.model.mean(self.conducting(hands), stillness)
+    def _moving(self, hands: Vector, velocities: Vector, accelerations: Vector) -> Vector:
+        """Both hands' motion (3, 6)."""
+        return self._conducting(np.array([hands, velocities, accelerations])).reshape(3, 6)
+
+    def _conducting(self, both: Vector) -> Vector:
+        """Of both hands (M, 2, D), one that makes no difference is where the other is."""
+        return both if self.conductor is None else both[:, [self.conductor] * 2]
+
+    def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
+        """The tool (T, 3) [m] for hands (T, 6) [m] at rest; at these via-points, if given."""
+        return self.model.mean(self.conducting(hands), names)
 
     def conducting(self, hands: Vector) -> Vector:
         """Hands (T, 6) [m] of which one that makes no difference is where the other is."""
-        if self.conductor is None:
-            return hands
-        return np.tile(hands[:, 3 * self.conductor : 3 * self.conductor + 3], 2)
+        return self._conducting(np.reshape(hands, (-1, 2, 3))).reshape(-1, 6)
 
     @property
     def hands(self) -> Vector:
@@ -238,60 +253,133 @@ class Skill:
         return np.stack([hands.min(axis=0), hands.max(axis=0)])
 
 
-class Wanted(NamedTuple):
-    """What the skill asks for: the target in the workspace, and how the tool is to turn there."""
-
-    target: Target
-    orientation: Vector  # (4,) quaternion x y z w
-    turning: Vector  # (3,) [rad/s]
-    gate_m: float  # what is compared with the skill's threshold
+MOST_TORN, EASE = 0.3, 0.5  # probability that the tool should be elsewhere, which is told; a share below goes on
+TORN_S = 0.3  # so long: from one stage to the next it passes by
+NO_STAGE = -1  # of a frame
+AMBIGUOUS = int(Reason.AMBIGUOUS)
 
 
 class SkillStage:
     """The skill in force; what it predicted at the newest sample of a hand is kept in the state."""
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
-        self.skill, self._reach, self._period_s = skill, settings.reach, settings.period_s
+        self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
+        self._take(skill)
+
+    def _take(self, skill: Skill) -> None:
+        self.skill = skill
+        delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
+        self._lag_s = LAG_S if skill.model.remembers else delay_s / ORDER
 
     def adopt(self, state: Record, skill: Skill) -> None:
-        """Another skill from now on."""
-        self.skill = skill
+        """Another skill from now on; of one with the same via-points the stage is known already."""
+        if skill.model.names != self.skill.model.names:
+            state["stage_belief"] = 0.0
+        if skill.model.remembers != self.skill.model.remembers or skill.model.delay_s != self.skill.model.delay_s:
+            state["memory_ticks"] = -1
+        self._take(skill)
         state["skill"] = np.frombuffer(skill.digest, np.uint8)
         state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
+        state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
 
     def step(self, state: Record, frame: Record) -> Wanted:
         """What the skill asks for with the hands as they are, which must be known.
 
         Covariances and the gripper are predicted anew only when a sample of a hand has come.
         """
-        remember(as_array(state), self._period_s)
+        remember(as_array(state), self._period_s, self._lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
+        belief = state["stage_belief"]
         is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
         before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
         found = self.skill.predict(
-            hands[:, 0], hands[:, 1], hands[:, 2], state["hand_stillness"], before=before, past=state["memory"]
+            hands[:, 0],
+            hands[:, 1],
+            hands[:, 2],
+            state["hand_stillness"],
+            before=before,
+            past=state["memory"],
+            turns=state["turns"],
+            belief=belief,
+            period_s=self._period_s,
+            lead_s=self._lead_s,
         )
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
             state["closure"] = found.closure
         target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
         _write(frame, found, target)
+        passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
+        recent_mps = recent(found.position, passed_s, state["trail"])
+        reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
+        state["unsure"] = reach_m > (SURE_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
         frame["closure"] = state["closure"]
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m)
+        _tell_stage(belief, frame)
+        most = MOST_TORN * (EASE if state["reason"] == AMBIGUOUS else 1.0)
+        if found.torn <= most:
+            state["sure_tick"] = tick
+        torn = (tick - int(state["sure_tick"])) * self._period_s > TORN_S
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn)
+
+    def set_stage(self, state: Record, name: str) -> None:
+        """The task has come to the via-point of this name. One that it has not changes nothing."""
+        if name in (names := self.skill.model.names):
+            state["stage_belief"] = 0.0
+            state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
 
     def nothing(self, state: Record, frame: Record) -> None:
         """Into the frame that nothing is predicted: the target is the setpoint."""
+        state["unsure"], state["sure_tick"] = 0, state["tick"]
         frame["target"], frame["orientation"], frame["closure"] = (
             state["setpoint"][0],
             state["orientation"],
             state["closure"],
         )
+        _tell_stage(state["stage_belief"], frame)
+
+
+def _tell_stage(belief: Vector, frame: Record) -> None:
+    """Into the frame which stage it is, most probably, and how probable that is."""
+    most = int(belief.argmax())
+    frame["stage_belief"] = belief[most]
+    frame["stage"] = most if belief[most] > 0.0 else NO_STAGE
 
 
 def _write(frame: Record, found: Prediction, target: Target) -> None:
     frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-    frame["covariance"], frame["gate_m"] = found.covariance, found.gate_m
+    frame["gate_m"] = found.gate_m
     frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
+
+
+@compiled
+def recent(position: Vector, passed_s: float, trail: Vector) -> Vector:
+    """The tool's velocity over the last TRAIL_S (3,) [m/s], by the trail (3,) [m] that it leaves:
+    a filter of first order, which follows.
+    """
+    out, share = np.empty(3), 1.0 - math.exp(-passed_s / TRAIL_S)
+    for i in range(3):
+        trail[i] += share * (position[i] - trail[i])
+        out[i] = (position[i] - trail[i]) / TRAIL_S
+    return out
+
+
+@compiled
+def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, out: Vector) -> float:
+    """A model's covariance (3, 3) [m²], of a tool that lately moved so (3,) [m/s], as `Regions` has
+    it, rounded, into `out`; how far its 95 % region reaches [m].
+    """
+    for i in range(3):
+        for j in range(3):
+            found = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
+            out[i, j] = np.rint(found * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
+    mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0  # the greatest eigenvalue: Smith 1961
+    a, b, c = out[0, 0] - mean, out[1, 1] - mean, out[2, 2] - mean
+    d, e, f = out[0, 1], out[0, 2], out[1, 2]
+    spread = math.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
+    if spread > 0.0:
+        half = 0.5 * (a * b * c + 2.0 * d * e * f - a * f * f - b * e * e - c * d * d) / spread**3
+        mean += 2.0 * spread * math.cos(math.acos(min(max(half, -1.0), 1.0)) / 3.0)
+    return math.sqrt(REGION_95 * max(mean, 0.0))
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:

@@ -1,0 +1,399 @@
+"""Stages of a task, each from one via-point to the next: how far along it the hands are, in which
+one (a filtered belief, which tells visits of a place apart), and where the tool should be then.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.compiled import compiled
+from kmp.kernel_row import add_weighted
+from service.core.frame import Record, Records, Vector
+from service.core.geometry import round_to
+from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
+from service.core.skill.via_points import NEAR
+
+MOST_STAGES = 64  # that a state has room for
+SHARPNESS = 4.0  # power of the shares of the way of a hand that rests
+AT_M = 0.05  # on a way of full size, a hand that rests as near to an end belongs to it
+AWAY_M = 0.10  # one that rests as far from both waits on its way
+FULL_SIZE_M = 0.3  # on a shorter way so many times less is near ...
+LEAST_SIZE = 0.1  # ... down to this share
+STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # a hand's way squared that does not move; what the tool goes with
+WITH_HAND = 4  # power of the share with which the tool goes with a hand to, or from, a via-point alone
+NEAR_M = 0.08  # of a via-point, within which one stage ends and the next begins
+FORWARD, BACK = 2.0, 0.6  # [1/s] from one stage to the next while hands are there, and to the one before
+ASTRAY = 1e-4  # [1/s] to any other, so that a belief that is wrong comes right
+CYCLE = 0.2  # [1/s] from the last stage to the first, while hands are where that begins
+CORRELATED_S = 0.3  # samples that follow each other so soon tell the same
+FARTHEST = 9.0  # squared deviations beyond which a hand is nowhere: it tells nothing more
+DIRECTED, HASTE_MPS = 1.0, 0.15  # how much it tells that a hand goes the stage's way, and how fast it must be
+RESTLESS = 0.7  # how much of its speed tells against a stage in which it stays
+AT_ONCE = 3.0  # samples that tell as much as the first one does: nothing is known before it
+FIRST = 10.0  # times as probable as any other is the first stage, at the beginning
+ROUND_TO = 1e9  # beliefs, so that machines that differ in the last bits agree
+
+OUTPUTS = 4  # how far along the tool is, and its offset
+ALIKE = 0.2  # width, in the inputs, of what is near to a moment when errors are looked up
+OTHERS_ALIKE = 0.05  # what an error in another stage counts there
+LEAST_STD_M = 0.003  # of a prediction, each axis
+STEP_S = 0.02  # of differences along the hands' motion
+CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
+MAX_MPS2 = 3.0  # of a target's acceleration
+BELIEVED = 0.01  # a stage that is less probable is left out
+TORN_M = 0.05  # from the most probable stage's tool: farther apart there are two of them
+
+# One stage, in compiled loops: its ends, for the left and the right hand and the tool.
+STAGE = np.dtype(
+    [
+        ("begins", np.float64, (2, 3)),  # [m] where each hand is at its begin,
+        ("way", np.float64, (2, 3)),  # [m] and how it goes to its end
+        ("square", np.float64, (2,)),  # [m²] of the way; STAYS
+        ("off", np.float64, (2,)),  # [m] how far each hand is off that way, root mean square
+        ("tool", np.float64, (3,)),  # [m] where the tool is at its begin,
+        ("tool_way", np.float64, (3,)),  # [m] and how it goes
+        ("follow", np.int64, (2,)),  # the hand that the tool goes with, at its begin and at its end
+    ]
+)
+
+
+# What is of one size in all stages, in compiled loops.
+PLACED = np.dtype(
+    [
+        ("scale", np.float64),  # of the kernel exp(-scale |difference|²)
+        ("likeness", np.float64),  # what a centre of another stage counts
+        ("std", np.float64),  # [m] how sure the via-points' positions are, of each axis
+        ("prior", np.float64, (OUTPUTS,)),  # far from all data
+    ]
+)
+
+# What is known of the hands, in compiled loops: see `model.Seen`.
+SEEN = np.dtype(
+    [
+        ("moving", np.float64, (3, 6)),
+        ("now", np.float64, (3, 6)),
+        ("stillness", np.float64, (2,)),
+        ("period_s", np.float64),
+    ]
+)
+
+
+@compiled
+def on_way(hand: Vector, stage: Record, side: int) -> tuple[float, float]:
+    """How far along its way in a stage a hand (3,) is, 0 to 1, and how far off it [m].
+
+    A hand that stays is there.
+    """
+    begins, way, square = stage["begins"][side], stage["way"][side], stage["square"][side]
+    along = 0.0
+    if square > STAYS:
+        for i in range(3):
+            along += (hand[i] - begins[i]) * way[i]
+        along = min(max(along / square, 0.0), 1.0)
+    off = 0.0
+    for i in range(3):
+        off += (hand[i] - begins[i] - along * way[i]) ** 2
+    return along if square > STAYS else 1.0, math.sqrt(off)
+
+
+@compiled
+def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
+    """As `on_way`, of a hand (3,) that is so still, 0 to 1: one that rests near an end is there."""
+    along, _ = on_way(hand, stage, side)
+    square = stage["square"][side]
+    if square <= STAYS:
+        return along
+    long = math.sqrt(square)
+    size = min(max(long / FULL_SIZE_M, LEAST_SIZE), 1.0)
+    near = min(max((AWAY_M - min(along, 1.0 - along) * long / size) / (AWAY_M - AT_M), 0.0), 1.0)
+    power = 1.0 + (SHARPNESS - 1.0) * near * still
+    one, other = along**power, (1.0 - along) ** power
+    return float(one / (one + other))
+
+
+@compiled
+def along_both(hands: Vector, still: Vector, stage: Record) -> tuple[float, float]:
+    """How far along a stage both hands (6,) are, that are so still (2,)."""
+    return along_way(hands[:3], still[0], stage, 0), along_way(hands[3:], still[1], stage, 1)
+
+
+@compiled
+def _near(hands: Vector, stage: Record, at_end: float) -> float:
+    """How near (0 to 1) both hands (6,) are to where a stage begins, or ends."""
+    square = 0.0
+    for side in range(2):
+        for i in range(3):
+            square += (hands[3 * side + i] - stage["begins"][side, i] - at_end * stage["way"][side, i]) ** 2
+    return math.exp(-0.5 * square / NEAR_M**2)
+
+
+@compiled
+def _likely(moving: Vector, stage: Record) -> float:
+    """The logarithm of how probable hands are in a stage that move so (3, 6)."""
+    out = 0.0
+    for side in range(2):
+        here = slice(3 * side, 3 * side + 3)
+        _, off = on_way(moving[0, here], stage, side)
+        out -= 0.5 * min((off / stage["off"][side]) ** 2, FARTHEST)
+        square, speed, along = stage["square"][side], 0.0, 0.0
+        for i in range(3):
+            speed += moving[1, 3 * side + i] ** 2
+            along += moving[1, 3 * side + i] * stage["way"][side, i]
+        goes = along / math.sqrt(square) if square > STAYS else -RESTLESS * math.sqrt(speed)
+        out += DIRECTED * math.tanh(goes / HASTE_MPS)
+    return out
+
+
+@compiled
+def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) -> None:
+    """The belief (K or more,) in each of K stages, a period later, of hands that move so (3, 6).
+
+    A forward filter of a hidden Markov model (Rabiner 1989). One of zeros begins anew.
+    """
+    count, hands = len(stages), moving[0]
+    total, share = 0.0, min(period_s / CORRELATED_S, 1.0)
+    for k in range(count):
+        total += belief[k]
+    if total <= 0.0:
+        share = AT_ONCE
+        for k in range(count):
+            belief[k] = (FIRST if k == 0 else 1.0) / (count - 1 + FIRST)
+    elif count > 1:
+        before = belief[0]
+        for k in range(count - 1):
+            near = _near(hands, stages[k + 1], 0.0)
+            on = min(FORWARD * period_s * near, 0.5) * before
+            back = min(BACK * period_s * near, 0.5) * belief[k + 1]
+            before = belief[k + 1]
+            belief[k] += back - on
+            belief[k + 1] += on - back
+        again = min(CYCLE * period_s * _near(hands, stages[0], 0.0), 0.5) * belief[count - 1]
+        belief[count - 1] -= again
+        belief[0] += again
+        for k in range(count):
+            belief[k] += ASTRAY * period_s * (1.0 / count - belief[k])
+    told = np.empty(count)
+    for k in range(count):
+        told[k] = _likely(moving, stages[k])
+    most = told.max()
+    total = 0.0
+    for k in range(count):
+        belief[k] *= math.exp((told[k] - most) * share)
+        total += belief[k]
+    for k in range(count):
+        belief[k] = round(belief[k] / total * ROUND_TO) / ROUND_TO
+
+
+@compiled
+def off_all(hands: Vector, stages: Records) -> float:
+    """How far the farther of both hands (6,) is off its ways in all stages, rounded [m]."""
+    farther = 0.0
+    for side in range(2):
+        nearest = math.inf
+        for k in range(len(stages)):
+            nearest = min(nearest, on_way(hands[3 * side : 3 * side + 3], stages[k], side)[1])
+        farther = max(farther, nearest)
+    return float(np.rint(farther * MOTION_ROUND_TO) / MOTION_ROUND_TO)
+
+
+@compiled
+def _tool_in(
+    hands: Vector, still: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
+) -> None:
+    """The tool into `out` (3,) in one stage: equation (8) of Huang et al. 2019, and back."""
+    stage, found = stages[k], np.empty(OUTPUTS)
+    one, other = along_both(hands, still, stage)
+    found[:] = size["prior"]
+    for r in range(len(rows)):
+        value = math.exp(-size["scale"] * ((one - rows[r, 0]) ** 2 + (other - rows[r, 1]) ** 2))
+        if rows[r, 2] != k:
+            value *= size["likeness"]
+        for o in range(OUTPUTS):
+            found[o] += value * rows[r, 3 + o]
+    share = found[0]
+    for i in range(3):
+        out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
+    share = min(max(share, 0.0), 1.0)
+    follow = stage["follow"]
+    power = 1 if follow[0] == follow[1] else WITH_HAND
+    for end in range(2):
+        side = follow[end]
+        if side >= 0:
+            goes = (share if end else 1.0 - share) ** power
+            for i in range(3):
+                out[i] += goes * (hands[3 * side + i] - stage["begins"][side, i] - end * stage["way"][side, i])
+    if len(pulls):
+        add_weighted(hands, pulls, NEAR, out)
+
+
+@compiled
+def tool_at(
+    hands: Vector,
+    still: Vector,
+    belief: Vector,
+    stages: Records,
+    sizes: Records,
+    rows: Vector,
+    pulls: Vector,
+    out: Vector,
+) -> None:
+    """The tool into `out` (3,), its mean over all stages."""
+    in_one, total = np.empty(3), 0.0
+    out[:] = 0.0
+    for k in range(len(stages)):
+        if belief[k] >= BELIEVED:
+            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, in_one)
+            total += belief[k]
+            for i in range(3):
+                out[i] += belief[k] * in_one[i]
+    for i in range(3):
+        out[i] /= total
+
+
+@compiled
+def _torn(
+    hands: Vector, still: Vector, belief: Vector, stages: Records, sizes: Records, rows: Vector, pulls: Vector
+) -> float:
+    """How probable stages are whose tool is elsewhere than in the most probable one."""
+    most = 0
+    for k in range(len(stages)):
+        if belief[k] > belief[most]:
+            most = k
+    if belief[most] > 1.0 - BELIEVED:
+        return 0.0
+    usual, other, out = np.empty(3), np.empty(3), 0.0
+    _tool_in(hands, still, most, stages, sizes[0], rows, pulls, usual)
+    for k in range(len(stages)):
+        if belief[k] >= BELIEVED and k != most:
+            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, other)
+            square = 0.0
+            for i in range(3):
+                square += (other[i] - usual[i]) ** 2
+            if square > TORN_M**2:
+                out += belief[k]
+    return out
+
+
+@compiled
+def _motion(
+    moving: Vector,
+    still: Vector,
+    belief: Vector,
+    stages: Records,
+    sizes: Records,
+    rows: Vector,
+    pulls: Vector,
+    out: Vector,
+) -> None:
+    """Tool, velocity and acceleration into `out` (6, 3), by differences along the hands'
+    motion. One that only trembles moves nothing.
+    """
+    tools, hands = np.empty((3, 3)), np.empty((3, 6))  # a step behind, now, a step ahead
+    for side in range(2):
+        square = 0.0
+        for i in range(3 * side, 3 * side + 3):
+            square += moving[1, i] * moving[1, i]
+        goes = 1.0 - math.exp(-((math.sqrt(square) / CALM_MPS) ** 4))
+        for i in range(3 * side, 3 * side + 3):
+            step, bend = STEP_S * goes * moving[1, i], 0.5 * STEP_S**2 * goes * moving[2, i]
+            hands[0, i], hands[1, i], hands[2, i] = moving[0, i] - step + bend, moving[0, i], moving[0, i] + step + bend
+    for n in range(3):
+        tool_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
+    for i in range(3):
+        bend = (tools[2, i] - 2.0 * tools[1, i] + tools[0, i]) / STEP_S**2
+        out[0, i] = tools[1, i]
+        out[1, i] = (tools[2, i] - tools[0, i]) / (2.0 * STEP_S)
+        out[2, i] = min(max(bend, -MAX_MPS2), MAX_MPS2)
+
+
+@compiled
+def scatter(
+    hands: Vector,
+    still: Vector,
+    belief: Vector,
+    stages: Records,
+    sizes: Records,
+    rows: Vector,
+    errors: Vector,
+    out: Vector,
+) -> None:
+    """The mean square (3, 3) of errors near there, what stages differ by, via-points are off by."""
+    out[:] = 0.0
+    nothing, mean, tool, in_all = np.empty((0, 9)), np.empty(3), np.empty(3), 0.0
+    tool_at(hands, still, belief, stages, sizes, rows, nothing, mean)
+    weights = np.empty(len(errors))
+    for k in range(len(stages)):
+        if belief[k] < BELIEVED:
+            continue
+        in_all += belief[k]
+        one, other = along_both(hands, still, stages[k])
+        total = 1e-9
+        for m in range(len(errors)):
+            square = (one - errors[m, 0]) ** 2 + (other - errors[m, 1]) ** 2
+            weights[m] = math.exp(-0.5 * square / ALIKE**2) * (1.0 if errors[m, 2] == k else OTHERS_ALIKE)
+            total += weights[m]
+        _tool_in(hands, still, k, stages, sizes[0], rows, nothing, tool)
+        for i in range(3):
+            for j in range(i, 3):
+                found = (tool[i] - mean[i]) * (tool[j] - mean[j])
+                for m in range(len(errors)):
+                    found += weights[m] * errors[m, 3 + i] * errors[m, 3 + j] / total
+                out[i, j] += belief[k] * found
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= in_all
+            out[j, i] = out[i, j]
+        out[i, i] += sizes[0]["std"] ** 2 + LEAST_STD_M**2
+
+
+@compiled
+def predicted(
+    seen: Records,
+    belief: Vector,
+    stages: Records,
+    sizes: Records,
+    rows: Vector,
+    pulls: Vector,
+    errors: Vector,
+    out: Vector,
+) -> tuple[float, float]:
+    """Brings the belief up to date; tool, velocity, acceleration and covariance, rounded, into
+    `out` (6, 3), the last none without errors; what the gate compares [m], and how torn it is.
+    """
+    one = seen[0]
+    moving, still = one["moving"], one["stillness"]
+    if one["period_s"] > 0.0:
+        recognise(belief, one["now"], one["period_s"], stages)
+    _motion(moving, still, belief, stages, sizes, rows, pulls, out)
+    if len(errors):
+        scatter(moving[0], still, belief, stages, sizes, rows, errors, out[3:])
+    else:
+        out[3:] = 0.0
+    round_to(out[:3], MOTION_ROUND_TO)
+    round_to(out[3:], COVARIANCE_ROUND_TO)
+    torn = _torn(moving[0], still, belief, stages, sizes, rows, pulls)
+    return off_all(one["now"][0], stages), torn
+
+
+@compiled
+def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -> None:
+    """The beliefs (T, K) along hands that move so (T, 3, 6)."""
+    for t in range(len(moving)):
+        if t:
+            out[t] = out[t - 1]
+        recognise(out[t], moving[t], periods_s, stages)
+
+
+@compiled
+def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
+    """How far along the stages of these numbers (T,) hands (T, 6) are that are so still (T, 2), and
+    how far off their ways [m], into `out` (T, 4).
+    """
+    for t in range(len(hands)):
+        for side in range(2):
+            hand = hands[t, 3 * side : 3 * side + 3]
+            out[t, side] = along_way(hand, stillness[t, side], stages[labels[t]], side)
+            _, out[t, 2 + side] = on_way(hand, stages[labels[t]], side)

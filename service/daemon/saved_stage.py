@@ -1,0 +1,43 @@
+"""The stage of the task that survives a restart: a small file, written anew whenever it changes."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+
+from service.config import Settings
+from service.core.skill.skill import Skill
+from service.daemon.saved_via_points import state_folder
+
+LONGEST_S = 600.0  # a restart that takes longer is of another job: its hands tell where it begins
+SURE = 0.5  # a stage that is less probable is not worth keeping
+
+
+class SavedStage:
+    """The via-point that the task came from last, on disk; written atomically."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._path = state_folder(settings) / "stage.json"
+        self._kept = ""
+
+    def read(self, skill: Skill) -> str:
+        """The via-point that a task of this skill has come to lately; empty: not known."""
+        try:
+            age_s = time.time() - self._path.stat().st_mtime
+            saved = json.loads(self._path.read_bytes())
+            name = saved["via_point"] if saved["learned_from"] == skill.learned_from else ""
+        except (OSError, ValueError, KeyError, TypeError):
+            return ""
+        return name if 0.0 <= age_s < LONGEST_S and name in skill.model.names else ""
+
+    def keep(self, skill: Skill, stage: tuple[str, ...], belief: float) -> None:
+        """Takes note of the stage that it is now, from and to a via-point. Raises OSError."""
+        if not stage or belief < SURE or stage[0] == self._kept:
+            return
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        draft: Path = self._path.with_suffix(f".{os.getpid()}.new")
+        draft.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": stage[0]}))
+        draft.replace(self._path)
+        self._kept = stage[0]

@@ -1,0 +1,203 @@
+"""Division of demonstrations that name the via-points of a task into its stages, from via-point to
+via-point.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.contract.requests import ViaPoint
+from service.core.frame import Records, Vector
+from service.core.intake.hand_estimator import stillness_of
+from service.core.skill.stages import (
+    HASTE_MPS,
+    LEFT,
+    MOST_STAGES,
+    NONE,
+    RIGHT,
+    WITH_HAND,
+    along_all,
+)
+from service.core.skill.task import Indices, NamedViaPoints, Task
+from service.learning.demonstration import Demonstration
+from service.learning.skill_file import SkillError
+
+SMOOTHED_S = 0.28  # width of the window over the hands in demonstrations
+SAME_M = 0.05  # positions of a hand that are no farther apart, in any demonstration, are one
+OFF_M, FARTHEST = 0.06, 25.0  # of a way, in whose squares stages are told apart; and the most that counts
+DIRECTED = 2.0  # what it counts that hands and tool go the stage's way
+CORRELATED_S = 0.2  # samples that follow each other so soon tell the same
+NEXT, ANOTHER, LATER = 2.0, 12.0, 3.0  # what it costs to go to the next stage, to any other, to begin a stage later
+NEAR = 0.15  # of the way, to an end of it
+FAR_M = 0.10  # a via-point that the tool never came so near is given wrong
+FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
+
+
+def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
+    """The task of demonstrations, or why there is none, empty where no via-points are named."""
+    named = [tuple(point.name for point in one.places) for one in demonstrations]
+    if not any(named):
+        return ""
+    if len(set(map(frozenset, named))) > 1:
+        return "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
+    names = Counter(named).most_common(1)[0][0]
+    if not 2 <= len(names) <= MOST_STAGES + 1:
+        return f"{len(names)} named via-points: 2 to {MOST_STAGES + 1} are learned between"
+    at = np.array([[[*p.left, *p.right] for p in ordered(one.places, names)] for one in demonstrations])
+    corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
+    return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)]))
+
+
+def _corners(at: Vector) -> Indices:
+    """Which of its own positions a hand is at, (N,), for those (D, N, 3) in D demonstrations."""
+    out: list[int] = []
+    for i in range(at.shape[1]):
+        alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
+        out.append(alike[0] if alike else max(out, default=-1) + 1)
+    return np.array(out, np.int64)
+
+
+def ordered(points: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
+    by_name = {point.name: point for point in points}
+    return (by_name[name] for name in names)
+
+
+def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
+    """In words, which via-points the tool never came near in which demonstrations, by their names.
+
+    Raises SkillError for one that it came near in none.
+    """
+    warned = []
+    for named, follow in zip(task.names, task.follow.tolist(), strict=True):
+        off = [float(off_via_point(one, next(ordered(one.places, (named,))), follow).min()) for one in demonstrations]
+        if min(off) > FAR_M:
+            raise SkillError(
+                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
+                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
+                "where it was in these demonstrations?"
+            )
+        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M]
+        if missed:
+            warned.append(f"via-point {named!r}: the tool never came near it in {', '.join(missed)}")
+    return warned
+
+
+def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) -> Vector:
+    """The tool's distance (T,) from a via-point [m], there or with the hand that it follows."""
+    off = demonstration.tool[:, :3] - point.tool
+    out: Vector = np.linalg.norm(off, axis=1)
+    if follow == NONE:
+        return out
+    hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (point.left, point.right)[follow]
+    return np.asarray(np.minimum(out, np.linalg.norm(off - hand, axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """A demonstration (T samples) in the stages of its task: which one it is (T,), and what is
+    learned of it, how far along hands (T, 2) and tool (T,) are, and the tool's offset (T, 3) [m].
+    """
+
+    at: NamedViaPoints
+    stages: Records  # (K,) where they were
+    moving: Vector  # (T, 3, 6) the hands' motion
+    stillness: Vector  # (T, 2) of each hand
+    tool: Vector  # (T, 3)
+    labels: Indices
+    along: Vector
+    off: Vector  # (T, 2) [m] how far hands are off their ways
+    wanted: Vector  # (T, OUTPUTS)
+    period_s: float
+
+    @staticmethod
+    def of(task: Task, demonstration: Demonstration, late_s: float) -> Encoded:
+        """The demonstration of a teacher who is so late."""
+        period_s = demonstration.period_s
+        hands = _smoothed(demonstration.hands, round(SMOOTHED_S / period_s))
+        velocities = np.gradient(hands, period_s, axis=0)
+        moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
+        at = NamedViaPoints.of(demonstration.places)
+        stages, tool = task.stages(at, np.full((len(task.names) - 1, 2), OFF_M)), demonstration.tool[:, :3]
+        labels = _divided(stages, moving, tool, period_s)
+        steps = min(round(late_s / period_s), len(hands) - 1)
+        stillness = stillness_of(velocities, period_s)
+        late, rested = (
+            np.concatenate([np.repeat(x[:1], steps, axis=0), x[: len(x) - steps]]) for x in (hands, stillness)
+        )
+        found = np.empty((len(hands), 4))
+        along_all(late, rested, labels, stages, found)
+        along, off = found[:, :2], found[:, 2:]
+        begins, way = stages["tool"][labels], stages["tool_way"][labels]
+        square = (way**2).sum(axis=1)
+        goes = square > SAME_M**2
+        share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
+        share = share.clip(0.0, 1.0)
+        offset = tool - begins - share[:, None] * way - _followed(stages, labels, late, share)
+        wanted = np.column_stack([share, offset])
+        return Encoded(at, stages, moving, stillness, tool, labels, along, off, wanted, period_s)
+
+    def near(self, corner: tuple[float, float], stages: Sequence[int]) -> NDArray[np.bool_]:
+        """Where (T,) hands are so far along one of these stages, about."""
+        return np.asarray(np.isin(self.labels, stages) & (np.abs(self.along - corner).max(axis=1) < NEAR))
+
+    def rows(self, count: int) -> Indices:
+        """About so many samples, evenly along the way of hands and tool, a little along time."""
+        steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
+        kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
+        return np.asarray(np.unique(kept), np.int64)
+
+
+def _followed(stages: Records, labels: Indices, hands: Vector, share: Vector) -> Vector:
+    """By how much (T, 3) [m] the tool goes with hands (T, 6), where it is so far along (T,)."""
+    out = np.zeros((len(hands), 3))
+    follow = stages["follow"][labels]
+    power = np.where(follow[:, 0] == follow[:, 1], 1, WITH_HAND)
+    for end, goes in enumerate((1.0 - share, share)):
+        for side in (LEFT, RIGHT):
+            place = stages["begins"][labels, side] + end * stages["way"][labels, side]
+            own = (follow[:, end] == side) * goes**power
+            out += own[:, None] * (hands[:, 3 * side : 3 * side + 3] - place)
+    return out
+
+
+def _divided(stages: Records, moving: Vector, tool: Vector, period_s: float) -> Indices:
+    """Which stage it is at each sample (T,): the way through a demonstration that costs least
+    (Viterbi 1967), by how far hands and tool are off a stage's ways and whether they go along.
+    """
+    count, cost = len(stages), np.zeros((len(tool), len(stages)))
+    smooth = _smoothed(tool, round(SMOOTHED_S / period_s))
+    ways = [(stages["begins"][:, i], stages["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
+    ways.append((stages["tool"], stages["tool_way"], smooth, np.gradient(smooth, period_s, axis=0), 0))
+    for begins, way, points, velocities, first in ways:
+        at, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
+        square = (way**2).sum(axis=1)
+        moves = square > SAME_M**2
+        along = (((at - begins) * way).sum(axis=2) / np.where(moves, square, 1.0)).clip(0.0, 1.0) * moves
+        off = ((at - begins - along[:, :, None] * way) ** 2).sum(axis=2)
+        goes = np.where(moves, velocity @ way.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
+        goes -= 0.7 * ~moves * np.linalg.norm(velocity, axis=1)[:, None]
+        cost += np.minimum(off / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / HASTE_MPS)
+    cost *= period_s / CORRELATED_S
+    change = np.where(np.eye(count, k=1) > 0, NEXT, ANOTHER) * (1.0 - np.eye(count))
+    total, back = cost[0] + LATER * np.arange(count), []
+    for row in cost[1:]:
+        through = total[:, None] + change
+        back.append(through.argmin(axis=0))
+        total = through.min(axis=0) + row
+    labels = [int(total.argmin())]
+    for before in reversed(back):
+        labels.append(int(before[labels[-1]]))
+    return np.array(labels[::-1], np.int64)
+
+
+def _smoothed(hands: Vector, samples: int) -> Vector:
+    window = np.hanning(samples + 2)[1:-1] if samples else np.ones(1)
+    before = len(window) // 2
+    padded = [np.pad(column, (before, len(window) - 1 - before), mode="edge") for column in hands.T]
+    return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)

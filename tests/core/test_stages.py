@@ -1,0 +1,130 @@
+"""Stages: how far along one hands are, and the filtered belief in which one it is."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from service.config import Settings
+from service.core.controller import Controller, start_state
+from service.core.frame import Tick, order, structured
+from service.core.skill.memory import along, delayed
+from service.core.skill.skill import Skill, SkillStage
+from service.core.skill.stages import MOST_STAGES, STAGE, along_way, recognise
+from service.learning.skill_file import decoded
+from service.shipped import shipped_skill
+from support.paths import RECORDINGS
+from support.wam import URDF
+
+PERIOD_S = 0.01
+
+
+@pytest.fixture
+def there_and_back() -> np.ndarray:
+    """The left hand goes to B and back to A, twice; the right one rests."""
+    stages = structured(4, STAGE)
+    for k in range(4):
+        sign = 1.0 if k % 2 == 0 else -1.0
+        stages["begins"][k, 0] = (0.5 if k % 2 == 0 else 0.9, 0.0, 0.1)
+        stages["way"][k, 0] = (0.4 * sign, 0.0, 0.0)
+        stages["begins"][k, 1] = (0.8, 0.3, 0.1)
+    stages["square"], stages["off"], stages["follow"] = (stages["way"] ** 2).sum(axis=2), 0.03, -1
+    return stages
+
+
+def motion(x: np.ndarray) -> np.ndarray:
+    """Hands (T, 3, 6) whose left one goes along x so."""
+    out = np.zeros((len(x), 3, 6))
+    out[:, 0] = (0.0, 0.0, 0.1, 0.8, 0.3, 0.1)
+    out[:, 0, 0], out[:, 1, 0] = x, np.gradient(x, PERIOD_S)
+    return out
+
+
+def legs(*ends: float) -> np.ndarray:
+    """From end to end in a second each, with a second of rest at each."""
+    smooth = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 100))
+    parts = [np.full(100, ends[0])]
+    for here, there in itertools.pairwise(ends):
+        parts += [here + (there - here) * smooth, np.full(100, there)]
+    return np.concatenate(parts)
+
+
+def beliefs(stages: np.ndarray, x: np.ndarray) -> np.ndarray:
+    belief, out = np.zeros(MOST_STAGES), []
+    for one in motion(x):
+        recognise(belief, one, PERIOD_S, stages)
+        out.append(belief.copy())
+    return np.array(out)
+
+
+def test_what_was_before_tells_visits_of_a_place_apart(there_and_back: np.ndarray) -> None:
+    found = beliefs(there_and_back, legs(0.5, 0.9, 0.5, 0.9, 0.5))
+    assert np.abs(found.sum(axis=1) - 1.0).max() < 1e-6
+    for leg in range(4):
+        half = 100 + 200 * leg + 50
+        assert found[half].argmax() == leg
+        assert found[half, leg] > 0.8
+    ends = found[-1]
+    assert ends[3] > 0.7
+
+
+def test_a_belief_that_is_wrong_comes_right_within_a_second(there_and_back: np.ndarray) -> None:
+    """A stage whose ways are elsewhere is told by where hands are; those before are forgotten."""
+    stages = there_and_back.copy()
+    stages["begins"][3, 0], stages["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
+    belief = np.zeros(MOST_STAGES)
+    belief[0] = 1.0
+    for one in motion(np.full(100, 0.7)):
+        one[0, 1] = 0.4
+        recognise(belief, one, PERIOD_S, stages)
+    assert belief[3] > 0.8
+
+
+def test_a_hand_that_rests_near_an_end_is_there_and_a_moving_one_on_its_way(there_and_back: np.ndarray) -> None:
+    stage = there_and_back[0]
+    near, half = np.array([0.54, 0.02, 0.1]), np.array([0.7, 0.0, 0.1])
+    assert along_way(near, 1.0, stage, 0) < 0.01
+    assert along_way(near, 0.0, stage, 0) == pytest.approx(0.1)
+    assert along_way(half, 1.0, stage, 0) == along_way(half, 0.0, stage, 0) == pytest.approx(0.5)
+    assert along_way(half, 0.0, stage, 1) == 1.0  # the right hand stays
+
+
+def test_hands_are_delayed_as_they_were_learned_or_foreseen() -> None:
+    times = np.arange(0.0, 4.0, PERIOD_S)
+    hands = np.tile(0.2 * np.sin(times)[:, None], (1, 6))
+    rows = along(hands, PERIOD_S, 0.3 / 4, 4)
+    out, at = np.empty((3, 6)), 350
+    moving = np.stack([hands[at], np.gradient(hands, PERIOD_S, axis=0)[at], -hands[at]])
+    behind = np.ascontiguousarray(rows[at])
+    delayed(moving, behind, 0.3, out)
+    then = times[at] - 0.3
+    np.testing.assert_allclose(out[:, 0], [0.2 * np.sin(then), 0.2 * np.cos(then), -0.2 * np.sin(then)], atol=0.01)
+    delayed(moving, behind, -0.1, out)
+    assert out[0, 0] == pytest.approx(0.2 * np.sin(times[at] + 0.1), abs=0.002)
+
+
+def test_the_stage_is_set_kept_over_a_hold_and_begun_anew_by_another_task() -> None:
+    settings, skill = Settings(), shipped_skill()
+    stage, state = SkillStage(settings, skill), start_state(settings, skill)
+    stage.set_stage(state, "glass")
+    assert state["stage_belief"].argmax() == skill.model.names.index("glass")
+    stage.set_stage(state, "nowhere")
+    assert state["stage_belief"].argmax() == skill.model.names.index("glass")
+    stage.adopt(state, skill)
+    assert state["stage_belief"].max() == 1.0
+    another = stage_less(skill)
+    stage.adopt(state, another)
+    assert not state["stage_belief"].any()
+
+
+def stage_less(skill: Skill) -> Skill:
+    """Another skill, which has no stages."""
+    return decoded((RECORDINGS / "experiments/as-paper.npz").read_bytes(), origin="as-paper.npz")
+
+
+def test_a_request_sets_the_stage_in_the_loop() -> None:
+    controller = Controller(Settings(), shipped_skill(), urdf=URDF)
+    controller.step(Tick(0, (order("stage", "glass"),)))
+    assert controller.state["stage_belief"].argmax() == shipped_skill().model.names.index("glass")

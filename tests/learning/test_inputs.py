@@ -1,0 +1,148 @@
+"""What the tool is learned to be a function of: the simplest that tells where it is, found by
+leaving demonstrations out, or people.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.memory import TURN_LAG_S
+from service.learning.demonstration import Demonstration, groups
+from service.learning.inputs import KINDS, Inputs
+from service.learning.judgement import Figures, table
+from service.learning.learn import learn
+from service.learning.skill_file import StoredSkill, decoded
+from sim.experiments.left_out import judged, left_out, predicted
+
+TIMES = np.arange(0.0, 6.0, 0.04)
+CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is fixed to
+NOISE_M = 0.001
+
+
+def smooth(random: np.random.Generator, size: float, count: int = 3) -> np.ndarray:
+    """Slow ways (T, count)."""
+    rates, phases = random.uniform(0.5, 1.2, (2, count)), random.uniform(0.0, 6.0, (2, count))
+    return size * sum(np.sin(np.multiply.outer(TIMES, rate) + phase) for rate, phase in zip(rates, phases, strict=True))
+
+
+def shown(seed: int, kind: str, person: str = "") -> Demonstration:
+    """A take in which the tool goes with both hands, with the left one, or is fixed to that, or
+    goes its own way by the clock.
+    """
+    random = np.random.default_rng(seed)
+    left, right = (np.array([0.6, y, 0.3]) + smooth(random, 0.08) for y in (-0.2, 0.2))
+    turned = Rotation.from_euler("ZYX", smooth(random, 0.4 if kind == "carried" else 0.0) * [1.0, 0.3, 0.3])
+    ways = {
+        "both": 0.5 * (left + right) + np.array([0.0, 0.0, 0.2]),
+        "left": left + np.array([0.0, 0.1, 0.2]),
+        "carried": left + turned.apply(CARRIED),
+        "clock": np.array([0.5, 0.0, 0.4]) + 0.2 * np.sin(np.multiply.outer(TIMES, [0.7, 0.9, 1.1])),
+    }
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(TIMES), 1))
+    turns = (turned.as_quat(), still, still)
+    poses = (
+        np.hstack([at + NOISE_M * random.standard_normal(at.shape), turn])
+        for at, turn in zip((left, right, ways[kind]), turns, strict=True)
+    )
+    return Demonstration((1e9 * (1.0 + TIMES)).astype(np.int64), *poses, person=person)
+
+
+def figures(skill: StoredSkill) -> Figures:
+    return msgspec.json.decode(skill.figures, type=Figures)
+
+
+@pytest.fixture(scope="module")
+def carried() -> StoredSkill:
+    return learn([shown(seed, "carried") for seed in range(6)], points=120)
+
+
+def test_where_both_hands_tell_it_is_a_function_of_both() -> None:
+    skill = learn([shown(seed, "both") for seed in range(5)], points=120)
+    found = figures(skill)
+    assert skill.conductor is None
+    assert found.taken == "positions"
+    assert set(found.tried_mm) == {
+        f"{kind.name}{of}"
+        for kind in KINDS
+        if not kind.turned
+        for of in ("", " of the left hand", " of the right hand")
+    }
+    assert found.tried_mm["positions"] < 0.5 * found.tried_mm["positions of the left hand"]
+    lines = table(found).splitlines()
+    assert any(line.endswith("positions taken:") for line in lines)
+    assert sum(line.split("  ")[1] in found.tried_mm for line in lines if line.startswith("  ")) == len(found.tried_mm)
+
+
+def test_where_one_hand_tells_as_much_the_other_makes_no_difference_and_that_is_said() -> None:
+    skill = learn([shown(seed, "left") for seed in range(5)], points=120)
+    found = figures(skill)
+    assert skill.conductor == 0
+    assert found.taken == "positions of the left hand"
+    assert any("the left hand alone" in warning and "may be absent" in warning for warning in found.warnings)
+    hands, still = shown(9, "left").hands[40].reshape(2, 3), np.zeros((2, 3))
+    away = np.stack([hands[0], [3.0, 3.0, 3.0]])
+    np.testing.assert_array_equal(
+        skill.predict(hands, still, still).position, skill.predict(away, still, still).position
+    )
+
+
+def test_a_tool_that_is_fixed_to_a_turned_hand_is_predicted_by_how_that_is_turned(carried: StoredSkill) -> None:
+    found = figures(carried)
+    assert found.taken == "orientations of the left hand"
+    assert isinstance(carried.model, HandsKMP)
+    assert carried.model.turned
+    takes = [left_out("", "", shown(seed, "carried")) for seed in range(20, 23)]
+    by_turns, by_places = (
+        np.sqrt(sum(judged(take, predicted(skill, take)).squares for take in takes) / sum(len(t.tool) for t in takes))
+        for skill in (carried, learn([shown(seed, "carried") for seed in range(6)], points=120, ell=8.0))
+    )
+    assert by_turns < 0.02
+    assert by_turns < 0.5 * by_places
+
+
+def test_its_velocity_is_that_of_the_turning_hand_and_its_file_serves_as_it_was_learned(carried: StoredSkill) -> None:
+    again, still = decoded(carried.file, origin="a file"), np.zeros((2, 3))
+    hands = np.array([[0.6, -0.2, 0.3], [0.6, 0.2, 0.3]])
+    h, rate = 1e-3, np.array([0.0, 0.0, 0.5])
+
+    def turns(at_s: float) -> np.ndarray:
+        """The rows of the filters of hands that turn evenly: each lags by as much again."""
+        rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * TURN_LAG_S)).as_matrix().ravel() for i in range(3)]
+        return np.stack([rows, rows], axis=1)
+
+    behind, now, ahead = (again.predict(hands, still, still, turns=turns(t)) for t in (-h, 0.0, h))
+    np.testing.assert_array_equal(now.position, carried.predict(hands, still, still, turns=turns(0.0)).position)
+    np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
+    assert np.linalg.norm(now.velocity) > 0.03
+    untold = again.predict(hands, still, still).position
+    np.testing.assert_allclose(untold, again.mean(hands.reshape(1, 6))[0], atol=2e-6)
+
+
+def test_a_task_by_the_clock_is_told_to_be_a_timetable() -> None:
+    found = figures(learn([shown(seed, "clock") for seed in range(4)], points=120))
+    assert found.all.other_mm["same elapsed time"] < 10
+    assert any("the task is a timetable" in warning for warning in found.warnings)
+
+
+def test_takes_of_a_person_are_left_out_together_where_two_are_named() -> None:
+    takes = [shown(seed, "both", person) for seed, person in enumerate(("Ada", "Ada", "Bo", "Bo"))]
+    assert groups(takes).tolist() == [0, 0, 1, 1]
+    assert groups([one._replace(person="Ada") for one in takes]).tolist() == [0, 1, 2, 3]
+    assert groups([takes[0], takes[2], takes[0]._replace(person="")]).tolist() == [0, 1, 2]
+    by_person, alone = (
+        figures(learn(some, points=120)) for some in (takes, [one._replace(person="") for one in takes])
+    )
+    assert table(by_person).startswith("held out by person")
+    assert not table(alone).startswith("held out by")
+    assert by_person.all.error_mm > alone.all.error_mm  # half as many are left to learn from
+
+
+def test_the_other_hands_turns_and_memory_are_swapped_for_each_other() -> None:
+    rows = np.arange(6 + 12 + 18.0)[None]
+    swapped = Inputs("some", order=2, turned=True).swapped(rows)[0]
+    wanted = [*range(6), 9, 10, 11, 6, 7, 8, 15, 16, 17, 12, 13, 14, *range(27, 36), *range(18, 27)]
+    assert swapped.tolist() == wanted

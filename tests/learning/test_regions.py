@@ -1,0 +1,138 @@
+"""What is said of how sure a prediction is holds on what was left out, at the moment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.config import Settings
+from service.core.controller import start_state
+from service.core.frame import blank, frame_layout
+from service.core.skill.model import CHI_SQUARE, LEVELS, NORMAL, REGION_95, Regions
+from service.core.skill.skill import UNSURE_M, SkillStage, calibrate, recent
+from service.learning.judgement import Figures
+from service.learning.learn import learn
+from service.learning.regions import FOLDS, Apart, calibrated, folds, of_the_others
+from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+from service.shipped import shipped_skill
+from sim.made_tasks import takes
+
+
+def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> Apart:
+    """A demonstration by someone who errs as no normal says: by three times the covariance, with
+    heavy tails, and early or late.
+    """
+    count, person = 150, np.exp(0.3 * rng.normal())
+    covariance = np.tile(np.diag([4e-4, 1e-4, 2e-4]), (count, 1, 1))
+    velocity = np.clip(rng.normal(size=(count, 3)), -1, 1) * (rng.random(count) < 0.5)[:, None]
+    tails = rng.standard_t(4, size=(count, 3)) * np.sqrt(np.diagonal(covariance[0]))
+    errors = times * (3.0 * person * tails + late_s * rng.normal(size=(count, 1)) * velocity)
+    return Apart(errors, covariance, velocity)
+
+
+@pytest.mark.parametrize("count", [6, 12, 40])
+def test_regions_hold_on_other_people_what_they_say_at_every_level(count: int) -> None:
+    held = []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, count])
+        regions = calibrated([apart(rng) for _ in range(count)], np.arange(count))
+        held.append(np.mean([apart(rng).inside(regions) for _ in range(40)], axis=0))
+    found = dict(zip(LEVELS, np.mean(held, axis=0), strict=True))
+    assert found[0.5] == pytest.approx(0.5, abs=0.05)
+    assert found[0.95] == pytest.approx(0.95, abs=0.02)
+    assert found[0.99] > 0.97
+    assert regions.radii[LEVELS.index(0.95)] == pytest.approx(REGION_95)
+    assert regions.std_s == pytest.approx(0.07, abs=0.05), "in units of a covariance that is too small"
+
+
+def test_errors_as_of_a_normal_leave_a_covariance_as_it_is() -> None:
+    rng, covariance = np.random.default_rng(1), np.tile(1e-4 * np.eye(3), (150, 1, 1))
+    given = [Apart(1e-2 * rng.normal(size=(150, 3)), covariance, np.zeros((150, 3))) for _ in range(20)]
+    regions = calibrated(given, np.arange(len(given)))
+    assert regions.scale == pytest.approx(1.0, abs=0.1)
+    assert regions.radii == pytest.approx(CHI_SQUARE, rel=0.2)
+    assert calibrated(given[:1], np.arange(1)) == NORMAL
+
+
+def test_a_demonstration_is_judged_by_regions_that_it_had_no_part_in() -> None:
+    rng = np.random.default_rng(2)
+    usual = [apart(rng) for _ in range(12)]
+    spoilt = [*usual[:4], apart(rng, times=30.0), *usual[5:]]
+    assert [len(block) for block in folds(np.arange(12))] == [2] * FOLDS
+    together = np.arange(len(usual))
+    before, after = of_the_others(usual, together), of_the_others(spoilt, together)
+    assert before[4][1] == after[4][1] == after[5][1]
+    assert before[0][1] != after[0][1]
+    assert after[4][0].inside(after[4][1])[LEVELS.index(0.95)] < 0.5
+
+
+def test_a_tool_s_covariance_is_scaled_along_its_motion_and_reaches_as_far_as_its_longest_axis() -> None:
+    rng, out = np.random.default_rng(3), np.empty((3, 3))
+    for _ in range(50):
+        root, velocity = 0.05 * rng.normal(size=(3, 3)), rng.normal(size=3)
+        wanted = 2.5 * (root @ root.T + 0.3**2 * np.outer(velocity, velocity))
+        reach_m = calibrate(root @ root.T, velocity, 2.5, 0.3, out)
+        np.testing.assert_allclose(out, wanted, rtol=0, atol=1e-10)
+        assert reach_m == pytest.approx(np.sqrt(REGION_95 * np.linalg.eigvalsh(wanted)[-1]), rel=1e-6)
+    assert calibrate(1e-4 * np.eye(3), np.zeros(3), 1.0, 0.0, out) == pytest.approx(0.01 * np.sqrt(REGION_95))
+
+
+def test_unsure_is_told_from_where_the_region_reaches_too_far_and_does_not_flicker() -> None:
+    settings, skill = Settings(), shipped_skill()
+    state, frame = start_state(settings, skill), blank(frame_layout(len(settings.joints.names)))
+    state["hands"][:, 0] = skill.hands[0].reshape(2, 3)
+
+    def told(times: float) -> bool:
+        """Whether it is, with regions that reach so many times as far as is told of."""
+        state["covariance"] = np.eye(3) * (times * UNSURE_M) ** 2 / REGION_95
+        stage = SkillStage(settings, replace(skill, regions=Regions(1.0)))
+        stage.step(state, frame)
+        assert np.sqrt(REGION_95 * np.linalg.eigvalsh(frame["covariance"])[-1]) == pytest.approx(times * UNSURE_M)
+        return bool(state["unsure"])
+
+    state["tick"], state["hand_ticks"] = 5, 3
+    assert [told(times) for times in (0.9, 1.1, 0.9, 0.7, 0.9, 1.1)] == [False, True, True, False, False, True]
+    SkillStage(settings, skill).nothing(state, frame)
+    assert not state["unsure"]
+
+
+def test_a_tool_s_recent_motion_is_that_of_its_trail_at_any_period() -> None:
+    found = []
+    for period_s in (0.002, 0.02):
+        trail = np.zeros(3)
+        velocities = [recent(np.array([min(t, 1.0), 0, 0]), period_s, trail) for t in np.arange(0, 1.5, period_s)]
+        found.append([velocities[round(t / period_s)][0] for t in (0.9, 1.2, 1.48)])
+    assert found[0] == pytest.approx(found[1], abs=0.06)
+    assert found[0] == pytest.approx([1.0, np.exp(-1), np.exp(-2.4)], abs=0.03)
+
+
+@pytest.fixture(scope="module")
+def learned() -> StoredSkill:
+    """A skill of six people, the fifth of whom is quick, at a task whose teacher reacts late."""
+    return learn([take.demonstration.every(4) for take in takes("path", people=range(6), each=1)])
+
+
+def test_what_is_learned_says_how_sure_it_is_with_its_lag_left_in(learned: StoredSkill) -> None:
+    figures = msgspec.json.decode(learned.figures, type=Figures)
+    assert learned.regions.std_s > 0.0
+    assert figures.all.within_50 == pytest.approx(50, abs=10)
+    assert figures.all.within_95 == pytest.approx(95, abs=3)
+    stored = decoded(learned.file, origin="memory")
+    assert stored.regions == learned.regions != NORMAL
+
+
+def test_a_file_without_regions_has_those_of_a_normal_and_one_with_others_is_refused(learned: StoredSkill) -> None:
+    without = with_file(replace(learned, regions=NORMAL))
+    assert decoded(without.file, origin="memory").regions == NORMAL
+    for spoilt in (
+        learned.regions._replace(scale=0.0),
+        learned.regions._replace(std_s=-1.0),
+        learned.regions._replace(radii=learned.regions.radii[::-1]),
+        learned.regions._replace(radii=learned.regions.radii[1:]),
+        learned.regions._replace(radii=tuple(2 * radius for radius in learned.regions.radii)),
+    ):
+        with pytest.raises(SkillError, match=r"region|radii"):
+            decoded(with_file(replace(learned, regions=spoilt)).file, origin="memory")
