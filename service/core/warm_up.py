@@ -22,7 +22,7 @@ from service.core.intake.intake import still_ticks
 from service.core.limiter.limiter import Limiter
 from service.core.separation.separation import Separation
 from service.core.skill import ORDER
-from service.core.skill.memory import moving_features
+from service.core.skill.memory import delayed, moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 
@@ -53,12 +53,13 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
 
 def _rarely(settings: Settings, urdf: str) -> None:
     """What the loop runs only near the tool's greatest speed, on a way out, and with a skill that
-    remembers.
+    remembers or whose teacher was late.
     """
     limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
     still = np.zeros(len(posture))
     limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
     Separation(settings, urdf).share(still)
+    delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 

@@ -44,7 +44,7 @@ from service.learning.via_points import in_force, points_made_of, warnings_of
 
 ADOPTION_TIMEOUT_S = 2.0
 POLL_S = 0.001  # while waiting for the tick that took a request
-MOST_POINTS = 400  # of all via-points, with the points of their neighbourhoods
+MOST_POINTS = 400  # of all via-points that are not the task's, with the points of their neighbourhoods
 MOST_WAITING = 16  # requests in a queue ...
 MOST_ORDERS = 1024  # ... of orders, of which one tick takes all
 LONGEST_LIST = 100  # bytes
@@ -318,10 +318,11 @@ class Queryables:
 
     def _check(self, added: Sequence[ViaPoint]) -> None:
         """Raises RequestError for too many via-points, and for those out of reach."""
-        total = points_made_of(list({point.name: point for point in (*self._skill.via_points, *added)}.values()))
+        all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
+        total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
         if total > MOST_POINTS:
             raise RequestError(
-                f"$.points: {total} via-points in all, 13 for each with a radius; at most {MOST_POINTS} accepted"
+                f"$.points: {total} via-points beside the task's, 13 for each with a radius; at most {MOST_POINTS} accepted"
             )
         low, high = self._skill.workspace
         reach = self._settings.reach

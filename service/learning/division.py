@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import stillness_of
@@ -20,8 +21,10 @@ from service.core.skill.stages import (
     MOST_STAGES,
     NONE,
     RIGHT,
-    WITH_HAND,
-    along_all,
+    add_followed,
+    along_way,
+    on_way,
+    recognise,
 )
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.learning.demonstration import Demonstration
@@ -137,7 +140,9 @@ class Encoded:
         goes = square > SAME_M**2
         share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
         share = share.clip(0.0, 1.0)
-        offset = tool - begins - share[:, None] * way - _followed(stages, labels, late, share)
+        followed = np.zeros_like(tool)
+        all_followed(late, share, labels, stages, followed)
+        offset = tool - begins - share[:, None] * way - followed
         wanted = np.column_stack([share, offset])
         return Encoded(at, stages, moving, stillness, tool, labels, along, off, wanted, period_s)
 
@@ -151,19 +156,6 @@ class Encoded:
         way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
         kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
         return np.asarray(np.unique(kept), np.int64)
-
-
-def _followed(stages: Records, labels: Indices, hands: Vector, share: Vector) -> Vector:
-    """By how much (T, 3) [m] the tool goes with hands (T, 6), where it is so far along (T,)."""
-    out = np.zeros((len(hands), 3))
-    follow = stages["follow"][labels]
-    power = np.where(follow[:, 0] == follow[:, 1], 1, WITH_HAND)
-    for end, goes in enumerate((1.0 - share, share)):
-        for side in (LEFT, RIGHT):
-            place = stages["begins"][labels, side] + end * stages["way"][labels, side]
-            own = (follow[:, end] == side) * goes**power
-            out += own[:, None] * (hands[:, 3 * side : 3 * side + 3] - place)
-    return out
 
 
 def _divided(stages: Records, moving: Vector, tool: Vector, period_s: float) -> Indices:
@@ -201,3 +193,31 @@ def _smoothed(hands: Vector, samples: int) -> Vector:
     before = len(window) // 2
     padded = [np.pad(column, (before, len(window) - 1 - before), mode="edge") for column in hands.T]
     return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)
+
+
+@compiled
+def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -> None:
+    """The beliefs (T, K) along hands that move so (T, 3, 6)."""
+    for t in range(len(moving)):
+        if t:
+            out[t] = out[t - 1]
+        recognise(out[t], moving[t], periods_s, stages)
+
+
+@compiled
+def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
+    """How far along the stages of these numbers (T,) hands (T, 6) are that are so still (T, 2), and
+    how far off their ways [m], into `out` (T, 4).
+    """
+    for t in range(len(hands)):
+        for side in range(2):
+            hand = hands[t, 3 * side : 3 * side + 3]
+            out[t, side] = along_way(hand, stillness[t, side], stages[labels[t]], side)
+            _, out[t, 2 + side] = on_way(hand, stages[labels[t]], side)
+
+
+@compiled
+def all_followed(hands: Vector, shares: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
+    """As `add_followed`, in the stages of these numbers (T,): to `out` (T, 3)."""
+    for t in range(len(hands)):
+        add_followed(hands[t], shares[t], stages[labels[t]], out[t])

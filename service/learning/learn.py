@@ -172,7 +172,7 @@ def learn(
         if isinstance(error, SkillError):
             raise SkillError(f"{error}{repeats}") from None
         raise SkillError(f"cannot learn from {sum(len(hands) for hands, _ in paths)} samples: {error}") from None
-    told = list(of_the_others(apart, together))
+    told = of_the_others(apart, together)
     judged = figures(
         demonstrations,
         list(zip(found.known, (tool for _, tool in paths), strict=True)),

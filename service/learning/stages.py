@@ -16,17 +16,11 @@ from service.core.skill import ORDER
 from service.core.skill.memory import along
 from service.core.skill.model import Model
 from service.core.skill.staged import APART, APART_BESIDE, Placed, StagedKMP
-from service.core.skill.stages import (
-    MOST_STAGES,
-    OUTPUTS,
-    STAYS,
-    along_all,
-    recognised,
-)
+from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration, lag
-from service.learning.division import NEAR, Encoded, ordered
+from service.learning.division import NEAR, Encoded, along_all, ordered, recognised
 from service.learning.gate import CEILING_M, FLOOR_M, Gate, gate_between, nonsense
 from service.learning.judgement import HeldOut
 
@@ -83,6 +77,12 @@ class Samples(NamedTuple):
             mine = self.owner == h
             out[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], weighted[mine])
         return out
+
+    def missed_m(self, parameters: Parameters) -> float:
+        """How far demonstrations are missed by the others [m], each way taken as of mean length."""
+        missed = self.residuals(parameters)
+        ways = [np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in self.encoded]
+        return rms(missed[:, 1:] + missed[:, :1] * float(np.mean(ways)))
 
     def fitted(self, parameters: Parameters, without: Sequence[int] = ()) -> KMP:
         """The KMP, which has the tool at the end of a stage where both hands are there."""
@@ -179,11 +179,7 @@ def learned(
     delay, each_s = delay_of(demonstrations)
     encoded = [Encoded.of(task, *one) for one in zip(demonstrations, each_s, strict=True)]
     samples, stages = Samples.of(encoded), encoded[0].stages
-    tried = [
-        (rms(samples.residuals(one)[:, 1:] + samples.residuals(one)[:, :1] * _lengths(encoded)), one)
-        for one in CANDIDATES
-    ]
-    parameters = min(tried, key=lambda one: one[0])[1]
+    parameters = min(CANDIDATES, key=samples.missed_m)
     labels, off = np.concatenate([one.labels for one in encoded]), np.concatenate([one.off for one in encoded])
     scatter = [off[labels == k] if (labels == k).any() else off for k in range(len(stages))]
     off = np.array([np.maximum(np.sqrt((one**2).mean(axis=0)), LEAST_OFF_M) for one in scatter])
@@ -209,7 +205,7 @@ def learned(
     kept = [_kept(*one, ERRORS_KEPT // len(encoded)) for one in zip(inputs, errors, strict=True)]
     progress(f"learning from all {len(encoded)}")
     model = StagedKMP(samples.fitted(parameters), task, nominal, off, np.concatenate(kept), delay.mean_s)
-    held_out = []
+    held_out, there = [], []
     for h, one in enumerate(encoded):
         others = np.concatenate([found for i, found in enumerate(kept) if i not in of_block[h]] or kept)
         placed = Placed.of(task, one.at, off, model.primitive, others)
@@ -217,15 +213,17 @@ def learned(
             [placed.covariance(*row) for row in zip(lates[h], beliefs[h], one.stillness, strict=True)]
         )
         held_out.append(HeldOut(errors[h], covariance, placed.gates_m(one.moving[:, 0])))
+        there.append(placed)
     known = [np.hstack([one.moving[:, 0], x[:, 2:]]) for one, x in zip(encoded, inputs, strict=True)]
     return Learned(
-        model, held_out, _gate(task, encoded, model), inputs, known, delay, [one[:, : len(stages)] for one in beliefs]
+        model,
+        held_out,
+        _gate(encoded, there, held_out),
+        inputs,
+        known,
+        delay,
+        [one[:, : len(stages)] for one in beliefs],
     )
-
-
-def _lengths(encoded: Sequence[Encoded]) -> float:
-    """The mean length of the tool's ways [m], of which an error along them is a share."""
-    return float(np.mean([np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in encoded]))
 
 
 def _late(one: Encoded, late_s: float) -> Vector:
@@ -241,14 +239,12 @@ def _kept(inputs: Vector, errors: Vector, count: int) -> Vector:
     return np.column_stack([inputs[rows, :2], inputs[rows, 2:].argmax(axis=1), errors[rows]])
 
 
-def _gate(task: Task, encoded: Sequence[Encoded], model: StagedKMP) -> Gate:
+def _gate(encoded: Sequence[Encoded], placed: Sequence[Placed], held_out: Sequence[HeldOut]) -> Gate:
     """The gate on how far a hand is off its ways."""
-    wrong, held_out = [], []
-    for one in encoded:
-        placed = Placed.of(task, one.at, model.off, model.primitive, model.errors)
+    wrong = []
+    for one, there in zip(encoded, placed, strict=True):
         hands = one.moving[:, 0]
-        held_out.append(placed.gates_m(hands))
-        some = hands[:: max(1, len(hands) // 50)]
-        wrong.append([placed.gates_m(moved) for moved in nonsense(some)])
+        wrong.append([there.gates_m(moved) for moved in nonsense(hands[:: max(1, len(hands) // 50)])])
+    reached = np.concatenate([one.gate_m for one in held_out])
     kinds = [np.concatenate(kind) for kind in zip(*wrong, strict=True)]
-    return gate_between(np.concatenate(held_out), kinds, ceiling=CEILING_M, floor=FLOOR_M, false=FALSE_HOLDS)
+    return gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, false=FALSE_HOLDS)

@@ -25,17 +25,19 @@ from service.core.skill.stages import (
     SEEN,
     STEP_S,
     along_both,
+    expected,
     off_all,
     predicted,
     recognise,
     scatter,
-    tool_at,
+    tools_at,
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
 from service.core.skill.via_points import bent
 
 APART = 0.12  # of two stages, as inputs beside how far along hands are: most of what is learned in one holds in all
 APART_BESIDE = 0.5  # the same for orientation and gripper, which are of each stage alone
+NO_PULLS, NO_ERRORS = np.empty((0, 9)), np.empty((0, 6))  # where nothing else is taught, or no covariance wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,6 @@ class Placed:
     rows: Vector
     errors: Vector
     pulls: Vector
-    no_errors: Vector  # (0, 6) in place of errors, where no covariance is wanted
 
     @classmethod
     def of(cls, task: Task, at: NamedViaPoints, off: Vector, primitive: KMP, errors: Vector) -> Placed:
@@ -65,7 +66,7 @@ class Placed:
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
         along, stage = primitive.centres[:, :2], primitive.centres[:, 2:].argmax(axis=1)
         rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS)])
-        return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), np.empty((0, 9)), np.empty((0, 6)))
+        return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), NO_PULLS)
 
     def belief(self, hands: Vector) -> Vector:
         """The belief (MOST_STAGES,) in each stage, of hands (6,) at rest and nothing before."""
@@ -81,18 +82,15 @@ class Placed:
         K or more).
         """
         out = np.empty((len(hands), 3))
-        for t in range(len(hands)):
+        for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
             still = STILL if stillness is None else stillness[t]
-            tool_at(
-                np.ascontiguousarray(hands[t]),
-                still,
-                beliefs[t],
-                self.stages,
-                self.sizes,
-                self.rows,
-                self.pulls,
-                out[t],
-            )
+            expected(belief, self._tools(one, still, belief, self.pulls), out[t])
+        return out
+
+    def _tools(self, hands: Vector, still: Vector, belief: Vector, pulls: Vector) -> Vector:
+        """The tools (K, 3) [m] in the stages that are believed in, for hands (6,)."""
+        out = np.empty((len(self.stages), 3))
+        tools_at(np.ascontiguousarray(hands), still, belief, self.stages, self.sizes, self.rows, pulls, out)
         return out
 
     def gates_m(self, hands: Vector) -> Vector:
@@ -103,8 +101,9 @@ class Placed:
         """(3, 3) [m²] for hands (6,), a belief, and how still they are (2,): the scatter of errors
         near there, that of the stages' tools and that of the via-points.
         """
-        out = np.empty((3, 3))
-        scatter(np.ascontiguousarray(hands), still, belief, self.stages, self.sizes, self.rows, self.errors, out)
+        out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
+        tools = self._tools(hands, still, belief, NO_PULLS)
+        scatter(hands, still, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
@@ -183,7 +182,7 @@ class StagedKMP:
         at, out, hands = self.placed, np.empty((6, 3)), np.zeros(1, SEEN)
         hands["moving"], hands["now"] = seen.moving, seen.now
         hands["stillness"], hands["period_s"] = seen.stillness, seen.period_s
-        errors = at.errors if known is None else at.no_errors
+        errors = at.errors if known is None else NO_ERRORS
         gate_m, torn = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, torn)
 

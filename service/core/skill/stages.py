@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kmp.compiled import compiled
 from kmp.kernel_row import add_weighted
@@ -121,12 +120,12 @@ def along_both(hands: Vector, still: Vector, stage: Record) -> tuple[float, floa
 
 
 @compiled
-def _near(hands: Vector, stage: Record, at_end: float) -> float:
-    """How near (0 to 1) both hands (6,) are to where a stage begins, or ends."""
+def _near(hands: Vector, stage: Record) -> float:
+    """How near (0 to 1) both hands (6,) are to where a stage begins."""
     square = 0.0
     for side in range(2):
         for i in range(3):
-            square += (hands[3 * side + i] - stage["begins"][side, i] - at_end * stage["way"][side, i]) ** 2
+            square += (hands[3 * side + i] - stage["begins"][side, i]) ** 2
     return math.exp(-0.5 * square / NEAR_M**2)
 
 
@@ -164,13 +163,13 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     elif count > 1:
         before = belief[0]
         for k in range(count - 1):
-            near = _near(hands, stages[k + 1], 0.0)
+            near = _near(hands, stages[k + 1])
             on = min(FORWARD * period_s * near, 0.5) * before
             back = min(BACK * period_s * near, 0.5) * belief[k + 1]
             before = belief[k + 1]
             belief[k] += back - on
             belief[k + 1] += on - back
-        again = min(CYCLE * period_s * _near(hands, stages[0], 0.0), 0.5) * belief[count - 1]
+        again = min(CYCLE * period_s * _near(hands, stages[0]), 0.5) * belief[count - 1]
         belief[count - 1] -= again
         belief[0] += again
         for k in range(count):
@@ -200,6 +199,19 @@ def off_all(hands: Vector, stages: Records) -> float:
 
 
 @compiled
+def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> None:
+    """Adds to `out` (3,) by how much the tool goes with hands (6,), where it is so far along."""
+    follow = stage["follow"]
+    power = 1 if follow[0] == follow[1] else WITH_HAND
+    for end in range(2):
+        side = follow[end]
+        if side >= 0:
+            goes = (share if end else 1.0 - share) ** power
+            for i in range(3):
+                out[i] += goes * (hands[3 * side + i] - stage["begins"][side, i] - end * stage["way"][side, i])
+
+
+@compiled
 def _tool_in(
     hands: Vector, still: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
 ) -> None:
@@ -216,21 +228,13 @@ def _tool_in(
     share = found[0]
     for i in range(3):
         out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
-    share = min(max(share, 0.0), 1.0)
-    follow = stage["follow"]
-    power = 1 if follow[0] == follow[1] else WITH_HAND
-    for end in range(2):
-        side = follow[end]
-        if side >= 0:
-            goes = (share if end else 1.0 - share) ** power
-            for i in range(3):
-                out[i] += goes * (hands[3 * side + i] - stage["begins"][side, i] - end * stage["way"][side, i])
+    add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
         add_weighted(hands, pulls, NEAR, out)
 
 
 @compiled
-def tool_at(
+def tools_at(
     hands: Vector,
     still: Vector,
     belief: Vector,
@@ -240,58 +244,49 @@ def tool_at(
     pulls: Vector,
     out: Vector,
 ) -> None:
-    """The tool into `out` (3,), its mean over all stages."""
-    in_one, total = np.empty(3), 0.0
-    out[:] = 0.0
+    """The tools into `out` (K, 3) in the stages that are believed in."""
     for k in range(len(stages)):
         if belief[k] >= BELIEVED:
-            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, in_one)
+            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, out[k])
+
+
+@compiled
+def expected(belief: Vector, tools: Vector, out: Vector) -> None:
+    """The mean of the tools (K, 3) in all stages into `out` (3,)."""
+    total = 0.0
+    out[:] = 0.0
+    for k in range(len(tools)):
+        if belief[k] >= BELIEVED:
             total += belief[k]
             for i in range(3):
-                out[i] += belief[k] * in_one[i]
+                out[i] += belief[k] * tools[k, i]
     for i in range(3):
         out[i] /= total
 
 
 @compiled
-def _torn(
-    hands: Vector, still: Vector, belief: Vector, stages: Records, sizes: Records, rows: Vector, pulls: Vector
-) -> float:
-    """How probable stages are whose tool is elsewhere than in the most probable one."""
+def _torn(belief: Vector, tools: Vector) -> float:
+    """How probable stages are whose tool (K, 3) is elsewhere than in the most probable one."""
     most = 0
-    for k in range(len(stages)):
+    for k in range(len(tools)):
         if belief[k] > belief[most]:
             most = k
-    if belief[most] > 1.0 - BELIEVED:
-        return 0.0
-    usual, other, out = np.empty(3), np.empty(3), 0.0
-    _tool_in(hands, still, most, stages, sizes[0], rows, pulls, usual)
-    for k in range(len(stages)):
+    out = 0.0
+    for k in range(len(tools)):
         if belief[k] >= BELIEVED and k != most:
-            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, other)
             square = 0.0
             for i in range(3):
-                square += (other[i] - usual[i]) ** 2
+                square += (tools[k, i] - tools[most, i]) ** 2
             if square > TORN_M**2:
                 out += belief[k]
     return out
 
 
 @compiled
-def _motion(
-    moving: Vector,
-    still: Vector,
-    belief: Vector,
-    stages: Records,
-    sizes: Records,
-    rows: Vector,
-    pulls: Vector,
-    out: Vector,
-) -> None:
-    """Tool, velocity and acceleration into `out` (6, 3), by differences along the hands'
-    motion. One that only trembles moves nothing.
+def _around(moving: Vector, out: Vector) -> None:
+    """Hands that move so (3, 6) a step ago, now and a step ahead, into `out` (3, 6). One that only
+    trembles stays.
     """
-    tools, hands = np.empty((3, 3)), np.empty((3, 6))  # a step behind, now, a step ahead
     for side in range(2):
         square = 0.0
         for i in range(3 * side, 3 * side + 3):
@@ -299,14 +294,7 @@ def _motion(
         goes = 1.0 - math.exp(-((math.sqrt(square) / CALM_MPS) ** 4))
         for i in range(3 * side, 3 * side + 3):
             step, bend = STEP_S * goes * moving[1, i], 0.5 * STEP_S**2 * goes * moving[2, i]
-            hands[0, i], hands[1, i], hands[2, i] = moving[0, i] - step + bend, moving[0, i], moving[0, i] + step + bend
-    for n in range(3):
-        tool_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
-    for i in range(3):
-        bend = (tools[2, i] - 2.0 * tools[1, i] + tools[0, i]) / STEP_S**2
-        out[0, i] = tools[1, i]
-        out[1, i] = (tools[2, i] - tools[0, i]) / (2.0 * STEP_S)
-        out[2, i] = min(max(bend, -MAX_MPS2), MAX_MPS2)
+            out[0, i], out[1, i], out[2, i] = moving[0, i] - step + bend, moving[0, i], moving[0, i] + step + bend
 
 
 @compiled
@@ -315,16 +303,17 @@ def scatter(
     still: Vector,
     belief: Vector,
     stages: Records,
-    sizes: Records,
-    rows: Vector,
+    tools: Vector,
     errors: Vector,
+    std: float,
     out: Vector,
 ) -> None:
-    """The mean square (3, 3) of errors near there, what stages differ by, via-points are off by."""
+    """The mean square (3, 3) of errors near there, what the stages' tools (K, 3) differ by, and
+    what via-points are off by.
+    """
     out[:] = 0.0
-    nothing, mean, tool, in_all = np.empty((0, 9)), np.empty(3), np.empty(3), 0.0
-    tool_at(hands, still, belief, stages, sizes, rows, nothing, mean)
-    weights = np.empty(len(errors))
+    mean, weights, in_all = np.empty(3), np.empty(len(errors)), 0.0
+    expected(belief, tools, mean)
     for k in range(len(stages)):
         if belief[k] < BELIEVED:
             continue
@@ -335,10 +324,9 @@ def scatter(
             square = (one - errors[m, 0]) ** 2 + (other - errors[m, 1]) ** 2
             weights[m] = math.exp(-0.5 * square / ALIKE**2) * (1.0 if errors[m, 2] == k else OTHERS_ALIKE)
             total += weights[m]
-        _tool_in(hands, still, k, stages, sizes[0], rows, nothing, tool)
         for i in range(3):
             for j in range(i, 3):
-                found = (tool[i] - mean[i]) * (tool[j] - mean[j])
+                found = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j])
                 for m in range(len(errors)):
                     found += weights[m] * errors[m, 3 + i] * errors[m, 3 + j] / total
                 out[i, j] += belief[k] * found
@@ -346,7 +334,7 @@ def scatter(
         for j in range(i, 3):
             out[i, j] /= in_all
             out[j, i] = out[i, j]
-        out[i, i] += sizes[0]["std"] ** 2 + LEAST_STD_M**2
+        out[i, i] += std**2 + LEAST_STD_M**2
 
 
 @compiled
@@ -362,38 +350,25 @@ def predicted(
 ) -> tuple[float, float]:
     """Brings the belief up to date; tool, velocity, acceleration and covariance, rounded, into
     `out` (6, 3), the last none without errors; what the gate compares [m], and how torn it is.
+
+    Velocity and acceleration are by differences along the hands' motion.
     """
-    one = seen[0]
-    moving, still = one["moving"], one["stillness"]
+    one, hands, steps = seen[0], np.empty((3, 6)), np.empty((3, 3))
+    still, tools = one["stillness"], np.empty((3, len(stages), 3))
     if one["period_s"] > 0.0:
         recognise(belief, one["now"], one["period_s"], stages)
-    _motion(moving, still, belief, stages, sizes, rows, pulls, out)
+    _around(one["moving"], hands)
+    for n in range(3):
+        tools_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
+        expected(belief, tools[n], steps[n])
+    for i in range(3):
+        bend = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / STEP_S**2
+        out[0, i] = steps[1, i]
+        out[1, i] = (steps[2, i] - steps[0, i]) / (2.0 * STEP_S)
+        out[2, i] = min(max(bend, -MAX_MPS2), MAX_MPS2)
+    out[3:] = 0.0
     if len(errors):
-        scatter(moving[0], still, belief, stages, sizes, rows, errors, out[3:])
-    else:
-        out[3:] = 0.0
+        scatter(hands[1], still, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
-    torn = _torn(moving[0], still, belief, stages, sizes, rows, pulls)
-    return off_all(one["now"][0], stages), torn
-
-
-@compiled
-def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -> None:
-    """The beliefs (T, K) along hands that move so (T, 3, 6)."""
-    for t in range(len(moving)):
-        if t:
-            out[t] = out[t - 1]
-        recognise(out[t], moving[t], periods_s, stages)
-
-
-@compiled
-def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """How far along the stages of these numbers (T,) hands (T, 6) are that are so still (T, 2), and
-    how far off their ways [m], into `out` (T, 4).
-    """
-    for t in range(len(hands)):
-        for side in range(2):
-            hand = hands[t, 3 * side : 3 * side + 3]
-            out[t, side] = along_way(hand, stillness[t, side], stages[labels[t]], side)
-            _, out[t, 2 + side] = on_way(hand, stages[labels[t]], side)
+    return off_all(one["now"][0], stages), _torn(belief, tools[1])
