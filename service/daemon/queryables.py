@@ -322,7 +322,7 @@ class Queryables:
         total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
         if total > MOST_POINTS:
             raise RequestError(
-                f"$.points: {total} via-points beside the task's, 13 for each with a radius; at most {MOST_POINTS} accepted"
+                f"$.points: {total} via-points beside the task's, 13 each with a radius; at most {MOST_POINTS} accepted"
             )
         low, high = self._skill.workspace
         reach = self._settings.reach
