@@ -123,20 +123,22 @@ class Choice:
             )
         ells, ridges = (NARROW, RIDGES) if self.even else (ELLS, (RIDGE_M,))
         ells = ells if ell is None else np.array([ell])
-        constant = min(self._tried(ells, (None,)), key=lambda one: one[0])
+        beneath = (None, *ridges) if may_be_linear and self.even else (None,)
+        tried = list(self._tried(ells, beneath))
+        constant = min((one for one in tried if one[1].ridge_m is None), key=lambda one: one[0])
         if not may_be_linear:
             return constant
         # Of positions the kernel's length stays: off the data the covariance grows as fast, and the
         # gate holds what it would hold over a constant, however straight the way was.
-        linear = min(self._tried(ells if self.even else np.array([constant[1].ell]), ridges), key=lambda one: one[0])
+        tried = tried if self.even else list(self._tried(np.array([constant[1].ell]), ridges))
+        linear = min((one for one in tried if one[1].ridge_m is not None), key=lambda one: one[0])
         return linear if linear[0] < (1.0 if self.even else CLEARLY) * constant[0] else constant
 
     def _tried(self, ells: Vector, ridges: Sequence[float | None]) -> Iterator[tuple[float, Parameters]]:
         for ell in ells.tolist():
-            for noise in NOISES.tolist():
-                inverse = self._inverse(ell, noise)
-                for ridge_m in ridges:
-                    yield rms(self._residuals(inverse, ridge_m)), Parameters(ell, noise, 1.0, 1.0, ridge_m)
+            for noise, missed in zip(NOISES.tolist(), self._missed(ell, NOISES, ridges), strict=True):
+                for ridge_m, residuals in zip(ridges, missed, strict=True):
+                    yield rms(residuals), Parameters(ell, noise, 1.0, 1.0, ridge_m)
 
     def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
         """Those that predict best a demonstration left out, with this ell or the best; over a
@@ -163,16 +165,19 @@ class Choice:
 
     def residuals(self, ell: float, noise: float, ridge_m: float | None = None) -> Vector:
         """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""
-        return self._residuals(self._inverse(ell, noise), ridge_m)
+        return np.asarray(self._missed(ell, np.array([noise]), (ridge_m,))[0, 0])
 
-    def _inverse(self, ell: float, noise: float) -> Vector:
-        return np.asarray(np.linalg.inv(np.exp(-ell * self._squares) + noise * np.eye(len(self.inputs))), np.float64)
-
-    def _residuals(self, inverse: Vector, ridge_m: float | None) -> Vector:
-        out = np.empty_like(self.outputs)
-        for h, departures in self._departures(ridge_m).items():
-            mine = self.owner == h
-            out[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], inverse[mine] @ departures)
+    def _missed(self, ell: float, noises: Vector, ridges: Sequence[float | None]) -> Vector:
+        """The residuals (J, R, N, 3) [m] with each noise (J,) over each mean beneath (R,): by one
+        eigendecomposition, as noise moves eigenvalues alone.
+        """
+        values, vectors = np.linalg.eigh(np.exp(-ell * self._squares))
+        out = np.empty((len(noises), len(ridges), *self.outputs.shape))
+        for h in np.unique(self.owner).tolist():
+            mine, departures = self.owner == h, [self._departures(ridge_m)[h] for ridge_m in ridges]
+            rows = vectors[mine] / (values + noises[:, None])[:, None]
+            missed = np.linalg.solve(rows @ vectors[mine].T, rows @ (vectors.T @ np.hstack(departures)))
+            out[:, :, mine] = missed.reshape(*missed.shape[:2], len(ridges), 3).swapaxes(1, 2)
         return out
 
     def _departures(self, ridge_m: float | None) -> dict[int, Vector]:
@@ -227,31 +232,30 @@ class Choice:
         """The spread under which these residuals are most likely, at whatever scale; of those as
         likely the least, with which the covariance grows most off the data.
         """
-        everyone = np.ones(len(self.owner), bool)
-        kernel, scatter = np.exp(-ell * self._squares), self._scatter(residuals, everyone)
+        scatter = self._scatter(residuals, np.ones(len(self.owner), bool))
         likelihoods = []
-        for spread in SPREADS:
-            covariance = self._left_out(kernel, spread * scatter)
+        for covariance in self._left_out(np.exp(-ell * self._squares), scatter):
             scale = mahalanobis(residuals, covariance).mean() / 3
             likelihoods.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariance)[1].mean()))
         return float(SPREADS[np.flatnonzero(np.array(likelihoods) <= min(likelihoods) + AS_LIKELY)[0]])
 
-    def _left_out(self, kernel: Vector, noise: Vector) -> Vector:
-        """The covariance (N, 3, 3) at each point given the other demonstrations, in the kernel's
-        units, with the noise (N, 3, 3) of the points.
+    def _left_out(self, kernel: Vector, scatter: Vector) -> Vector:
+        """The covariances (J, N, 3, 3) at each point given the other demonstrations, in units of
+        the kernel, where the points' noise is each of SPREADS (J,) times their scatter (N, 3, 3):
+        by one eigendecomposition of the kernel over that, of one output where all are alike.
         """
-        count = len(kernel)
-        total = np.einsum("nm,ij->nimj", kernel, np.eye(3))
-        total[np.arange(count), :, np.arange(count), :] += noise
-        inverse = np.linalg.inv(total.reshape(3 * count, 3 * count))
-        out = np.empty((count, 3, 3))
+        roots = np.linalg.cholesky(scatter[:, :1, :1] if self.alike else scatter)
+        white, (count, width, _) = np.linalg.inv(roots), roots.shape
+        total = np.einsum("nm,nik,mjk->nimj", kernel, white, white, optimize=True).reshape(2 * [count * width])
+        values, vectors = np.linalg.eigh(total)
+        out = np.empty((len(SPREADS), count, width, width))
         for h in np.unique(self.owner):
             mine = np.flatnonzero(self.owner == h)
-            rows = (3 * mine[:, None] + np.arange(3)).ravel()
-            block = np.linalg.inv(inverse[np.ix_(rows, rows)]).reshape(len(mine), 3, len(mine), 3)
-            each = np.arange(len(mine))
-            out[mine] = block[each, :, each, :] - noise[mine]
-        return 0.5 * (out + out.transpose(0, 2, 1))
+            rows, each = vectors[(width * mine[:, None] + np.arange(width)).ravel()], np.arange(len(mine))
+            blocks = np.linalg.inv(rows / (values + SPREADS[:, None])[:, None] @ rows.T)
+            found = blocks.reshape(-1, len(mine), width, len(mine), width)[:, each, :, each].swapaxes(0, 1)
+            out[:, mine] = roots[mine] @ (found - SPREADS[:, None, None, None] * np.eye(width)) @ roots[mine].mT
+        return 0.5 * (out + out.mT) * np.eye(3) if self.alike else 0.5 * (out + out.mT)
 
 
 def ridge(hands: Vector, tool: Vector, ridge_m: float = RIDGE_M) -> AffineMean:
