@@ -5,7 +5,6 @@ then there.
 from __future__ import annotations
 
 import math
-import pickle
 from dataclasses import replace
 
 import msgspec
@@ -47,7 +46,7 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     for one in (plain, skill):
         one.predict(*np.zeros((3, 2, 3)))
     _rarely(settings, urdf)
-    for one in (skill, _as_sent(skill), _as_sent(plain)):
+    for one in (skill, plain):
         _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
 
 
@@ -61,16 +60,6 @@ def _rarely(settings: Settings, urdf: str) -> None:
     Separation(settings, urdf).share(still)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
-
-
-def _as_sent(skill: Skill) -> Skill:
-    """The skill as another process gives it back: its arrays are read-only, and loops are compiled
-    once more for those.
-    """
-    parts: list[bytes] = []
-    data = pickle.dumps(skill, protocol=5, buffer_callback=lambda part: parts.append(bytes(part.raw())))
-    sent: Skill = pickle.loads(data, buffers=parts)
-    return sent
 
 
 def _follow(settings: Settings, skill: Skill, urdf: str) -> None:

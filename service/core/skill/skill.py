@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.immutable import Immutable, frozen
 from service.config import Reach, Settings
 from service.contract.records import Reason
 from service.contract.requests import TOLERANCE_M, ViaPoint
@@ -150,8 +151,8 @@ class Prediction(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Skill:
-    """Immutable: a model of how the tool goes with both hands, and what belongs to it.
+class Skill(Immutable):
+    """A model of how the tool goes with both hands, and what belongs to it.
 
     Made by `service.learning`, which learns, adapts and stores it.
     """
@@ -170,6 +171,9 @@ class Skill:
     digest: bytes = bytes(16)  # 16 bytes of its file that tell it from any other
     conductor: int | None = None  # side of the hand that conducts alone: the other makes no difference
     regions: Regions = NORMAL
+
+    def __post_init__(self) -> None:
+        frozen(self.workspace)
 
     def predict(
         self,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP
+from kmp.immutable import Immutable, frozen
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
@@ -37,19 +38,20 @@ from service.core.skill.via_points import bent
 
 APART = 0.12  # of two stages, as inputs beside how far along hands are: most of what is learned in one holds in all
 APART_BESIDE = 0.5  # the same for orientation and gripper, which are of each stage alone
-NO_PULLS, NO_ERRORS = np.empty((0, 9)), np.empty((0, 6))  # where nothing else is taught, or no covariance wanted
+NO_PULLS = frozen(np.empty((0, 9)))  # where nothing else is taught
+NO_ERRORS = frozen(np.empty((0, 6)))  # where no covariance is wanted
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
+@dataclass(frozen=True, eq=False, repr=False)
+class Placed(Immutable):
     """K stages where they are, R centres, M errors, X hands.
 
     rows: (R, 3 + 4) how far along each hand is, the stage, and weights. errors: (M, 3 + 3) the
     same and by how much [m] the tool was off. pulls: (X, 9) [m] hands around which the tool is
     moved besides, and weights, see `via_points.bent`.
 
-    All arrays are copies: what came from elsewhere may be read-only, for which loops would be
-    compiled once more, while they run.
+    All arrays are read-only, wherever they come from: for others loops would be compiled once more,
+    while they run.
     """
 
     stages: Records  # (K,) of STAGE
@@ -57,6 +59,10 @@ class Placed:
     rows: Vector
     errors: Vector
     pulls: Vector
+
+    def __post_init__(self) -> None:
+        for part in (self.stages, self.sizes, self.rows, self.errors, self.pulls):
+            frozen(part)
 
     @classmethod
     def of(cls, task: Task, at: NamedViaPoints, off: Vector, primitive: KMP, errors: Vector) -> Placed:
