@@ -10,18 +10,13 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from service.config import Settings, robot_description
-from service.contract.requests import ViaPoint
-from service.core import warm_up
 from service.core.skill.skill import Skill
-from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import decoded
-from support import tiers, vulkan
+from support import compiling, tiers, vulkan
 from support.paths import RECORDINGS, ROOT
 
 
@@ -50,41 +45,39 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what is quick and what is research, and puts the files that take longest first."""
-    tests = ROOT / "tests"
-    where = {item: str(item.path.relative_to(tests)) + "::" + item.nodeid.split("::", 1)[-1] for item in items}
-    for item, test in where.items():
-        for marker in tiers.markers(test, timed=item.get_closest_marker("timed") is not None):
+    """Marks what is quick and what is research, and puts first what needs nothing compiled, then
+    the files that take longest.
+    """
+    for item in items:
+        for marker in tiers.markers(_where(item), timed=item.get_closest_marker("timed") is not None):
             item.add_marker(marker)
-    items.sort(key=lambda item: tiers.begins(where[item]))
+    items.sort(key=lambda item: tiers.begins(_where(item)))
+
+
+def _where(item: pytest.Item) -> str:
+    """The test as `tiers` names it."""
+    return str(item.path.relative_to(ROOT / "tests")) + "::" + item.nodeid.split("::", 1)[-1]
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leaves out a test for which no time is left, and says so."""
+    """Leaves out a test for which no time is left, and says so; else waits for what is compiled."""
     left_s = item.config.getoption("--seconds-left")
     if left_s is not None and time.monotonic() - BEGAN_S > left_s:
         pytest.skip(f"left out: not begun within {left_s:g} s")
+    if not tiers.is_among(_where(item), tiers.UNCOMPILED):
+        compiling.wait()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """In a checkout fresh to this Python, compiles what a daemon compiles at its first start.
+    """Begins to compile in a checkout fresh to this Python, once for all workers.
 
-    Each test of a daemon would else do so in a process of its own, and time out where several do.
     Files are begun in the order of the tests, not the one with the most tests first.
     """
     config.option.loadscopereorder = False
-    version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    compiled = any((Path(warm_up.__file__).parent / "__pycache__").glob(f"*.{version}.nbi"))
-    if compiled or hasattr(config, "workerinput"):
-        return
-    place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
-    skill_worker = SkillWorker()
-    for name in ("soldering.npz", "experiments/as-paper.npz"):
-        loaded = skill_worker.load(RECORDINGS / name, timeout_s=120.0)
-        for one in (loaded, skill_worker.adapt(loaded, [place], tolerance=0.05, timeout_s=120.0)):
-            warm_up.warm_up(Settings(), one, urdf=robot_description(Settings()))
-    skill_worker.close()
+    if not hasattr(config, "workerinput") and compiling.is_needed():
+        process = compiling.begun()
+        config.add_cleanup(lambda: compiling.end(process))
 
 
 @pytest.fixture(scope="session")

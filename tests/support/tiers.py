@@ -17,7 +17,19 @@ RESEARCH = (
     "sim/test_people.py::test_a_reduced_comparison_keeps_the_order_that_is_stable",
     "test_replay.py::test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units",
 )
-SLOW = (  # the longest first: so they begin first
+UNCOMPILED = (  # what runs while the others wait for what is compiled, the longest first
+    "test_static.py",
+    "kmp",
+    "test_site.py",
+    "test_wheel.py",
+    "test_documents.py",
+    "test_hand_sample.py",
+    "test_architecture.py",
+    "test_config.py",
+    "contract",
+)
+SLOW = (  # the longest first: so they begin first, after what compiles for another number of joints
+    "core/test_other_arms.py",
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "core/test_warm_up.py",
@@ -28,11 +40,13 @@ SLOW = (  # the longest first: so they begin first
     "test_replay.py",
     "recording/test_segments.py",
     "core/test_any_hands.py",
+    "core/test_quick_reaches.py",
+    "core/test_settles.py",
+    "sim/test_partners.py",
     "cli/test_own_task.py",
     "sim/test_bench.py",
     "cli/test_interrupt.py",
     "daemon/test_fuzzed_daemon.py",
-    "core/test_other_arms.py",
     "cli/test_view_live.py",
     "daemon/test_network.py",
     "core/test_fuzzed_session.py",
@@ -54,6 +68,8 @@ SLOW = (  # the longest first: so they begin first
     "core/test_setpoint.py::test_an_axis_that_wild_ones_starve_comes_back",
     "core/test_arm_sources.py::test_no_stranger_makes_a_command_jump",
     "core/test_plausibility.py::test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculated_with",
+    "recording/test_drawings.py::test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed",
+    "daemon/test_way_out.py",
     "learning/test_gate.py",
     "kmp/test_low_rank.py",
     "kmp/test_tutorial.py",
@@ -80,7 +96,7 @@ SMOKE = (
 
 def is_among(test: str, named: tuple[str, ...]) -> bool:
     """Whether a test (`folder/file.py::name[parameters]`) is one of these, or in one of these."""
-    return any(test == one or test.startswith((f"{one}::", f"{one}[")) for one in named)
+    return any(test == one or test.startswith((f"{one}::", f"{one}[", f"{one}/")) for one in named)
 
 
 def markers(test: str, *, timed: bool) -> list[str]:
@@ -92,7 +108,8 @@ def markers(test: str, *, timed: bool) -> list[str]:
     return ["quick"]
 
 
-def begins(test: str) -> int:
+def begins(test: str) -> tuple[int, int]:
     """The place of a test's file in the order in which files are begun: the longest first."""
-    file = test.split("::", maxsplit=1)[0]
-    return SLOW.index(file) if file in SLOW else len(SLOW)
+    file, slow = test.split("::", maxsplit=1)[0], [one.split("::", maxsplit=1)[0] for one in SLOW]
+    early = [is_among(test, (one,)) for one in UNCOMPILED]
+    return (*early, True).index(True), (*slow, file).index(file)
