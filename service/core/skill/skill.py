@@ -334,11 +334,8 @@ class SkillStage:
     def nothing(self, state: Record, frame: Record) -> None:
         """Into the frame that nothing is predicted: the target is the setpoint."""
         state["unsure"], state["sure_tick"] = 0, state["tick"]
-        frame["target"], frame["orientation"], frame["closure"] = (
-            state["setpoint"][0],
-            state["orientation"],
-            state["closure"],
-        )
+        frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
+        frame["closure"] = state["closure"]
         _tell_stage(state["stage_belief"], frame)
 
 
