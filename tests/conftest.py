@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -42,6 +43,12 @@ os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--seconds-left`, for what is run as long as there is time."""
     parser.addoption("--seconds-left", type=float, metavar="S", help="leave out what has not begun after so long")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only what is timed is asked for, what holds none of it is not imported."""
+    only_timed = config.option.markexpr.startswith("timed") and collection_path.suffix == ".py"
+    return True if only_timed and "mark.timed" not in collection_path.read_text(encoding="utf-8") else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
