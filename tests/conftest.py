@@ -73,7 +73,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if left_s is not None and time.monotonic() - BEGAN_S > left_s:
         pytest.skip(f"left out: not begun within {left_s:g} s")
     if not tiers.is_among(_where(item), tiers.UNCOMPILED):
-        compiling.wait()
+        compiling.wait(six="ur5" in item.nodeid)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -28,8 +28,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
     "test_config.py",
     "contract",
 )
-SLOW = (  # the longest first: so they begin first, after what compiles for another number of joints
-    "core/test_other_arms.py",
+SLOW = (  # the longest first: so they begin first
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "core/test_warm_up.py",
@@ -40,6 +39,7 @@ SLOW = (  # the longest first: so they begin first, after what compiles for anot
     "test_replay.py",
     "recording/test_segments.py",
     "core/test_any_hands.py",
+    "core/test_other_arms.py",
     "core/test_quick_reaches.py",
     "core/test_settles.py",
     "sim/test_partners.py",
