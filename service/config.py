@@ -63,8 +63,8 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # [m] the tool's point and turn, seen from the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=4)] = 4.0  # [m/s²] each axis
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=200)] = 200.0  # [m/s³] each axis
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] as a norm; joints mostly allow less
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] likewise
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
     orientation: Literal["direction", "full"] = "direction"  # what the arm follows: where the tool's +z points, or all
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] of the tool
@@ -72,6 +72,16 @@ class ToolSettings(Section, frozen=True):
     radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk² beside error², at least
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
+
+    @property
+    def stop_acceleration(self) -> float:
+        """Of each axis in a stop [m/s²], in which the norm then never passes `max_acceleration`."""
+        return 0.4 * self.max_acceleration
+
+    @property
+    def stop_jerk(self) -> float:
+        """Of each axis in a stop [m/s³], likewise."""
+        return self.max_jerk / math.sqrt(3.0)
 
 
 class ArmSettings(Section, frozen=True):

@@ -349,7 +349,7 @@ SOURCES: dict[str, list[Source]] = {
             for key in ("mean", "worst")
         ),
         of("motion/by_follower/ours/minimum jerk/lag_ms"),
-        *("0.8", "4"),
+        "0.8",
     ],
     "`separation`": [
         of("separation/scenes"),

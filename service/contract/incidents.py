@@ -251,7 +251,8 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
             about, remedy = "the same stamp again", "stamp each sample when it was measured, and send it once"
             found = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
         case Cause.OLDER:
-            about, found = "a stamp before the newest", f"stamped {-apart_s:.3g} s before the newest accepted one"
+            about = "a stamp more than 0.1 s before the newest; of the arm, any before it"
+            found = f"stamped {-apart_s:.3g} s before the newest accepted one"
             remedy = "stop the second tracker or driver of this key; look for a network that reorders"
         case Cause.AHEAD:
             about = "a stamp farther ahead than the time that has passed"

@@ -164,6 +164,8 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     age_ms: float | None = None  # of the newest accepted sample; None: none yet
     fresh: bool = False  # whether that is young enough to go by
     clock_ms: float | None = None  # stamp to arrival, median of the last second; below 0: a clock that is ahead
+    late_ms: float | None = None  # of a hand's newest 49 samples behind the quickest, mean; None: no steady clock
+    late_95_ms: float | None = None  # of 95 in 100 of them at most
     frame: str = ""  # that the newest message names
     rejected: dict[str, int] = {}  # samples by cause, `malformed` among them
     cause: str = ""  # of the newest one rejected in the last second

@@ -17,7 +17,7 @@ from service.contract.records import SIDES
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
-from service.core.intake.intake import still_ticks
+from service.core.intake.arm_samples import still_ticks
 from service.core.limiter.limiter import Limiter
 from service.core.separation.separation import Separation
 from service.core.skill import ORDER

@@ -17,8 +17,10 @@ from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
 from service.core.frame import Record
+from service.core.intake.arm_samples import FARTHEST_OUTSIDE, MAX_JOINT_SPEED
 from service.core.intake.far_away import too_far
-from service.core.intake.intake import FARTHEST_OUTSIDE, MAX_JOINT_SPEED, Refused
+from service.core.intake.intake import Refused
+from service.core.intake.late_samples import lateness_ms
 from service.daemon.cell_streams import Arrivals
 
 WINDOW_S = 1.0  # over which rates and clocks are taken
@@ -77,11 +79,14 @@ class InputMonitor:
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
         silent_ms = settings.arm.silent_ms if source == "arm" else settings.hands.stale_ms
+        late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
         return Source(
             rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,
             age_ms=age_ms,
             fresh=age_ms is not None and age_ms < silent_ms,
             clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
+            late_ms=None if late is None else round(late[0], 1),
+            late_95_ms=None if late is None else round(late[1], 1),
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
             cause=history.cause if lately else "",

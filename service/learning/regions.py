@@ -71,8 +71,8 @@ def folds(together: NDArray[np.intp]) -> list[list[int]]:
     (H,), and of some that follow each other.
     """
     groups = np.unique(together)
-    blocks = np.array_split(groups, min(FOLDS, len(groups)))
-    return [np.flatnonzero(np.isin(together, block)).tolist() for block in blocks]
+    blocks = np.array_split(groups, max(1, min(FOLDS, len(groups))))
+    return [np.flatnonzero(np.isin(together, block)).tolist() for block in blocks if len(block)]
 
 
 def of_held_out(

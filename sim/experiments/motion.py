@@ -56,6 +56,7 @@ class Figures:
     follower: str
     group: str
     name: str
+    person: str
     error_rms_mm: float
     error_p95_mm: float
     lag_ms: float
@@ -148,6 +149,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         name,
         hands.group,
         hands.name,
+        hands.person,
         error_rms_mm=float(np.sqrt(np.mean(off_mm**2))),
         error_p95_mm=float(np.percentile(off_mm, 95)),
         lag_ms=_lag_ms(target, seen.tool),
@@ -198,9 +200,14 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         for group, rate_hz in FLOOR_GROUPS.items()
     }
     _record(results, hands[1], by_name["ours"](hands[1]))
+    people = _by_person([one for one in found if math.isnan(one.overshoot_mm)])
+    for group, rows in people.items():
+        told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in rows.items())
+        results.say(f"{group}, ours / best chase: {told}")
     numbers = {
         "hands": "recorded" if options.hands else "modelled",
         "by_follower": table,
+        "by_person": people,
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
     }
@@ -226,6 +233,27 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
             }
         out[group]["top_speed"] = top
     return out
+
+
+def _by_person(rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each group and person the root mean square error [mm] over all sequences, ours and that of
+    the chase that is best in the group.
+    """
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for group in dict.fromkeys(one.group for one in rows):
+        of = [one for one in rows if one.group == group]
+        chases = {one.follower for one in of if one.follower.startswith("chase")}
+        best = min(sorted(chases), key=lambda name: _pooled(of, name))
+        out[group] = {
+            person: {"ours": _pooled(mine, "ours"), "chase": _pooled(mine, best)}
+            for person in dict.fromkeys(one.person for one in of)
+            for mine in [[one for one in of if one.person == person]]
+        }
+    return out
+
+
+def _pooled(rows: list[Figures], follower: str) -> float:
+    return math.sqrt(np.mean([one.error_rms_mm**2 for one in rows if one.follower == follower]))
 
 
 def _line(groups: dict[str, dict[str, float]]) -> str:

@@ -1,8 +1,10 @@
 """Hands in motion, for `motion`: recorded ones, ones modelled after them, sudden stops, and the
 bench's reaches.
 
-Recordings are `.npz` files with `time_s` (T,), `left` and `right` (T, 3) [m]. What they hold is
-brought into the skill's region; their truth is the recording without what is too fast for a wrist.
+Recordings are `.npz` files with `time_s` or `t` (T,) [s], `left` and `right` (T, 3) [m], NaN where
+a hand was not seen; one that never was rests. Files that differ only in what follows the last
+underscore of their names are of one person. What they hold is brought into the skill's region;
+their truth is the recording without what is too fast for a wrist.
 """
 
 from __future__ import annotations
@@ -39,6 +41,11 @@ class Moving:
     samples: Array
     stop_s: float = math.nan  # when a sudden stop begins
 
+    @property
+    def person(self) -> str:
+        """Whose hands they are."""
+        return self.name.rsplit("_", 1)[0]
+
 
 def recorded(folder: Path, middle: Array) -> list[Moving]:
     """Each recording of a folder, clean, as it is, and seen at 30 Hz. Raises ExperimentError."""
@@ -51,7 +58,8 @@ def recorded(folder: Path, middle: Array) -> list[Moving]:
 def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
     try:
         with np.load(path, allow_pickle=False) as data:
-            t, left, right = (np.asarray(data[name], np.float64) for name in ("time_s", "left", "right"))
+            t = np.asarray(data["t" if "t" in data else "time_s"], np.float64)
+            left, right = (_seen(t, np.asarray(data[name], np.float64)) for name in ("left", "right"))
     except (KeyError, ValueError, OSError) as error:
         raise ExperimentError(f"{path}: not a recording of hands: {error}") from None
     t = t - t[0]
@@ -77,6 +85,14 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
         Moving(name, "recorded", fine, t, middle + scale * hands),
         seen("30 Hz, 2 mm", 30, 0.002),
     ]
+
+
+def _seen(t: Array, hand: Array) -> Array:
+    """A hand's path (T, 3), straight where it was not seen; at rest where it never was."""
+    known = np.isfinite(hand).all(axis=1)
+    if not known.any():
+        return np.zeros_like(hand)
+    return np.stack([np.interp(t, t[known], column[known]) for column in hand.T], axis=1)
 
 
 def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:

@@ -10,7 +10,8 @@ import pytest
 from service.config import HandSettings
 from service.core.frame import Vector
 from service.core.intake import hand_estimator
-from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE, model
+from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE
+from service.core.intake.motion_model import model
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 
@@ -106,9 +107,9 @@ def test_compiled_and_plain_functions_agree() -> None:
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
-        for name, more in (("_advance", (transition, noise)), ("_update", (0.01, position, 0.03))):
+        for name, more in (("advance", (transition, noise)), ("_update", (0.01, position, 0.03))):
             function = getattr(hand_estimator, name)
-            arrays = parts[:2] if name == "_advance" else parts
+            arrays = parts[:2] if name == "advance" else parts
             (function.py_func if plain else function)(*arrays, *more)
         results.append(parts)
     for compiled, plain in zip(*results, strict=True):

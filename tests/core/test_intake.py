@@ -130,10 +130,10 @@ def test_what_is_rejected_is_counted_by_source_too() -> None:
 
 def test_repeated_and_older_stamps_are_counted_apart() -> None:
     hands = Hands()
-    for stamp in (1000, 1000, 999):
+    for stamp in (200_000_000, 200_000_000, 99_999_999, 100_000_000, 100_000_000):
         hands.hand(stamp)
         hands.advance()
-    assert hands.rejected() == {Cause.REPEATED: 1, Cause.OLDER: 1}
+    assert hands.rejected() == {Cause.REPEATED: 2, Cause.OLDER: 1}
     assert int(hands.state["hand_ticks"][LEFT]) == 0
 
 

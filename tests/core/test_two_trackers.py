@@ -81,3 +81,42 @@ def test_nobodys_hands_are_a_contest_at_uneven_intervals() -> None:
         for times, places in session(who, 0, group="tuning").samples():
             kept = random.random(len(times)) < 0.6
             assert first_contest_s(times[kept], places[kept]) is None
+
+
+def spoilt(kind: str, rate_hz: float, seed: int) -> tuple[Vector, Vector]:
+    """Times [s] and places (T, 3) [m] as one tracker tells them that takes a hand for elsewhere,
+    each time another way: at once for some samples, or a little for one.
+    """
+    random, times = np.random.default_rng(seed), np.arange(0.0, 8.0, 1.0 / rate_hz)
+    places = (
+        PLACE + np.outer(0.1 * np.sin(2 * times), (0.0, 1.0, 0.0)) + 0.002 * random.standard_normal((len(times), 3))
+    )
+    at = 3
+    while at < len(times):
+        way, lasts = random.standard_normal(3), 1 if kind == "spikes" else int(random.integers(3, 9))
+        far_m = random.uniform(0.02, 0.04) if kind == "spikes" else random.uniform(0.1, 0.2)
+        places[at : at + lasts] += far_m * way / np.linalg.norm(way)
+        at += lasts + int(random.integers(5, 9))
+    return times, places
+
+
+@pytest.mark.parametrize("rate_hz", [30.0, 60.0, 100.0])
+@pytest.mark.parametrize("kind", ["spikes", "bursts"])
+def test_one_tracker_that_is_often_elsewhere_for_a_moment_is_no_contest(kind: str, rate_hz: float) -> None:
+    for seed in range(6):
+        assert first_contest_s(*spoilt(kind, rate_hz, seed)) is None
+
+
+@pytest.mark.parametrize("rates_hz", [(30.0, 30.0), (100.0, 100.0), (100.0, 60.0), (60.0, 30.0)])
+@pytest.mark.parametrize("apart_m", [0.02, 0.1, 0.3])
+def test_two_trackers_of_any_rates_are_noticed_of_a_hand_that_moves(
+    apart_m: float, rates_hz: tuple[float, float]
+) -> None:
+    for seed, way in enumerate(np.eye(3)):
+        one, other = (uneven(rate_hz, 4.0, "early or late", seed + round(rate_hz)) for rate_hz in rates_hz)
+        order, random = np.argsort(np.concatenate((one, other + 0.003))), np.random.default_rng(seed)
+        times, of_other = np.concatenate((one, other + 0.003))[order], order >= len(one)
+        moved = np.outer(0.1 * np.sin(4 * times), (0.0, 1.0, 0.0)) + 0.001 * random.standard_normal((len(times), 3))
+        found = first_contest_s(times, PLACE + moved + apart_m * np.outer(of_other, way))
+        assert found is not None
+        assert found < 2.5

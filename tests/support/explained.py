@@ -26,7 +26,8 @@ from service.core.skill.skill import Skill
 def margin(tool: ToolSettings) -> float:
     """[m] by which a setpoint may pass what the targets explain."""
     back = RETURN_SHARE * tool.max_speed
-    stop_s = (tool.max_speed + back) / tool.max_acceleration + 2.0 * tool.max_acceleration / tool.max_jerk
+    stop_s = (tool.max_speed + back) / tool.stop_acceleration
+    stop_s += (tool.max_acceleration + tool.stop_acceleration) / tool.stop_jerk
     return HULL_MARGIN + back * stop_s
 
 
@@ -53,7 +54,7 @@ class Explained(SetpointGenerator):
         before, tool = state["setpoint"].copy(), self._tool
         if self._steps < 0:
             ends = [
-                [farthest(before, i, side, tool.max_acceleration, tool.max_jerk, 0.0) for i in range(3)]
+                [farthest(before, i, side, tool.stop_acceleration, tool.stop_jerk, 0.0) for i in range(3)]
                 for side in (1.0, -1.0)
             ]
             self._most, self._steps = np.array(ends), 0
@@ -62,7 +63,7 @@ class Explained(SetpointGenerator):
         self._last[self._steps % len(self._last)] = [target.position, -target.position]
         self._steps += 1
         back = RETURN_SHARE * tool.max_speed
-        too_fast = speed_to_come(before[1], before[2], tool.max_jerk, back) > tool.max_speed
+        too_fast = speed_to_come(before[1], before[2], tool.stop_jerk, back) > tool.max_speed
         share = 0.0 if too_fast else slow / max(1.0, tool.max_speed * np.abs(costs[0]).max())
         self._most = np.maximum(self._last.max(axis=0), self._most - back * share * self._period)
         left = self._most + self._margin - [state["setpoint"][0], -state["setpoint"][0]]

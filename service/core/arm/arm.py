@@ -25,13 +25,13 @@ SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 t
 POSITION_GAIN, TURN_GAIN = 50.0, 10.0  # [1/s] of small errors' decay; at most ...
 POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_rate`, or joints swing about the target
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
-CLOSING_BRAKES = 0.1  # of the tool's acceleration; with more, joints at their jerk limit swing about the target
+CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
 HORIZON_S = 0.02  # for reaching the joint velocities that an orientation step needs; else it is scaled down
-SPARING = 0.2  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
+SPARING = 0.3  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
-PLANNED_SHARE = np.array([0.96, 0.9, 0.7])
+PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
 
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
@@ -119,7 +119,7 @@ class Arm:
         self._data = self._model.createData()
         top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / REACH_M
         closing = closing or Closing(
-            CLOSING_BRAKES * settings.tool.max_acceleration, min(top, CLOSING_SPEED), FAR_DAMPING
+            CLOSING_BRAKES * settings.tool.stop_acceleration, min(top, CLOSING_SPEED), FAR_DAMPING
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
         scale = (acceleration / acceleration.max()) ** SPARING

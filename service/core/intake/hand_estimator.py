@@ -23,12 +23,12 @@ import functools
 import math
 
 import numpy as np
-from scipy.linalg import expm
 
 from kmp.compiled import compiled
 from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
-from service.core.intake import MODES
+from service.core.intake import KEPT, MODES
+from service.core.intake.motion_model import model
 
 LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
 FALL_S = 0.03  # in which it is still no more
@@ -68,8 +68,6 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
     return out
 
 
-REVERT_A = 15.0  # [1/s] of the acceleration
-REVERT_V = 100.0  # [1/s²] of the velocity
 INTENSITY = np.array([0.03, 3.0, 30.0])  # [m²/s⁵] of the modes
 PRIOR = np.array([0.4, 0.4, 0.2])  # their probabilities, when nothing is known
 SWITCH_RATE = 3.0  # [1/s] at which a mode is left
@@ -77,17 +75,17 @@ LEAST_NOISE = 7e-4  # [m] of a tracker's standard deviation: below it, hands tre
 MOST_NOISE = 5e-2  # [m]
 AVERAGED = 60  # samples over which the noise is averaged
 OUTLIER = 9.0  # times the noise variance: as much as one difference may count
-JUMP_NOISE = 6.0  # standard deviations of a tracker's noise that are no jump
 START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
 START_ACCELERATION = 1.0  # [m/s²] likewise
+LATE_S = 0.1  # that a sample may be older than the newest one, and later than the quickest: a network's worst delay
+SECOND_S = 1.0  # in which a tracker's quickest sample is as quick as ever: of 30 its delays, 2 ms of 60
+STEADY_S = 0.01  # that it may differ by all the same: clocks that are 1 % apart are not gone by
+EXACT_NS = 2.0**62  # of differences of two stamps that do not overflow
+ROUNDED = 1e-6  # of a tick, that a lateness may lack: sums of periods are not exact
+LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # clocks: in their first second, not steady, steady
 LEAST_PROBABILITY = 1e-4  # of a mode
+ALONE_S = 1.0  # since the sample before one that has none: longer than samples are compared over
 MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
-PLACES_M = 0.012  # so far apart at least are the places of which two sources tell ...
-PLACE_SHARE = 0.4  # ... and so much of that is what each tells of one
-LEAST_S = 1e-3  # between two samples, also of one tick
-BETWEEN_S = 0.08  # the time over which a hand that was told of three times may go to and fro ...
-BETWEEN_MPS2 = 50.0  # [m/s²] ... unless that takes more than a hand can
-TO_AND_FRO = (0b0010, 0b0100, 0b0110, 0b0101)  # which of four samples are of one place, the rest of the other
 ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
 
 
@@ -115,23 +113,6 @@ class HandEstimator:
         _advance_both(as_array(state), stale_ticks, self._model(ticks))
 
 
-def model(interval_s: float) -> tuple[Vector, Vector]:
-    """Transition (3, 3), and process noise (3, 3) of unit intensity, over an interval (Van Loan,
-    1978).
-    """
-    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -REVERT_V, -REVERT_A]])
-    whole = np.zeros((6, 6))
-    whole[:3, :3], whole[2, 5], whole[3:, 3:] = -dynamics, 1.0, dynamics.T
-    grown = expm(whole * interval_s)
-    transition = np.ascontiguousarray(grown[3:, 3:].T)
-    return _to_digits(transition), _to_digits(transition @ grown[:3, 3:])
-
-
-def _to_digits(matrix: Vector) -> Vector:
-    """To 12 digits, as LAPACK's last ones are another CPU's."""
-    return np.array([[float(f"{value:.11e}") for value in row] for row in matrix])
-
-
 @compiled
 def _start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
     """A hand of which one sample is known."""
@@ -147,7 +128,7 @@ def _start(means: Vector, covariances: Vector, modes: Vector, noise: float, posi
 
 
 @compiled
-def _advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
+def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
     """All modes moved on: m = F m, P = F P F' + q Q."""
     moved, product = np.empty((3, 3)), np.empty((3, 3))
     for mode in range(MODES):
@@ -259,7 +240,7 @@ def _update(
 
 
 @compiled
-def _combine(means: Vector, modes: Vector, estimate: Vector) -> None:
+def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
     """The estimate (3, 3): position, velocity and acceleration, by axis."""
     for row in range(3):
         for axis in range(3):
@@ -275,8 +256,8 @@ def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
     for side in range(2):
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
-            _advance(state.mode_means[side], state.mode_covariances[side], over.transition, over.noise)
-            _combine(state.mode_means[side], state.mode_probabilities[side], hand)
+            advance(state.mode_means[side], state.mode_covariances[side], over.transition, over.noise)
+            combine(state.mode_means[side], state.mode_probabilities[side], hand)
         else:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
@@ -292,55 +273,9 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
 
 
 @compiled
-def has_jumped(states: Records, parameters: Records, side: int, position: Vector, interval_s: float) -> bool:
-    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
-    after the one before.
-    """
-    state, given = states[0], parameters[0]
-    gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE * math.sqrt(state.noise_variance[side]))
-    off = 0.0
-    for axis in range(3):
-        off += (position[axis] - state.hands[side, 0, axis]) ** 2
-    return bool(off > gate * gate)
-
-
-@compiled
-def is_to_and_fro(states: Records, side: int, position: Vector, interval_s: float) -> bool:
-    """Whether a sample (3,) [m], `interval_s` after the one before, and the three before it go to
-    and fro between two places as no hand does, however uneven their intervals.
-    """
-    state, samples, wanted = states[0], np.empty((4, 3)), 0.0
-    if interval_s + state.sample_interval_s[side] > BETWEEN_S:
-        return False
-    samples[0], samples[1:] = position, state.past_samples[side]
-    after_s, before_s = max(interval_s, LEAST_S), max(state.sample_interval_s[side], LEAST_S)
-    for axis in range(3):
-        turned = (samples[0, axis] - samples[1, axis]) / after_s - (samples[1, axis] - samples[2, axis]) / before_s
-        wanted += (2.0 * turned / (after_s + before_s)) ** 2
-    if wanted < BETWEEN_MPS2**2:
-        return False
-    for places in TO_AND_FRO:
-        within, apart = 0.0, np.inf
-        for i in range(4):
-            for j in range(i):
-                square = 0.0
-                for axis in range(3):
-                    square += (samples[i, axis] - samples[j, axis]) ** 2
-                if (places >> i) & 1 == (places >> j) & 1:
-                    within = max(within, square)
-                else:
-                    apart = min(apart, square)
-        if apart >= PLACES_M**2 and within <= PLACE_SHARE**2 * apart:
-            return True
-    return False
-
-
-@compiled
-def _turned(turn: tuple[float, float, float, float], frame: Vector, out: Vector) -> None:
-    """Into `out` (9,) the rotation matrix in frame base of a quaternion x y z w, with the tracker's
-    axes in its unit (3, 4).
-    """
-    x, y, z, w = turn
+def turn_to(states: Records, side: int, turn: tuple[float, float, float, float], frame: Vector) -> None:
+    """Takes in a quaternion x y z w of a hand, by the tracker's axes in its unit (3, 4)."""
+    (x, y, z, w), out = turn, states[0].hand_turns[side]
     s, matrix = 2.0 / (x * x + y * y + z * z + w * w), np.empty((3, 3))
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
     matrix[1, 0], matrix[1, 1], matrix[1, 2] = s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)
@@ -354,28 +289,112 @@ def _turned(turn: tuple[float, float, float, float], frame: Vector, out: Vector)
 
 
 @compiled
-def take(
-    states: Records,
-    side: int,
-    position: Vector,
-    turn: tuple[float, float, float, float],
-    frame: Vector,
-    interval_s: float,
-    anew: bool,
-) -> None:
-    """Takes in a sample of one hand, where it is (3,) [m] and how it is turned in the tracker's
-    frame (3, 4), `interval_s` after the one before, or starts `anew` with it.
-    """
+def seconds_after(stamp_ns: int, other_ns: int) -> float:
+    """How much later a stamp is than another one [s], whatever both are."""
+    apart_ns = float(stamp_ns) - float(other_ns)
+    return 1e-9 * (float(stamp_ns - other_ns) if abs(apart_ns) < EXACT_NS else apart_ns)
+
+
+@compiled
+def _later_s(states: Records, side: int, quickest: int, stamp_ns: int, period_s: float) -> float:
+    """How much later a sample comes than the quickest of this second (0) or the last (1) [s]."""
     state = states[0]
+    passed_s = (state.tick - state.quickest_ticks[side, quickest]) * period_s
+    return float(passed_s - seconds_after(stamp_ns, state.quickest_stamps_ns[side, quickest]))
+
+
+@compiled
+def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> int:
+    """How many whole ticks later a sample comes than the quickest ones; 0 by a clock that is not
+    believed.
+    """
+    if states[0].clock[side] != BELIEVED:
+        return 0
+    late_s = max(_later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s))
+    return int(min(max(late_s, 0.0), LATE_S) / period_s + ROUNDED)
+
+
+@compiled
+def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh: bool) -> None:
+    """Remembers how late a sample came; a clock set back over a silence is another one."""
+    state = states[0]
+    stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
+    known = state.clock_tick[side] >= 0
+    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > LATE_S):
+        stamps[:], ticks[:] = stamp_ns, state.tick
+        state.clock[side], state.clock_tick[side] = LEARNING, state.tick
+    elif (state.tick - state.clock_tick[side]) * period_s >= SECOND_S:
+        apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
+        steady = abs(apart_s) <= STEADY_S and state.clock[side] != LEARNING
+        state.clock[side] = BELIEVED if steady else DOUBTED
+        stamps[1], ticks[1] = stamps[0], ticks[0]
+        stamps[0], ticks[0] = stamp_ns, state.tick
+        state.clock_tick[side] = state.tick
+    elif _later_s(states, side, 0, stamp_ns, period_s) < 0.0:
+        stamps[0], ticks[0] = stamp_ns, state.tick
+
+
+@compiled
+def slot(states: Records, side: int, order: int) -> int:
+    """Where in its ring a hand's sample is."""
+    return int((states[0].kept_newest[side] - order) % KEPT)
+
+
+@compiled
+def order_of(states: Records, side: int, stamp_ns: int) -> int:
+    """How many kept samples have a newer stamp than this; -1: one has the same."""
+    state = states[0]
+    for order in range(state.kept[side]):
+        kept_ns = state.kept_stamps_ns[side, slot(states, side, order)]
+        if kept_ns <= stamp_ns:
+            return -1 if kept_ns == stamp_ns else order
+    return int(state.kept[side])
+
+
+@compiled
+def take(
+    states: Records, parameters: Records, side: int, stamp_ns: int, position: Vector, restarts: bool, fresh: bool
+) -> None:
+    """Filters in a sample (3,) [m] of one hand that is the newest and was made now; with one that
+    `restarts`, or of a hand that was not `fresh`, the filter begins anew.
+    """
+    state, period_s = states[0], parameters[0].period_s
+    note_clock(states, side, stamp_ns, period_s, fresh)
+    ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
+    state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
+    state.kept[side] = min(state.kept[side] + 1, KEPT)
+    at = state.kept_newest[side]
+    state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, state.tick
+    state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
+    state.kept_positions[side, at] = position
+    filter_in(states, side, at, ALONE_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
+    combine(state.mode_means[side], state.mode_probabilities[side], state.hands[side])
+
+
+@compiled
+def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool) -> None:
+    """Filters in a kept sample, with the filter as of when that was made, and keeps it so."""
+    state, position = states[0], states[0].kept_positions[side, at]
     means, covariances = state.mode_means[side], state.mode_covariances[side]
-    probabilities = state.mode_probabilities[side]
     if anew:
         state.even_samples[side] = 0
     _update_noise(states, side, position, interval_s)
-    variance = state.noise_variance[side]
+    variance, modes = state.noise_variance[side], state.mode_probabilities[side]
     if anew:
-        _start(means, covariances, probabilities, variance, position)
+        _start(means, covariances, modes, variance, position)
     else:
-        _update(means, covariances, probabilities, variance, position, interval_s)
-    _combine(means, probabilities, state.hands[side])
-    _turned(turn, frame, state.hand_turns[side])
+        _update(means, covariances, modes, variance, position, interval_s)
+    _remember(states, side, at)
+
+
+@compiled
+def _remember(states: Records, side: int, at: int) -> None:
+    """Keeps the filter as it is, in all its parts."""
+    state = states[0]
+    state.kept_means[side, at] = state.mode_means[side]
+    state.kept_covariances[side, at] = state.mode_covariances[side]
+    state.kept_probabilities[side, at] = state.mode_probabilities[side]
+    state.kept_past[side, at] = state.past_samples[side]
+    noise = state.kept_noise[side, at]
+    noise[0], noise[1] = state.noise_variance[side], state.noise_samples[side]
+    noise[2], noise[3] = state.even_samples[side], state.sample_interval_s[side]

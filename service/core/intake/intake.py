@@ -1,21 +1,8 @@
 """Hand and arm samples as they come in: checked, mapped to frame `base`, and filtered to a state at
 the tick.
 
-What a source tells, against what it told before: stamps, jumps, and a second source that
-contradicts it. One rule for both hands and the arm:
-
-* A stamp must be newer than the newest one, and no farther ahead of it than the time since then
-  plus the time after which the source is silent. Silence is judged by arrival; after it any stamp
-  is taken, but the same again.
-* Where a sample cannot come from what was known it has jumped. A hand's jump is believed once
-  `CONFIRMED` samples in a row, over `CONFIRMED_S` at least, agree with each other; the arm's never,
-  before it was silent: it has a body.
-* A hand that comes to where the other one was, which is not seen there any more, has not moved: its
-  tracker takes one for the other. That is believed after `hands.swapped_s`, as it may have put
-  itself right.
-* A source is contested from when a quarter of what it told within about a second had jumped, or of
-  a hand went to and fro between two places, until that is less than a tenth; and while a hand's
-  samples scatter more than any tracker's, as those of two that are some centimetres apart do.
+The rules by which a sample is believed, in full: `plausibility`. Those that come late:
+`late_samples`.
 """
 
 from __future__ import annotations
@@ -32,137 +19,44 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError, 
 from service.contract.records import SIDES, SOURCES, Cause, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
-from service.core.intake.hand_estimator import HandEstimator, has_jumped, is_to_and_fro, take
-
-REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
-CONFIRMED = 3  # samples in a row that agree
-CONFIRMED_S = 0.02  # over so long at least
-SWAPPED_M = 0.05  # so near to where the other hand was ...
-SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
-AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
-AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
-CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
-MOST_SHARE = 0.5  # to which samples that went to and fro raise it
-SETTLED = 0.1  # share below which it is no more
-SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
-GATHERED_M = 0.010  # below which it is no more
-MEMORY_S = 1.0  # over which the share is averaged
-MOST_S = 1 / 30  # that one sample counts, whatever the pause before it
-ROUND_TO = 1e9  # of the share: machines that differ in the last bits agree
-
-
-@compiled
-def is_contested(states: Records, already: bool) -> bool:
-    """Whether some source is contradicted by another; `already`: it was found so before."""
-    share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED_SHARE, SCATTERED_M)
-    return bool(states[0].contested.max() > share or states[0].noise_variance.max() > scatter_m**2)
-
-
-@compiled
-def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float) -> int:
-    """The cause for which a stamp is refused, or -1; the newest one came `passed_s` ago."""
-    if stamp_ns == newest_ns:
-        return REPEATED
-    if not fresh:
-        return -1
-    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of integers may overflow
-    if ahead_s > passed_s + silent_s:
-        return AHEAD
-    return OLDER if stamp_ns < newest_ns else -1
-
-
-@compiled
-def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
-    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
-    after the other, the samples count alike.
-    """
-    state = states[0]
-    ticks, share = state.sample_ticks[source], state.contested[source]
-    passed = float(state.tick - ticks[0])
-    if ticks[1] < state.tick:
-        passed *= 0.5  # since the sample before the last
-        ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min(passed * period_s, MOST_S)
-    share += (1.0 - math.exp(-passed_s / MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
-    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
-
-
-@compiled
-def is_swapped(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample (3,) [m], the first after a silence, is the other hand's, or goes on
-    from samples that were.
-    """
-    state, given = states[0], parameters[0]
-    is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
-    if is_swap and (state.tick - state.jump_first_tick[side]) * given.period_s >= given.swapped_s:
-        return False
-    if is_swap and _goes_on(states, parameters, side, position):
-        return True
-    silent = state.tick - seen
-    lately = given.stale_ticks <= silent and silent * given.period_s < given.swapped_s
-    return bool(seen >= 0 and lately and _is_at_other(states, parameters, side, position))
-
-
-@compiled
-def is_confirmed(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample (3,) [m] that jumped is to be believed, by those just before it."""
-    state, given = states[0], parameters[0]
-    if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
-        state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
-    state.jumped_to[side, :] = position
-    state.jump_newest_tick[side] = state.tick
-    state.jump_count[side] += 1
-    first, count = state.jump_first_tick[side], state.jump_count[side]
-    unseen = state.hand_ticks[1 - side] < first
-    if count > 1 and unseen and _is_at_other(states, parameters, side, position):
-        state.jump_is_swap[side] = 1
-    enough_s = given.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
-    return bool(count >= CONFIRMED and (state.tick - first + 0.5) * given.period_s >= enough_s)
-
-
-@compiled
-def _is_at_other(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample is where the other hand was, and not where this one was."""
-    state, given = states[0], parameters[0]
-    seen = state.hand_ticks[1 - side]
-    here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * given.period_s, given.swapped_s)
-    return bool(seen >= 0 and _distance(position, there) < min(near, 0.5 * _distance(here, there)))
-
-
-@compiled
-def _goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a sample is where a hand can be that was at the newest one that jumped."""
-    state, given = states[0], parameters[0]
-    passed = state.tick - state.jump_newest_tick[side]
-    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * given.period_s
-    return bool(passed < given.stale_ticks and near)
-
-
-@compiled
-def _distance(a: Vector, b: Vector) -> float:
-    square = 0.0
-    for axis in range(3):
-        square += (a[axis] - b[axis]) ** 2
-    return math.sqrt(square)
-
+from service.core.intake import KEPT
+from service.core.intake.arm_samples import (
+    FARTHEST_OUTSIDE,
+    JUMP_RAD,
+    JUMP_RADPS,
+    JUMP_SPEEDS,
+    STILL_RAD,
+    compared,
+    still_ticks,
+)
+from service.core.intake.hand_estimator import LATE_S, HandEstimator, note_clock, order_of, take, ticks_late, turn_to
+from service.core.intake.late_samples import expected, take_late, tick_made
+from service.core.intake.motion_model import models
+from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # of `hands.unit`
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
+REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
 TWO_SOURCES = int(Reason.TWO_SOURCES)
-MAX_JOINT_SPEED = 100.0  # [rad/s] beyond it a measured joint is a mistake
-JUMP_RAD = 0.2  # [rad] jump gate of a joint ...
-JUMP_RADPS = 5.0  # [rad/s] ... for each second without a sample, as by hand an arm is moved so fast ...
-JUMP_SPEEDS = 2.0  # ... or as many times its fastest joint's greatest speed, where that is more
-FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
-STILL_RAD = 0.02  # an arm is at rest that stayed within so much ...
-STILL_S = 0.1  # ... for so long
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
 HANDS_KNOWN = 1  # what a step says: both hands are seen
 ARM_HEARD = 2  # the arm has reported its joints lately enough
 ARM_STILL = 4  # ... and has reported one posture for a while
 CONTESTED = 8  # a hand or the arm is reported by two sources
+CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
+SETTLED = 0.1  # share below which it is no more
+SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
+GATHERED_M = 0.010  # below which it is no more
+SCATTER_SAMPLES = 30  # that it is judged by at least: in fewer, four that one outlier spoils weigh too much
+MEMORY_S = 1.0  # over which the share is averaged
+MOST_S = 1 / 30  # that one sample counts, whatever the pause before it
+ROUND_TO = 1e9  # of the share: machines that differ in the last bits agree
+JUMP_NOISE = 6.0  # standard deviations of a tracker's noise that are no jump
+LEAST_S = 1e-3  # between two samples, also of one tick
+BETWEEN_S = 0.08  # the time over which a hand that was told of three times may go to and fro ...
+BETWEEN_MPS2 = 50.0  # [m/s²] ... unless that takes more than a hand can
+MOST_SHARE = 0.5  # to which samples that went to and fro raise it
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -172,11 +66,6 @@ def _stale_ticks(key: str, settings: Settings) -> int:
     section, name = BY_KEY[key].stale_after or ("", "")
     duration_ms: float = getattr(getattr(settings, section), name)
     return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
-
-
-def still_ticks(settings: Settings) -> int:
-    """The ticks over which an arm must report one posture before it is believed."""
-    return math.ceil(round(STILL_S / settings.period_s, 6))
 
 
 class Refused(NamedTuple):
@@ -200,6 +89,8 @@ class Intake:
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        # from the sample before to one that is late, and from that to now
+        self._models = models(settings.period_s, self.stale_ticks + math.ceil(LATE_S / settings.period_s) + 1)
         limits = np.array([settings.joints.lower, settings.joints.upper])
         self._parameters = parameters(
             period_s=settings.period_s,
@@ -223,7 +114,7 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Sets in a state of zeros what no sample has reported yet."""
-        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks"):
+        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
             state[field] = -1
         self._estimator.begin(state)
 
@@ -253,6 +144,7 @@ class Intake:
         cause = _take_hand(
             as_array(state),
             self._parameters,
+            self._models,
             side,
             sample.stamp_ns,
             sample.position,
@@ -281,6 +173,77 @@ class Intake:
 
 
 @compiled
+def is_contested(states: Records, already: bool) -> bool:
+    """Whether some source is contradicted by another; `already`: it was found so before."""
+    share, scatter_m = (SETTLED, GATHERED_M) if already else (CONTESTED_SHARE, SCATTERED_M)
+    state = states[0]
+    for side in range(2):
+        known = already or state.noise_samples[side] >= SCATTER_SAMPLES
+        if known and state.noise_variance[side] > scatter_m**2:
+            return True
+    return bool(state.contested.max() > share)
+
+
+@compiled
+def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float) -> int:
+    """The cause for which a stamp is refused, or -1; the newest one came `passed_s` ago, and one
+    may be older than that by `late_s`.
+    """
+    if stamp_ns == newest_ns:
+        return REPEATED
+    if not fresh:
+        return -1
+    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of integers may overflow
+    if ahead_s > passed_s + silent_s:
+        return AHEAD
+    return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
+
+
+@compiled
+def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
+    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
+    after the other, the samples count alike.
+    """
+    state = states[0]
+    ticks, share = state.sample_ticks[source], state.contested[source]
+    passed = float(state.tick - ticks[0])
+    if ticks[1] < state.tick:
+        passed *= 0.5  # since the sample before the last
+        ticks[0], ticks[1] = ticks[1], state.tick
+    passed_s = min(passed * period_s, MOST_S)
+    share += (1.0 - math.exp(-passed_s / MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
+    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
+
+
+@compiled
+def has_jumped(
+    states: Records, parameters: Records, side: int, position: Vector, expected: Vector, interval_s: float
+) -> bool:
+    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
+    after the one before, which tells that it was `expected` elsewhere.
+    """
+    state, given = states[0], parameters[0]
+    gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE * math.sqrt(state.noise_variance[side]))
+    off = 0.0
+    for axis in range(3):
+        off += (position[axis] - expected[axis]) ** 2
+    return bool(off > gate * gate)
+
+
+@compiled
+def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
+    """Whether a hand would turn as none can, by two kept samples and one (3,) [m] after them."""
+    before_s, past, wanted = states[0].kept_noise[side, at, 3], states[0].kept_past[side, at], 0.0
+    if after_s + before_s > BETWEEN_S:
+        return False
+    after_s, before_s = max(after_s, LEAST_S), max(before_s, LEAST_S)
+    for axis in range(3):
+        turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
+        wanted += (2.0 * turned / (after_s + before_s)) ** 2
+    return wanted >= BETWEEN_MPS2**2
+
+
+@compiled
 def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
     """`Intake.take_arm`: the cause for which it was rejected, or -1."""
     state, given = states[0], parameters[0]
@@ -290,15 +253,10 @@ def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vec
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
         return NOT_FINITE
-    near, off, moved = True, 0.0, 0.0
-    for i in range(len(position)):
-        near = near and given.plausible_joints[0, i] <= position[i] <= given.plausible_joints[1, i]
-        near = near and abs(velocity[i]) <= MAX_JOINT_SPEED
-        off = max(off, abs(position[i] - state.measured[i]))
-        moved = max(moved, abs(position[i] - state.arm_still_posture[i]))
+    near, off, moved = compared(states, parameters, position, velocity)
     cause = -1 if near else OUT_OF_RANGE
     if near:
-        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s)
+        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
         jumped = fresh and off > JUMP_RAD + given.joint_jump_speed * passed_s
         note(states, ARM, jumped, given.period_s)
@@ -319,6 +277,7 @@ def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vec
 def _take_hand(
     states: Records,
     parameters: Records,
+    models: Records,
     side: int,
     stamp_ns: int,
     position: tuple[float, float, float],
@@ -339,7 +298,7 @@ def _take_hand(
     stale_ticks, period_s = given.stale_ticks, given.period_s
     since = state.tick - state.hand_ticks[side]
     fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
-    jumped, cause = False, -1
+    jumped, cause, order, made = False, -1, 0, state.tick
     if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
         cause = NOT_FINITE
     elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
@@ -347,23 +306,53 @@ def _take_hand(
     elif not far <= FARTHEST_M * FARTHEST_M:
         cause = OUT_OF_RANGE
     else:
-        cause = refusal(stamp_ns, state.hand_stamps_ns[side], fresh, since * period_s, stale_ticks * period_s)
-        if cause != REPEATED:
-            jumped = fresh and has_jumped(states, parameters, side, in_base, since * period_s)
-            doubtful = state.contested[side] < MOST_SHARE  # no more is needed, and it would settle late
-            twofold = fresh and doubtful and is_to_and_fro(states, side, in_base, since * period_s)
-            note(states, side, jumped or twofold, period_s)
-            jumped = jumped or is_swapped(states, parameters, side, in_base)
-        if cause < 0 and jumped and not is_confirmed(states, parameters, side, in_base):
+        newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
+        cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, LATE_S)
+        if cause < 0:
+            if not fresh:
+                state.kept[side] = 0
+            elif stamp_ns < newest_ns:
+                order = order_of(states, side, stamp_ns)
+            late = ticks_late(states, side, stamp_ns, period_s)
+            if order >= KEPT - 1:
+                order, cause = 0, OLDER
+            elif order < 0:
+                cause = REPEATED
+            elif order > 0 or late > 0:
+                made = tick_made(states, side, stamp_ns, order, late, period_s)
+        on_time, there = order == 0 and made == state.tick, np.empty(3)
+        if fresh and cause != REPEATED:
+            there[:] = state.hands[side, 0]
+            if not on_time:
+                expected(states, models, side, order, made, there)
+            at = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
+            passed_s = abs(made - state.kept_ticks[side, at]) * period_s
+            jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
+            another = jumped and is_of_another(states, parameters, side, in_base, there)
+            if not another and order < state.kept[side] and state.contested[side] < MOST_SHARE:
+                another = _turns_hard(states, side, at, in_base, passed_s)  # no more is needed, it would settle late
+                another = another and is_to_and_fro(states, side, order, in_base)
+            note(states, side, another, period_s)
+        elif cause != REPEATED:
+            note(states, side, False, period_s)
+        if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
+            jumped = is_swapped(states, parameters, side, in_base)
+        if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
-    take(states, side, in_base, turn, frame, since * period_s, jumped or not fresh)
-    state.jump_count[side] = state.jump_is_swap[side] = 0
-    state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
-    state.hand_stamps_ns[side] = stamp_ns
-    state.hand_ticks[side] = state.tick
+    if order == 0 and made == state.tick:
+        take(states, parameters, side, stamp_ns, in_base, jumped, fresh)
+    else:
+        note_clock(states, side, stamp_ns, period_s, fresh)
+        take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
+    if order == 0:
+        state.jump_count[side] = state.jump_is_swap[side] = 0
+        state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
+        turn_to(states, side, turn, frame)
+        state.hand_stamps_ns[side] = stamp_ns
+        state.hand_ticks[side] = state.tick
     return -1
 
 

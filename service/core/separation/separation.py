@@ -31,7 +31,9 @@ TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
 THINGS_ROOM = 0.005  # [m] from things, likewise
 PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
-PLAN_BRAKE = np.array([1.0, 0.5, 0.5])  # of the tool's acceleration, for people and things: no more is planned with ...
+PLAN_BRAKE = np.array(
+    [1.0, 0.5, 0.5]
+)  # of the tool's acceleration in a stop, for people and things: no more is planned with ...
 PLAN_REACTION_S = 0.02  # ... nor with less reaction time: joints that are let nearer more quickly swing there
 CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
 RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
@@ -69,7 +71,7 @@ class Separation:
         self._parameters = parameters(
             brake=brake,
             reaction_s=reaction_s,
-            planned_brake=PLAN_SHARE * np.minimum(brake, PLAN_BRAKE * settings.tool.max_acceleration),
+            planned_brake=PLAN_SHARE * np.minimum(brake, PLAN_BRAKE * settings.tool.stop_acceleration),
             planned_reaction_s=np.maximum(reaction_s, PLAN_REACTION_S),
             clearance=np.array([people.clearance, things.clearance, own_clearance(settings)]),
             room=np.array([PEOPLE_ROOM, THINGS_ROOM, THINGS_ROOM]),

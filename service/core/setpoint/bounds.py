@@ -168,23 +168,23 @@ def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector)
 def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
     """Which of BOUNDS a step from `before` (3, 3) breaks."""
     given = parameters[0]
-    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
+    max_speed = given.max_speed
     if not np.isfinite(setpoint).all():
         return 1
-    speed = hardest_now = hardest_before = change = 0.0
+    speed = now = earlier = change = 0.0
     for i in range(3):
         speed += setpoint[1, i] ** 2
-        hardest_now, hardest_before = max(hardest_now, abs(setpoint[2, i])), max(hardest_before, abs(before[2, i]))
-        change = max(change, abs(setpoint[2, i] - before[2, i]))
-    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], max_jerk, 0.0)) + 1e-9:
+        now, earlier = now + setpoint[2, i] ** 2, earlier + before[2, i] ** 2
+        change += (setpoint[2, i] - before[2, i]) ** 2
+    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], given.stop_jerk, 0.0)) + 1e-9:
         return 2
-    if hardest_now > max(max_acceleration, hardest_before) + 1e-9:
+    if math.sqrt(now) > max(given.max_acceleration, math.sqrt(earlier)) + 1e-9:
         return 3
-    if change > (max_jerk + 1e-6) * given.period_s:
+    if math.sqrt(change) > (given.max_jerk + 1e-6) * given.period_s:
         return 4
     low, high = np.empty(3), np.empty(3)
     bounds(hull, box, given.lowest, low, high)
-    farthest = 0.5 * max_speed * max_speed / max_acceleration + max_speed  # of a stop from outside, generously
+    farthest = 0.5 * max_speed * max_speed / given.stop_acceleration + max_speed  # of a stop from outside, generously
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
             return 5
@@ -201,14 +201,14 @@ def take_safe(
     fastest stop, and false. An axis that would not come back does so.
     """
     given = parameters[0]
-    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
+    max_speed, max_acceleration, max_jerk = given.max_speed, given.stop_acceleration, given.stop_jerk
     back = RETURN_SHARE * max_speed
     dearest = 0.0
     for i in range(3):
         for joint in range(costs.shape[2]):
             dearest = max(dearest, abs(costs[0, i, joint]))
     due = back * slow / max(1.0, dearest * max_speed) * given.period_s
-    stays = True
+    stays, mixed = True, False
     for i in range(3):
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
             if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
@@ -219,6 +219,14 @@ def take_safe(
             here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
             if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + ROUNDING:
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
+                mixed = True
+    if mixed:  # the norms of what the others do beside it
+        acceleration = change = 0.0
+        for i in range(3):
+            acceleration += ahead[2, i] ** 2
+            change += (ahead[2, i] - setpoint[2, i]) ** 2
+        stays = stays and acceleration <= given.max_acceleration**2
+        stays = stays and change <= (given.max_jerk * given.period_s) ** 2
     if stays and speed_to_come(ahead[1], ahead[2], max_jerk, back) <= max_speed:
         setpoint[:] = ahead
         return True
@@ -236,7 +244,7 @@ def _fall_back(
     """Into out (3, 3) one axis a period on along its fastest stop; or, where that ends beyond a
     bound, along the fastest change to `back` [m/s] inwards.
     """
-    max_acceleration, max_jerk, dt = parameters[0].max_acceleration, parameters[0].max_jerk, parameters[0].period_s
+    max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
     over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND
     under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND - low
     if over and under:  # it crosses the box

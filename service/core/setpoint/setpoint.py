@@ -8,7 +8,7 @@ and Sreenath, RSS 2017). A step is taken only if the stop after it keeps every l
 which the step before had made sure of, begins now. So the limits hold by induction, whatever the
 target does:
 
-* speed at most `max_speed` (as a norm), acceleration and jerk each axis at most theirs;
+* speed, acceleration and jerk at most `max_speed`, `max_acceleration` and `max_jerk`, as norms;
 * never outside the box of the workspace, nor farther than HULL_MARGIN from the box around the last
   HULL_TIME_S of targets. Where that box has moved away, or began elsewhere, the setpoint comes back
   to it at RETURN_SHARE of the greatest speed at least: docs/bounds.md has the proof.
@@ -43,7 +43,7 @@ from service.core.skill.skill import decided
 ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
-FORESEEN = 0.09  # [s] a target that brakes is taken to be slower by its deceleration times this
+FORESEEN = 0.12  # [s] a target that brakes is taken to be slower by its deceleration times this
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
 BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
@@ -70,6 +70,8 @@ class SetpointGenerator:
             max_speed=float(tool.max_speed),
             max_acceleration=float(tool.max_acceleration),
             max_jerk=float(tool.max_jerk),
+            stop_acceleration=tool.stop_acceleration,
+            stop_jerk=tool.stop_jerk,
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
             span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),
         )
@@ -111,8 +113,7 @@ def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) ->
         gap += ahead * ahead
     slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE) / GAP_SLOW)
     if share < 1.0:
-        speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
-        slow = min(slow, share * speed / max_speed)
+        slow = min(slow, share * _norm(setpoint[1]) / max_speed)
     return slow
 
 
@@ -154,9 +155,8 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     """
     given = parameters[0]
     gains, dt = given.gains, given.period_s
-    max_speed, max_acceleration, max_jerk = given.max_speed, given.max_acceleration, given.max_jerk
-    speed = math.sqrt(setpoint[1, 0] ** 2 + setpoint[1, 1] ** 2 + setpoint[1, 2] ** 2)
-    target_speed = math.sqrt(target[1, 0] ** 2 + target[1, 1] ** 2 + target[1, 2] ** 2)
+    max_speed = given.max_speed
+    speed, target_speed = _norm(setpoint[1]), _norm(target[1])
     feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
     for i in range(3):
         jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
@@ -167,17 +167,16 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     if speed <= LEAST_SPEED:
         return 0
     along = np.empty(3)
-    steepest = a = u = way = v_target = a_target = 0.0
+    a = u = way = v_target = a_target = 0.0
     for i in range(3):
         along[i] = setpoint[1, i] / speed
-        steepest = max(steepest, abs(along[i]))
         a += along[i] * setpoint[2, i]
         u += along[i] * jerk[i]
         way += along[i] * (target[0, i] - setpoint[0, i])
         v_target += along[i] * feasible * target[1, i]
         a_target += along[i] * target[2, i]
-    brake = SHARE * min(max_acceleration / steepest, 1.0 / max(_largest(costs[1], along), 1e-9))
-    change = SHARE * min(max_jerk / steepest, 1.0 / max(_largest(costs[2], along), 1e-9))
+    brake = SHARE * min(given.stop_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = SHARE * min(given.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
     change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
@@ -230,30 +229,25 @@ def _largest(costs: Vector, motion: Vector) -> float:
 
 @compiled
 def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
-    """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of axes and
+    """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of tool and
     joints.
     """
-    given, ahead, excess = parameters[0], np.empty(3), 0.0
-    max_acceleration, max_jerk, dt = given.max_acceleration, given.max_jerk, given.period_s
+    given, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
-        excess = max(excess, abs(ahead[i]) / max_acceleration)
-    excess = max(excess, _largest(costs[1], ahead))
+    excess = max(_norm(ahead) / given.max_acceleration, _largest(costs[1], ahead))
     if excess > 1.0:
         for i in range(3):
             jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
-    excess = _largest(costs[2], jerk)
-    for i in range(3):
-        excess = max(excess, abs(jerk[i]) / max_jerk)
+    excess = max(_norm(jerk) / given.max_jerk, _largest(costs[2], jerk))
     if excess > 1.0:
         for i in range(3):
             jerk[i] /= excess
-    for i in range(3):
-        least, most = (
-            max(-max_jerk, (-max_acceleration - acceleration[i]) / dt),
-            min(max_jerk, (max_acceleration - acceleration[i]) / dt),
-        )
-        jerk[i] = min(most, max(least, jerk[i]))
+
+
+@compiled
+def _norm(vector: Vector) -> float:
+    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
 TURN_GAIN = 12.0  # [1/s] of a small error's decay

@@ -1,0 +1,36 @@
+"""What a sample of the arm's joints is compared with: what an arm can have, and what this had."""
+
+from __future__ import annotations
+
+import math
+
+from kmp.compiled import compiled
+from service.config import Settings
+from service.core.frame import Records, Vector
+
+MAX_JOINT_SPEED = 100.0  # [rad/s] beyond it a measured joint is a mistake
+JUMP_RAD = 0.2  # [rad] jump gate of a joint ...
+JUMP_RADPS = 5.0  # [rad/s] ... for each second without a sample, as by hand an arm is moved so fast ...
+JUMP_SPEEDS = 2.0  # ... or as many times its fastest joint's greatest speed, where that is more
+FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
+STILL_RAD = 0.02  # an arm is at rest that stayed within so much ...
+STILL_S = 0.1  # ... for so long
+
+
+def still_ticks(settings: Settings) -> int:
+    """The ticks over which an arm must report one posture before it is believed."""
+    return math.ceil(round(STILL_S / settings.period_s, 6))
+
+
+@compiled
+def compared(states: Records, parameters: Records, position: Vector, velocity: Vector) -> tuple[bool, float, float]:
+    """Whether joints can be so [rad, rad/s]; how far one is off the newest sample, and off the
+    posture that was constant [rad].
+    """
+    state, given, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
+    for i in range(len(position)):
+        near = near and given.plausible_joints[0, i] <= position[i] <= given.plausible_joints[1, i]
+        near = near and abs(velocity[i]) <= MAX_JOINT_SPEED
+        off = max(off, abs(position[i] - state.measured[i]))
+        moved = max(moved, abs(position[i] - state.arm_still_posture[i]))
+    return near, off, moved

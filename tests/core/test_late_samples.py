@@ -1,0 +1,132 @@
+"""Samples that come late, or overtake each other: taken by their stamps, as of when they were
+made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+
+from service.contract.records import Cause
+from service.core.frame import Vector
+from service.core.intake.late_samples import lateness_ms
+from support.tracked import LEFT, PERIOD_S, RIGHT, Hands
+
+WARM_S = 2.5  # in which a clock is found to be steady
+ZERO_NS = 1_700_000_000_000_000_000
+
+
+def moving(t: Vector) -> Vector:
+    """A hand (T, 3) [m] that goes up and down at up to 0.45 m/s."""
+    return np.stack([0.5 + 0.15 * np.sin(3.0 * t), 0.1 * np.cos(2.0 * t), 0.2 + 0.0 * t], axis=1)
+
+
+def told(
+    made_s: Vector, late_s: Vector, *, stamps: Callable[[Vector], Vector] = lambda made_s: made_s, until_s: float
+) -> tuple[Hands, Vector]:
+    """An intake that was told of where a hand was at times, so much later; and the estimates (T, 3)
+    [m] at each tick.
+    """
+    hands, places, come_s, found = Hands(), moving(made_s), made_s + late_s, []
+    order, stamps_s, nth = np.argsort(come_s, kind="stable"), stamps(made_s), 0
+    for tick in range(round(until_s / PERIOD_S)):
+        if tick:
+            hands.advance()
+        while nth < len(order) and come_s[order[nth]] <= tick * PERIOD_S + 1e-9:
+            at = order[nth]
+            hands.hand(ZERO_NS + round(1e9 * stamps_s[at]), tuple(places[at].tolist()))
+            nth += 1
+        found.append(hands.state["hands"][LEFT, 0].copy())
+    return hands, np.array(found)
+
+
+@example_settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.sampled_from([30, 60, 100, 240, 500]), st.floats(0.01, 0.098), st.integers(0, 10**6))
+def test_whatever_order_samples_come_in_the_estimate_is_that_of_their_own(
+    rate_hz: int, latest_s: float, seed: int
+) -> None:
+    latest_s = min(latest_s, 0.098 - 1.0 / rate_hz)  # none is silent for long enough to begin anew
+    until_s = WARM_S + 0.6
+    made_s = np.arange(0.0, until_s, 1.0 / rate_hz)
+    shuffles = (made_s > WARM_S) & (made_s < WARM_S + 0.4)
+    some = latest_s * shuffles * np.random.default_rng(seed).random(len(made_s))
+    in_order = told(made_s, 0.0 * some, until_s=until_s)[0]
+    shuffled = told(made_s, some, until_s=until_s)[0]
+    assert shuffled.rejected() == in_order.rejected() == {}
+    np.testing.assert_allclose(shuffled.state["hands"], in_order.state["hands"], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(shuffled.state["noise_variance"], in_order.state["noise_variance"], rtol=1e-6)
+    np.testing.assert_array_equal(shuffled.state["kept_ticks"], in_order.state["kept_ticks"])
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 500])
+def test_a_hand_whose_samples_are_up_to_60_ms_late_is_known_nearly_as_well(rate_hz: int) -> None:
+    made_s = np.arange(0.0, 8.0, 1.0 / rate_hz)
+    late_s = 0.06 * np.random.default_rng(1).random(len(made_s))
+    hands, found = told(made_s, late_s, until_s=8.0)
+    assert hands.rejected() == {}
+    late_ms = lateness_ms(hands.state, LEFT, PERIOD_S)
+    assert late_ms is not None
+    np.testing.assert_allclose(late_ms, (29.0, 57.0), atol=6.0)
+    assert lateness_ms(hands.state, RIGHT, PERIOD_S) is None
+    truth = moving(np.arange(len(found)) * PERIOD_S)
+    error = np.linalg.norm(found - truth, axis=1)[round(3.0 / PERIOD_S) :]
+    assert np.sqrt(np.mean(error**2)) < {30: 0.005, 100: 0.003, 500: 0.002}[rate_hz]
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100])
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        lambda made_s: 1e-9 * np.arange(len(made_s)),
+        lambda made_s: 0.9 * made_s,
+        lambda made_s: 1.05 * made_s,
+        lambda made_s: 0.985 * made_s,
+    ],
+)
+def test_by_a_clock_that_is_none_samples_are_taken_when_they_come(
+    rate_hz: int, stamps: Callable[[Vector], Vector]
+) -> None:
+    made_s = np.arange(0.0, 8.0, 1.0 / rate_hz)
+    usual = told(made_s, 0.0 * made_s, until_s=8.0)
+    other = told(made_s, 0.0 * made_s, stamps=stamps, until_s=8.0)
+    assert other[0].rejected() == {}
+    np.testing.assert_array_equal(other[1], usual[1])
+
+
+@pytest.mark.parametrize("pace", [1.0, 1.0 - 1e-3, 1.0 + 1e-3])
+def test_samples_that_come_when_they_are_due_are_taken_when_they_come(pace: float) -> None:
+    made_s = np.arange(0.0, 8.0, 0.01)
+    usual = told(made_s, 0.0 * made_s, until_s=8.0)[1]
+    found = told(made_s, 0.0 * made_s, stamps=lambda made_s: pace * made_s, until_s=8.0)[1]
+    assert np.linalg.norm(found - usual, axis=1).max() < 0.0015
+
+
+def test_a_late_sample_of_before_a_jump_does_not_bring_the_hand_back() -> None:
+    hands = Hands()
+    for k in range(400):
+        hands.advance(5)
+        hands.hand(ZERO_NS + 10_000_000 * k, (0.5, 0.1 if k < 390 else 0.3, 0.2))
+    assert abs(hands.state["hands"][LEFT, 0, 1] - 0.3) < 0.001
+    for k in range(391, 399):
+        hands.hand(ZERO_NS + 10_000_000 * k - 5_000_000, (0.5, 0.1, 0.2))
+    assert abs(hands.state["hands"][LEFT, 0, 1] - 0.3) < 0.001
+    assert hands.rejected() == {Cause.JUMPED: 2 + 6}  # two of them are of before it
+
+
+def test_a_tracker_that_starts_anew_with_its_clock_set_back_is_believed_again() -> None:
+    hands = Hands()
+    for k in range(300):
+        hands.advance(5)
+        hands.hand(ZERO_NS + 10_000_000 * k)
+    hands.advance(50)
+    for k in range(300):
+        hands.advance(5)
+        hands.hand(10_000_000 * (k + 1), (0.5, 0.1 + 0.001 * k, 0.2))
+        assert hands.fresh()
+        assert abs(hands.state["hands"][LEFT, 0, 1] - 0.1 - 0.001 * k) < 0.002
+    assert hands.rejected() == {}
