@@ -33,6 +33,11 @@ def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) 
     return Apart(errors, covariance, velocity)
 
 
+def test_of_one_demonstration_alone_there_are_no_others_to_tell() -> None:
+    one = apart(np.random.default_rng(1))
+    assert of_the_others([one], np.arange(1)) == [(one, NORMAL)]
+
+
 @pytest.mark.parametrize("count", [6, 12, 40])
 def test_regions_hold_on_other_people_what_they_say_at_every_level(count: int) -> None:
     held = []
