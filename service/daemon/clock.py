@@ -19,7 +19,7 @@ from service.contract.requests import Percentiles
 from service.core.frame import Vector
 
 SPIN_NS = 100_000  # of busy waiting before a deadline, under real-time scheduling only
-PREPARE_NS = 450_000  # before a deadline the next tick is prepared
+PREPARE_NS = 650_000  # before a deadline the next tick is prepared: more than half as long again as one takes
 STEP_NS = 20_000_000  # a larger difference to the system clock means that it was set
 DRAW = 256  # time constant of following a smaller difference, in deadlines
 CREEP_NS = 1_000  # from stamp to stamp while time catches up
