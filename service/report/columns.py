@@ -26,7 +26,7 @@ from service.recording.steps import Gap, Step
 KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "tool", "joints"),
     *("joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages", "rejected"),
-    *("mode", "reason", "flags", "commanded"),
+    *("mode", "reason", "flags", "commanded", "stage", "stage_belief"),
 )
 BLOCK = 4096  # ticks that are held whole
 ORDERS = ("hold", "resume", "reset", "fault")

@@ -18,6 +18,7 @@ from service.core.frame import Vector
 from service.recording.recording import Recording
 from service.report.causes import before, why
 from service.report.columns import Columns, read, runs
+from service.report.stages import stages
 from service.report.visits import places
 
 SHARES = (50, 99, 100)
@@ -136,6 +137,7 @@ class Report:
         self.lag_mm = Percentiles.of(lag_mm)  # from the tool to its target, while it follows
         self.approach = _approach(columns, self.spans)
         self.places = tuple(places(columns))
+        self.stages = tuple(stages(columns))
         self.limits = tuple(_limits(columns))
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))

@@ -47,6 +47,13 @@ def _tables(report: Report) -> Iterator[Table]:
         numbers=0,
     )
     yield Table(
+        "stages",
+        "Stages of the task",
+        ("from [s]", "for [s]", "stage", "how probable [%]"),
+        tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.stages),
+        numbers=0,
+    )
+    yield Table(
         "places",
         "Taught places",
         (

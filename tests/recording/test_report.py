@@ -4,6 +4,7 @@ limits, promptness; against sessions of which that is known.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable
 from dataclasses import replace
@@ -27,6 +28,7 @@ from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
 from service.report.report import Report, differing_settings, reported, why_missed
+from service.report.stages import LEAST_S
 from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
@@ -166,6 +168,19 @@ def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_we
     assert first.best_m < 0.02
     assert (again.visits, again.best_m) == ((), None)
     assert again.hands_m > 0.03
+
+
+def test_the_stages_of_a_task_are_told_in_their_order(golden: Report) -> None:
+    assert golden.stages[0].start_s < 0.5
+    assert [one.name for one in golden.stages][:3] == ["start to handover", "handover to glass", "glass to soldering"]
+    for one, after in itertools.pairwise(golden.stages):
+        assert one.name != after.name
+        assert one.start_s + one.lasts_s <= after.start_s + 1e-9
+    frames = golden.columns.frames
+    for one in golden.stages:
+        assert one.lasts_s > LEAST_S
+        at = int((one.start_s + one.lasts_s / 2) / PERIOD_S)
+        assert one.probable == pytest.approx(frames["stage_belief"][at], abs=0.5)
 
 
 def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:

@@ -1,0 +1,49 @@
+"""Which stages of its task a session went through, as the service believed then."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from service.core.skill.stages import MOST_STAGES
+from service.report.columns import Columns, runs
+
+LEAST_S = 0.3  # a belief that changes for less has hesitated: it is told with the stage around it
+
+
+class Stage(NamedTuple):
+    """A stage from one via-point to the next: since the first tick, and how long [s]; how probable
+    it was in the middle of that time (the median).
+    """
+
+    start_s: float
+    lasts_s: float
+    begins: str
+    ends: str
+    probable: float
+
+    @property
+    def name(self) -> str:
+        """From where to where."""
+        return f"{self.begins} to {self.ends}"
+
+
+def stages(columns: Columns) -> list[Stage]:
+    """The stages, one after the other; none where the skill has no via-points."""
+    frames, times, found = columns.frames, columns.times, list[Stage]()
+    numbers = np.where(frames["stage_belief"] > 0, frames["stage"], -1)
+    in_force = np.searchsorted([one.tick for one in columns.skills], frames["tick"], side="right") - 1
+    for begin, end in runs(in_force * (MOST_STAGES + 1) + numbers):
+        names = columns.skills[in_force[begin]].skill.model.names if in_force[begin] >= 0 else ()
+        if not 0 <= numbers[begin] < len(names) - 1:
+            continue
+        begins, ends = names[numbers[begin]], names[numbers[begin] + 1]
+        lasts_s = (end - begin) * columns.period_s
+        before = found[-1] if found else None
+        if before is not None and ((begins, ends) == (before.begins, before.ends) or lasts_s < LEAST_S):
+            found[-1] = before._replace(lasts_s=float(times[end - 1]) + columns.period_s - before.start_s)
+        else:
+            probable = float(np.median(frames["stage_belief"][begin:end]))
+            found.append(Stage(float(times[begin]), lasts_s, begins, ends, probable))
+    return found
