@@ -1,4 +1,4 @@
-"""The wheel: it holds service, bench and the shipped recordings, and its page shows no picture and
+"""The wheel: it holds service, bench, the shipped skill and what that was learned from, and its page shows no picture and
 no link that leads nowhere there.
 """
 
@@ -32,7 +32,10 @@ def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(
         if not path.is_relative_to(EXPERIMENTS)
     }
     assert sources <= held
-    assert {"service/arms/wam.urdf", "service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
+    assert {"service/arms/wam.urdf", "service/recordings/soldering.npz"} <= held
+    shown = {f"service/recordings/people/{path.name}" for path in (ROOT / "recordings" / "people").iterdir()}
+    assert shown <= held
+    assert wheel.stat().st_size < 1.5e6
     assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"kmp", "service", "sim"}
     assert {name for name in held if name.startswith("kmp/") and not name.endswith(".py")} == {"kmp/py.typed"}
 
