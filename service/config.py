@@ -16,7 +16,7 @@ import msgspec
 from service.contract import ros2
 from service.contract.explain import InvalidError, validated
 from service.described_arm import SettingsError, UnreadableError, check, completed
-from service.network_settings import Network
+from service.network_settings import Network, Ros2
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
@@ -216,6 +216,7 @@ class Settings(Section, frozen=True):
     people: People = msgspec.field(default_factory=People)
     obstacles: Obstacles = msgspec.field(default_factory=Obstacles)
     network: Network = msgspec.field(default_factory=Network)
+    ros2: Ros2 = msgspec.field(default_factory=Ros2)
     files: Files = msgspec.field(default_factory=Files)
     skill: SkillSettings = msgspec.field(default_factory=SkillSettings)
 
@@ -236,6 +237,11 @@ class Settings(Section, frozen=True):
                 f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
                 "none of them with a digit first, joined by slashes needed"
             )
+        named = [topic.name for topic in ros2.controllers(self.ros2)]
+        if named and self.network.ros2_domain is None:
+            yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
+        if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
+            yield f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, in any order"
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),

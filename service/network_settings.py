@@ -1,4 +1,4 @@
-"""Network settings of a cell: endpoints, certificates, ROS 2 domain."""
+"""Network settings of a cell: endpoints, certificates, ROS 2 domain and controllers."""
 
 from __future__ import annotations
 
@@ -15,6 +15,15 @@ from service.contract.roles import DAEMON, ROLES, names
 Domain = Annotated[
     Annotated[int, msgspec.Meta(ge=0, le=ros2.LAST_DOMAIN)] | None,
     msgspec.Meta(extra={"accepted": f"a whole number from 0 to {ros2.LAST_DOMAIN}"}),
+]
+
+
+Topic = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z",
+        extra={"accepted": "a topic's full name, /like/this,"},
+    ),
 ]
 
 
@@ -64,3 +73,14 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
                     f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
                     f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
                 )
+
+
+class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The arm's controllers of ros2_control, which take commands as they are, in the domain
+    `network.ros2_domain`. Of each the full name of its topic; empty: none.
+    """
+
+    position_commands: Topic = ""  # of a forward_command_controller for positions: /<its name>/commands
+    trajectory: Topic = ""  # of a joint_trajectory_controller: /<its name>/joint_trajectory
+    joint_states: Topic = ""  # of the joint_state_broadcaster: /joint_states, heard beside the cell's own
+    joints: tuple[str, ...] = ()  # in the order of the controller's parameter `joints`; empty: that of `joints.names`

@@ -1,5 +1,5 @@
-"""The wheel: it holds service, bench, the shipped skill and what that was learned from, and its page shows no picture and
-no link that leads nowhere there.
+"""The wheel: it holds service, bench, the shipped skill and what that was learned from; its page
+shows no picture and no link that leads nowhere there.
 """
 
 from __future__ import annotations

@@ -124,6 +124,32 @@ def encode_command(
     return head + layout.pack(*position, len(names), *velocity, 0)
 
 
+def encode_numbers(values: Sequence[float]) -> bytes:
+    """CDR bytes of a `std_msgs/msg/Float64MultiArray` without a layout."""
+    out = Writer()
+    out.pack(_STAMP, 0, 0, align=4)  # no dimensions, and where data begins
+    out.doubles(values)
+    return bytes(out)
+
+
+def encode_trajectory(
+    names: tuple[str, ...], position: Sequence[float], velocity: Sequence[float], within_ns: int
+) -> bytes:
+    """CDR bytes of a `trajectory_msgs/msg/JointTrajectory` that begins when it comes: one point
+    [rad, rad/s], reached so soon [ns].
+    """
+    out = Writer()
+    out.header(0, "")
+    out.pack(_LENGTH, len(names), align=4)
+    for name in names:
+        out.string(name)
+    out.pack(_LENGTH, 1, align=4)
+    for values in (position, velocity, (), ()):
+        out.doubles(values)
+    out.pack(_STAMP, *_stamp(within_ns), align=4)
+    return bytes(out)
+
+
 def encode_string(text: str) -> bytes:
     """CDR bytes of a `std_msgs/msg/String`."""
     out = Writer()

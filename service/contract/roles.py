@@ -50,7 +50,12 @@ def names(role: str) -> tuple[str, ...]:
     return (role, *(f"{role}-{number}" for number in range(2, MOST_OF_A_ROLE + 1)))
 
 
-def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | None = None) -> dict[str, Any]:
+def access_control(
+    cell: str,
+    revoked: Collection[str] = (),
+    ros2_domain: int | None = None,
+    controllers: Collection[ros2.Topic] = (),
+) -> dict[str, Any]:
     """Zenoh's settings by which a daemon of this cell keeps the roles apart, and lets certificates
     of the `revoked` names do nothing. What a role may do it may do in a ROS 2 domain too.
     """
@@ -59,7 +64,9 @@ def access_control(cell: str, revoked: Collection[str] = (), ros2_domain: int | 
         found = [channels.key(cell, suffix) for suffix in suffixes]
         if topics and ros2_domain is not None:
             known = (channels.BY_KEY[suffix] for suffix in suffixes)
-            found += [ros2.key(ros2_domain, cell, channel) for channel in known if channel in TOPICS]
+            also = (ros2.of_channel(cell, channel) for channel in known if channel in TOPICS)
+            found += [ros2.key(ros2_domain, topic) for topic in also]
+            found += [ros2.key(ros2_domain, topic) for topic in controllers if topic.channel in suffixes]
         return found
 
     heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)

@@ -7,7 +7,8 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 from service.contract import channels
 
@@ -16,6 +17,8 @@ NODE = "thirdhand"
 TYPE_HASHES = {  # of the definitions, as REP 2011 has them; Humble has none
     "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+    "std_msgs/msg/Float64MultiArray": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
+    "trajectory_msgs/msg/JointTrajectory": "179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e",
     "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
 }
@@ -25,6 +28,36 @@ _DEPTH = 10
 _RELIABLE, _BEST_EFFORT = f"::,{_DEPTH}:,:,:,,", f"2::,{_DEPTH}:,:,:,,"  # the rest as ROS 2 has it by default
 _ATTACHMENT = struct.Struct("<qqB16s")
 _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
+
+
+class Topic(NamedTuple):
+    """A topic: its full name, its message type, the channel whose messages pass there, and whether
+    the cell hears it or else publishes on it.
+    """
+
+    name: str
+    type: str
+    channel: str
+    heard: bool
+
+
+CONTROLLERS: tuple[tuple[str, str, str, bool], ...] = (  # of ros2_control: setting and topic
+    ("position_commands", "std_msgs/msg/Float64MultiArray", "joints/command", False),
+    ("trajectory", "trajectory_msgs/msg/JointTrajectory", "joints/command", False),
+    ("joint_states", "sensor_msgs/msg/JointState", "joints/state", True),
+)
+
+
+def controllers(settings: Any) -> Iterator[Topic]:
+    """The topics of ros2_control that a cell's settings name."""
+    for setting, kind, channel, heard in CONTROLLERS:
+        if name := getattr(settings, setting):
+            yield Topic(name, kind, channel, heard)
+
+
+def of_channel(cell: str, channel: channels.Channel) -> Topic:
+    """A channel's own topic."""
+    return Topic(channels.topic(cell, channel.key), type_of(channel), channel.key, channel.direction == "in")
 
 
 def is_name(cell: str) -> bool:
@@ -37,9 +70,9 @@ def type_of(channel: channels.Channel) -> str:
     return channels.STRING.type if channel.codec.encoding == "json" else channel.codec.type
 
 
-def key(domain: int, cell: str, channel: channels.Channel) -> str:
-    """The Zenoh key of a channel's topic in a domain."""
-    return f"{domain}/{channels.key(cell, channel.key)}/{_typed(channel)}"
+def key(domain: int, topic: Topic) -> str:
+    """The Zenoh key of a topic in a domain."""
+    return f"{domain}{topic.name}/{_typed(topic)}"
 
 
 def all_tokens(domain: int) -> str:
@@ -47,16 +80,16 @@ def all_tokens(domain: int) -> str:
     return f"@ros2_lv/{domain}/**"
 
 
-def tokens(domain: int, cell: str, session: str, heard: Sequence[channels.Channel]) -> dict[str, str]:
-    """The liveliness tokens of the daemon of a Zenoh session, by channel: of those in `heard` it is
-    a subscriber, of all that go out a publisher. The node's own is under "".
+def tokens(domain: int, cell: str, session: str, topics: Sequence[Topic]) -> dict[str, str]:
+    """The liveliness tokens of the daemon of a Zenoh session, by the topic's name; its node's is
+    under "".
     """
     node = f"%/{_mangled(f'/{cell}')}/{NODE}"
     found = {"": f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
-    for number, channel in enumerate((*heard, *SAID), start=1):
-        kind, quality = ("MS", _BEST_EFFORT) if channel in heard else ("MP", _RELIABLE)
-        topic = _mangled(f"/{channels.key(cell, channel.key)}")
-        found[channel.key] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{topic}/{_typed(channel)}/{quality}"
+    for number, topic in enumerate(topics, start=1):
+        kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _RELIABLE)
+        what = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
+        found[topic.name] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{what}"
     return found
 
 
@@ -72,10 +105,9 @@ def encode_attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
     return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
 
 
-def _typed(channel: channels.Channel) -> str:
-    kind = type_of(channel)
-    package, _, name = kind.split("/")
-    return f"{package}::msg::dds_::{name}_/RIHS01_{TYPE_HASHES[kind]}"
+def _typed(topic: Topic) -> str:
+    package, _, name = topic.type.split("/")
+    return f"{package}::msg::dds_::{name}_/RIHS01_{TYPE_HASHES[topic.type]}"
 
 
 def _mangled(name: str) -> str:

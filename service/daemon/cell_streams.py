@@ -13,10 +13,17 @@ from service.client import publisher
 from service.config import Settings
 from service.contract import channels, ros2
 from service.contract.messages import JointState, PoseStamped, WireError
+from service.contract.roles import access_control
 from service.core.frame import Event
 from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+
+
+def access(settings: Settings) -> dict[str, Any]:
+    """Zenoh's settings by which the daemon of a cell keeps its roles apart."""
+    network = settings.network
+    return access_control(settings.cell, network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),))
 
 
 class Arrivals:
@@ -62,14 +69,18 @@ class CellStreams:
         inputs = [c for c in ros2.HEARD if c.key != "joints/state" or settings.arm.source == "state"]
         keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
         if domain is not None:
-            keys += [(channel, ros2.key(domain, cell, channel)) for channel in inputs]
+            topics = [ros2.of_channel(cell, channel) for channel in (*inputs, *ros2.SAID)]
+            topics += [
+                one for one in ros2.controllers(settings.ros2) if not one.heard or settings.arm.source == "state"
+            ]
+            keys += [(channels.BY_KEY[one.channel], ros2.key(domain, one)) for one in topics if one.heard]
         self._subscribers = [(channel, session.declare_subscriber(key, RingChannel(1))) for channel, key in keys]
         self._publishers = {
             channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
-        self._ros2 = None if domain is None else Ros2Domain(session, cell, domain, heard=inputs, failed=failed)
+        self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
         """The newest message of each channel, if it is new and can be decoded."""

@@ -22,14 +22,14 @@ from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
 from service.contract.records import Reason
 from service.contract.requests import Status, encode_json
-from service.contract.roles import access_control
 from service.core.controller import Controller, run
 from service.core.frame import STAGES, Event, Frame, Tick, blank, frame_layout, order, timed
 from service.core.outputs import Outputs, outgoing
 from service.core.separation.clearance import FARTHEST
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
-from service.daemon.cell_streams import CellStreams
+from service.daemon.braking import brake
+from service.daemon.cell_streams import CellStreams, access
 from service.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
@@ -100,8 +100,7 @@ class Daemon:
                 listen=network.listen,
                 certificate=network.certificate,
                 zenoh_config=network.zenoh_config,
-                more=BOUNDS
-                | (access_control(settings.cell, network.revoked, network.ros2_domain) if network.certificate else {}),
+                more=BOUNDS | (access(settings) if network.certificate else {}),
             )
         try:
             self._token = occupy(self._session, settings.cell)
@@ -186,6 +185,7 @@ class Daemon:
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             supervised_thread.supervised("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
+            brake(self._settings, self._frame, self._clock, self._streams)
             self._ended.set()
             gc.unfreeze()
             if reporter is not None:

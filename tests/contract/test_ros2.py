@@ -4,6 +4,8 @@ the names and attachments of zenoh-ros2-sdk.
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk.attachment import Attachment
@@ -13,9 +15,12 @@ from zenoh_ros2_sdk.qos import QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
 from service.config import SettingsError, parse
-from service.contract import channels, ros2
+from service.contract import cdr, channels, ros2
+from service.network_settings import Ros2
 
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
+COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"
+CONTROLLED = Ros2(position_commands=COMMANDS, trajectory=TRAJECTORY, joint_states=STATES)
 
 
 @pytest.mark.parametrize("store", [Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
@@ -27,20 +32,49 @@ def test_the_hashes_of_the_types_are_those_of_ros2(store: Stores) -> None:
 
 
 def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -> None:
-    tokens = ros2.tokens(DOMAIN, CELL, SESSION, ros2.HEARD)
+    topics = [ros2.of_channel(CELL, channel) for channel in (*ros2.HEARD, *ros2.SAID)]
+    topics += ros2.controllers(CONTROLLED)
+    tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
     node = NodeEntity(DOMAIN, SESSION, 0, ros2.NODE, f"/{CELL}")
     assert tokens.pop("") == node_liveliness_keyexpr(node)
     streams = [c.key for c in channels.CHANNELS if c.direction == "out" or (c.direction == "in" and c.event)]
-    assert list(tokens) == sorted(streams, key=list(tokens).index)
-    for number, (suffix, token) in enumerate(tokens.items(), start=1):
-        channel = channels.BY_KEY[suffix]
-        kind = ros2.type_of(channel)
-        named = (f"/{CELL}/{suffix}", ros2_to_dds_type(kind), f"RIHS01_{ros2.TYPE_HASHES[kind]}")
-        is_in = channel.direction == "in"
+    own = [f"/{CELL}/{suffix}" for suffix in streams]
+    assert set(tokens) == {*own, COMMANDS, TRAJECTORY, STATES}
+    for number, ((name, token), topic) in enumerate(zip(tokens.items(), topics, strict=True), start=1):
+        named = (name, ros2_to_dds_type(topic.type), f"RIHS01_{ros2.TYPE_HASHES[topic.type]}")
+        is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name == STATES
         quality = QosProfile(reliability=QosReliability.BEST_EFFORT if is_in else QosReliability.RELIABLE)
         entity = EntityKind.SUBSCRIPTION if is_in else EntityKind.PUBLISHER
         assert token == endpoint_liveliness_keyexpr(EndpointEntity(node, number, entity, *named, quality.encode()))
-        assert ros2.key(DOMAIN, CELL, channel) == topic_keyexpr(DOMAIN, *named)
+        assert ros2.key(DOMAIN, topic) == topic_keyexpr(DOMAIN, *named)
+
+
+def test_what_controllers_are_told_is_read_by_others() -> None:
+    types = get_typestore(Stores.ROS2_JAZZY)
+    told: Any = types.deserialize_cdr(cdr.encode_numbers((0.5, -1.0, 2.0)), "std_msgs/msg/Float64MultiArray")
+    assert (told.data.tolist(), told.layout.dim, told.layout.data_offset) == ([0.5, -1.0, 2.0], [], 0)
+    for names in (("a",), ("base", "elbow", "wrist_1")):
+        raw = cdr.encode_trajectory(names, (0.1,) * len(names), (-0.2,) * len(names), 2_000_000)
+        way: Any = types.deserialize_cdr(raw, "trajectory_msgs/msg/JointTrajectory")
+        [point] = way.points
+        assert (way.header.stamp.sec, way.header.stamp.nanosec, tuple(way.joint_names)) == (0, 0, names)
+        assert point.positions.tolist() == [0.1] * len(names)
+        assert point.velocities.tolist() == [-0.2] * len(names)
+        assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 2_000_000)
+        assert bytes(types.serialize_cdr(way, "trajectory_msgs/msg/JointTrajectory")) == raw
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ('ros2.trajectory = "/a/b"', r"\$\.network\.ros2_domain: none given; for /a/b one from 0 to 232 needed"),
+        ('ros2.trajectory = "a/b"', r"\$\.ros2\.trajectory: 'a/b' given; a topic's full name, /like/this, accepted"),
+        ('ros2.joints = ["elbow"]', r"\$\.ros2\.joints: \['elbow'\] given; those of \$\.joints\.names needed, in any"),
+    ],
+)
+def test_controllers_that_cannot_be_told_are_refused(given: str, told: str) -> None:
+    with pytest.raises(SettingsError, match=told):
+        parse(given, origin="cell.toml")
 
 
 def test_what_rides_with_a_message_is_read_by_others() -> None:

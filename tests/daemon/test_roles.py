@@ -49,7 +49,9 @@ def keys(suffixes: Iterable[str]) -> set[str]:
     """The keys of streams, in the cell and in the ROS 2 domain."""
     plain = {channels.key(CELL, suffix) for suffix in suffixes}
     return plain | {
-        ros2.key(DOMAIN, CELL, channels.BY_KEY[suffix]) for suffix in suffixes if channels.BY_KEY[suffix] in TOPICS
+        ros2.key(DOMAIN, ros2.of_channel(CELL, channels.BY_KEY[suffix]))
+        for suffix in suffixes
+        if channels.BY_KEY[suffix] in TOPICS
     }
 
 
@@ -68,7 +70,7 @@ class Guarded:
         self._declared = [self.session.declare_subscriber(key, self._take) for key in keys(INPUTS)]
         self._publishers = [self.session.declare_publisher(key) for key in keys(OUTPUTS)]
         own = str(self.session.zid())
-        topics = ros2.tokens(DOMAIN, CELL, own, ros2.HEARD).values()
+        topics = ros2.tokens(DOMAIN, CELL, own, [ros2.of_channel(CELL, one) for one in TOPICS]).values()
         self._tokens = [
             self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, own), *topics)
         ]

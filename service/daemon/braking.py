@@ -1,0 +1,32 @@
+"""The end of all commands: the planned stop to its end, and that the arm rests, said so often that
+it is heard.
+"""
+
+from __future__ import annotations
+
+import time
+
+from service.config import Settings
+from service.contract import cdr
+from service.contract.messages import Attachment
+from service.core.frame import Frame
+from service.core.limiter.limiter import Limiter
+from service.daemon.cell_streams import CellStreams
+from service.daemon.clock import Deadlines
+
+
+RESTS_S = 0.1  # so long it is said: a message may be lost, and some controllers go on by the last one
+
+
+def brake(settings: Settings, frame: Frame, clock: Deadlines, streams: CellStreams) -> None:
+    """Commands the stop that follows the newest frame, tick by tick, and then rest."""
+    limiter, names = Limiter(settings.joints, settings.period_s), settings.joints.names
+    q, dq, ddq = (frame[name].copy() for name in ("joints", "joint_velocities", "joint_accelerations"))
+    resting = 0
+    while frame["commanded"] and resting < RESTS_S * settings.rate_hz:
+        q, dq, ddq, _ = limiter.stop(q, dq, ddq)
+        resting += not dq.any()
+        index, _ = clock.wait()
+        attachment = cdr.encode_attachment(Attachment(index, time.time_ns(), 0))
+        command = cdr.encode_command(clock.stamp_ns, names, q.tolist(), dq.tolist())
+        streams.publish("joints/command", command, attachment)
