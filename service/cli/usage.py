@@ -126,8 +126,10 @@ def reaching(args: argparse.Namespace) -> ClientSettings:
 
 
 def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router; None: it waits until Ctrl-C. Raises UnreachableError."""
-    return reaching(args).session(timeout_s=timeout_s)
+    """A session to the daemon or router; None: it waits until Ctrl-C. Raises UnreachableError, at
+    once where the system says that nobody listens.
+    """
+    return reaching(args).session(timeout_s=timeout_s, at_once=timeout_s is not None)
 
 
 def added_in(path: Path) -> Add:

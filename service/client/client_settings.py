@@ -37,7 +37,7 @@ class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         if {".", ".."} & set(self.cell.split("/")):
             raise ValueError(f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted")
 
-    def session(self, *, timeout_s: float | None = 10.0) -> zenoh.Session:
+    def session(self, *, timeout_s: float | None = 10.0, at_once: bool = False) -> zenoh.Session:
         """A session to the daemon, recorder or router, as `open_session` opens it."""
         return open_session(
             connect=self.connect,
@@ -45,6 +45,7 @@ class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             timeout_s=timeout_s,
             certificate=self.certificate,
             zenoh_config=self.zenoh_config,
+            at_once=at_once,
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ def open_session(
     certificate: str | Path | None = None,
     zenoh_config: str | Path | None = None,
     more: Mapping[str, Any] | None = None,
+    at_once: bool = False,
 ) -> zenoh.Session:
     """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
 
@@ -48,7 +50,8 @@ def open_session(
     client without `connect` takes the file's endpoints, or else those in `otherwise`.
 
     It is tried for `timeout_s` [s]. None, where it only connects: until Ctrl-C, and that it waits
-    is said once on standard error, so that it does not matter who is started first.
+    is said once on standard error, so that it does not matter who is started first. With `at_once`
+    it is not tried where the system says that nobody listens.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
     begin with `tls/`. Where one of the two is None, $THIRDHAND_CERTIFICATE or
@@ -79,6 +82,9 @@ def open_session(
         **(more or {}),
     }
 
+    if at_once and _refused(connect):
+        raise UnreachableError(f"nobody listens at {', '.join(connect)}: is a daemon running there, or a router?")
+
     def opened() -> zenoh.Session:
         try:
             for name, value in settings.items():
@@ -88,6 +94,23 @@ def open_session(
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
     return tried(opened, None if timeout_s is None and not listen else 0.0)
+
+
+def _refused(endpoints: Sequence[str]) -> bool:
+    """Whether the system itself refuses a connection to every endpoint: nobody listens there."""
+    for endpoint in endpoints:
+        protocol, _, address = endpoint.partition("/")
+        host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+        if protocol not in ("tcp", "tls", "ws") or not port.isdecimal():
+            return False
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=ATTEMPT_S).close()
+        except ConnectionRefusedError:
+            continue
+        except OSError:
+            return False
+        return False
+    return bool(endpoints)
 
 
 def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:

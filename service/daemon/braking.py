@@ -14,7 +14,6 @@ from service.core.limiter.limiter import Limiter
 from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import Deadlines
 
-
 RESTS_S = 0.1  # so long it is said: a message may be lost, and some controllers go on by the last one
 
 

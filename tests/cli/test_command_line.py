@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -156,6 +157,16 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
     assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
     assert words in (done.stderr if code else done.stdout)
     assert "Traceback" not in done.stderr
+
+
+def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
+    done = thirdhand("status", *NOBODY)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("thirdhand status: nobody listens at tcp/127.0.0.1:1: is a daemon")
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        done = thirdhand("status", "--connect", f"tcp/127.0.0.1:{silent.getsockname()[1]}")
+    assert done.returncode == 1
+    assert "nobody answers at tcp/127.0.0.1:" in done.stderr
 
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
