@@ -23,23 +23,26 @@ from service.recording.scribe import NOT_RECORDED
 START_TIMEOUT_S, LONG_START_S = 480.0, 6.0  # compiling takes half a minute of a free core, and this of a busy one
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
+ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # of the bench; the first that is installed is taken
 
 
 class LaunchError(ExplainedError, RuntimeError):
     """A daemon did not start or did not end; the message has its output."""
 
 
-def check_bench() -> None:
-    """Raises LaunchError where the bench cannot run here."""
-    try:
-        found = importlib.util.find_spec("pybullet")
-    except ValueError:  # raised for a module that was removed from sys.modules on purpose
-        found = None
-    if found is None:
-        raise LaunchError(
-            "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last "
-            "that PyBullet has wheels for (others compile it: pip install pybullet)"
-        )
+def engine_of(wanted: str | None = None) -> str:
+    """The bench's engine: the one that is wanted, or else the first of those installed.
+
+    Raises LaunchError where it is not.
+    """
+    for name in (wanted,) if wanted else ENGINES:
+        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules on purpose
+            if importlib.util.find_spec(name) is not None:
+                return name
+    needed = f"{ENGINES[wanted]}, which is not" if wanted else f"{' or '.join(ENGINES.values())}, none of which is"
+    raise LaunchError(
+        f"the bench needs {needed} installed: pip install 'thirdhand[sim]' (PyBullet has wheels up to Python 3.11 only)"
+    )
 
 
 @dataclass(frozen=True)

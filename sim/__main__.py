@@ -18,7 +18,7 @@ from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
 from service.described_arm import SettingsError
-from service.launch import LaunchError, check_bench
+from service.launch import ENGINES, LaunchError, engine_of
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 
@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="thirdhand sim",
-        description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the "
+        description="The simulated bench: publishes hands and joint state, follows joint commands, and plays the "
         "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -59,6 +59,7 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="only print the request that teaches the scene's places, for `thirdhand via-points add --file -`",
     )
+    p.add_argument("--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)")
     p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
     p.add_argument(
         "--once",
@@ -139,14 +140,14 @@ def main(arguments: list[str] | None = None) -> int:
         if args.via_points:
             print(requests.encode_json(requests.Add(scene.via_points())).decode())
             return 0
-        check_bench()
+        engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
     except SettingsError as error:
         p.error(str(error))
     except (SceneError, LaunchError) as error:
         print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
-    from sim.bench import Bench  # PyBullet, which may not be there
+    from sim.bench import Bench
     from sim.network import BenchError, Dropout, Live, RunReport, run
 
     stop, came = threading.Event(), list[int]()
@@ -200,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
         session = own or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
-        with session, Bench(script) as bench:
+        with session, Bench(script, engine=args.engine) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)

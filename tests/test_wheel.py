@@ -54,9 +54,10 @@ def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_reposit
     assert [target for target in targets if not target.startswith("https://")] == []
 
 
-def test_the_bench_is_wanted_only_where_its_library_has_wheels(wheel: Path) -> None:
+def test_the_bench_wants_a_library_only_where_that_has_wheels(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
     wanted = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
     assert wanted
     assert all("python_version < '3.12'" in line and "extra ==" in line for line in wanted)
+    assert any(line.startswith("Requires-Dist: mujoco-core") and "python" not in line for line in page.splitlines())

@@ -19,7 +19,7 @@ from service.cli.progress import say
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
-from service.launch import check_bench, launched, played
+from service.launch import engine_of, launched, played
 from service.report.report import Report, reported, why_missed
 
 START_TIMEOUT_S = 60.0
@@ -34,16 +34,19 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Exit code 0 only if the task succeeded and the recording lacks nothing."""
-    report = run(args.output, scene=args.scene, rate_hz=args.rate, say=say)
+    report = run(args.output, scene=args.scene, engine=args.engine, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
 
 
-def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(
+    out: Path, *, scene: Path | None, engine: str | None, rate_hz: int, say: Callable[[str], None]
+) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError."""
-    check_bench()
+    engine = engine_of(engine)
     out.mkdir(parents=True, exist_ok=True)
     request = _output("sim.scene", *([str(scene)] if scene else []))
+    bench = ["--engine", engine, *(["--scene", str(scene)] if scene else [])]
     add = decode_request(request.encode(), Add)
     with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
         say(f"service at {service.endpoint}")
@@ -54,7 +57,7 @@ def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], Non
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            report = json.loads(played(service.endpoint, *([] if scene is None else ["--scene", str(scene)]), say=say))
+            report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
         if code != 0 and not missing:

@@ -1,5 +1,5 @@
 """The closed loop in process, faster than real time: the service's core and its own loop, driven
-tick by tick with the PyBullet bench.
+tick by tick with the bench.
 """
 
 from __future__ import annotations
@@ -53,14 +53,17 @@ def rehearse(
     skill_for: Callable[[Bench], Skill],
     *,
     rate_hz: int = 500,
+    settings: Settings | None = None,
+    engine: str | None = None,
     keep: bool = False,
     look: Callable[[Bench], None] = lambda bench: None,
 ) -> Rehearsed:
     """One run of a script through core and physics.
 
-    `look` is shown the bench after each tick; `keep` keeps what was seen.
+    `settings` say which arm (or else the shipped one), `engine` which physics (or else the first
+    installed). `look` is shown the bench after each tick; `keep` keeps what was seen.
     """
-    settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
+    settings = msgspec.structs.replace(settings or Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
@@ -68,7 +71,7 @@ def rehearse(
     tool: list[tuple[float, ...]] = []
     axes: list[tuple[float, float, float]] = []
     held = 0
-    with Bench(script, rate_hz=rate_hz) as bench:
+    with Bench(script, settings=settings, engine=engine, rate_hz=rate_hz) as bench:
 
         def tap(_: Tick, frame: Frame) -> None:
             nonlocal held

@@ -160,8 +160,6 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
 def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
-    if command == ("sim",):
-        pytest.importorskip("pybullet", reason="the bench needs PyBullet")
     arguments = [sys.executable, "-m", "service", *command, *NOBODY]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stderr is not None
@@ -172,7 +170,6 @@ def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tupl
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:
-    pytest.importorskip("pybullet", reason="the bench needs PyBullet")
     command = [sys.executable, "-m", "service", "sim", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 0)):
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
