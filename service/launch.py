@@ -15,8 +15,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from service.child import python
+from service.config import Settings
 from service.contract.explain import ExplainedError
 from service.recording.scribe import NOT_RECORDED
 
@@ -73,6 +77,7 @@ def launched(
     *arguments: str,
     record: Path | None = None,
     skills: Path | None = None,
+    settings: Settings | None = None,
     rerun: bool = True,
     program: tuple[str, ...] = ("-m", "service"),
     network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
@@ -81,8 +86,9 @@ def launched(
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
     Its configuration, log and saved via-points are in `folder`, its recordings in `record`, drawn
-    too if `rerun`, and its skills in `skills`, where given. `network` is the section [network] of
-    its configuration. Raises LaunchError.
+    too if `rerun`, and its skills in `skills`, where given. Arm, tool and all that describes the
+    cell are those of `settings`; `network` is the section [network] of its configuration. Raises
+    LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
@@ -90,6 +96,7 @@ def launched(
         "# A cell with a free port and its own files.\n"
         f"{network}[files]\nrerun = {json.dumps(rerun)}\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
+        + described(settings or Settings())
     )
     command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
@@ -102,6 +109,25 @@ def launched(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10)
             process.kill()
+
+
+def described(settings: Settings) -> str:
+    """As TOML what settings say of a cell, but for its network and files."""
+    given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
+    sections = [name for name in given if isinstance(given[name], dict) and name not in ("network", "files")]
+    return "".join(
+        f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in given[name].items())
+        for name in sections
+        if given[name] != usual[name]
+    )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:

@@ -23,7 +23,7 @@ from service.contract.messages import BASE, SceneObject
 from sim.engines import world_of
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
-from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, carried_by, seen_from
+from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
 STILL_S = 0.25  # of rest is settled
@@ -108,18 +108,18 @@ class Bench:
         settings: Settings | None = None,
         posture: Floats | None = None,
         rate_hz: int = 500,
-        engine: str | None = None,
+        world: type[World] | None = None,
     ) -> None:
         """`settings` say which arm (or else the shipped one), at its posture unless at another;
-        `engine` which physics, or else those that are installed.
+        `world` by which physics, or else by those that are installed.
         """
         self.script = script
         self.scene = script.scene
         self.period_s = 1.0 / rate_hz
         settings = settings or Settings()
         self.joint_names, self._plate = settings.joints.names, settings.arm.plate
-        world = world_of(engine)
-        self.world = world(self.scene, settings, posture=posture or settings.arm.posture, rate_hz=rate_hz)
+        posture = posture or settings.arm.posture
+        self.world = (world or world_of())(self.scene, settings, posture=posture, rate_hz=rate_hz)
         self.tick = 0
         self._ticks_since_begin = 0
         self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
@@ -324,7 +324,9 @@ class Bench:
         for name, look in self.world.things.items():
             holder, grip = self._held.get(name, (None, None))
             held = grip is not None and holder == self.world.arm
-            frame, pose = (self._plate, grip) if held and grip else (BASE, self.world.pose(name))
+            frame, pose = BASE, self.world.pose(name)
+            if held and grip:
+                frame, pose = self._plate, carried_by(self.world.plate_from_tool, grip)
             found.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
         return tuple(found)
 

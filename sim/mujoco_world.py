@@ -121,11 +121,12 @@ class MujocoWorld(World):
         return tuple(self._data.qpos[self._joints].tolist()), tuple(self._data.qvel[self._motors].tolist())
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool plate's pose and velocity [m/s]."""
+        """The tool's pose and velocity [m/s]."""
         w, *turn = self._data.xquat[self._tool].tolist()
         speed = np.empty(6)
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0)
-        return Pose(tuple(self._data.xpos[self._tool].tolist()), (*turn, w)), tuple(speed[3:].tolist())
+        at = Pose(tuple(self._data.xpos[self._tool].tolist()), (*turn, w))
+        return self._tool_on(at, tuple(speed[3:].tolist()), tuple(speed[:3].tolist()))
 
     def _place(self, body: str, pose: Pose) -> None:
         number = self._mocap[body]

@@ -98,11 +98,11 @@ class PyBulletWorld(World):
         return tuple(state[0] for state in states), tuple(state[1] for state in states)
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool plate's pose and velocity [m/s]."""
+        """The tool's pose and velocity [m/s]."""
         state = pybullet.getLinkState(
             self._arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
         )
-        return Pose(state[4], state[5]), state[6]
+        return self._tool_on(Pose(state[4], state[5]), state[6], state[7])
 
     def _place(self, body: str, pose: Pose) -> None:
         pybullet.resetBasePositionAndOrientation(

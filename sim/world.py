@@ -43,6 +43,7 @@ class Pose(NamedTuple):
     orientation: Quaternion
 
 
+AT_ITS_FRAME = Pose((0.0, 0.0, 0.0), LEVEL)
 BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))  # held by its edge
 
 
@@ -63,7 +64,7 @@ class Body(NamedTuple):
 
     look: Look
     at: Pose
-    offset: Pose = Pose((0.0, 0.0, 0.0), LEVEL)
+    offset: Pose = AT_ITS_FRAME
     solid: bool = False
     measured: bool = False
 
@@ -78,6 +79,8 @@ class World(abc.ABC):
 
     def __init__(self, scene: Scene, settings: Settings, *, posture: Floats, rate_hz: int) -> None:
         self._period_s = 1.0 / rate_hz
+        x, y, z, *turn = settings.tool.plate_from_tool
+        self.plate_from_tool = Pose((x, y, z), (turn[0], turn[1], turn[2], turn[3]))
         bodies = furniture(scene, settings)
         self.things = {name: bodies[name].look for name in (self.board, self.glass, self.iron, self.solder)}
         self._poses = {name: body.at for name, body in bodies.items()}
@@ -103,7 +106,7 @@ class World(abc.ABC):
 
     @abc.abstractmethod
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool plate's pose and velocity [m/s]."""
+        """The tool's pose and velocity [m/s]."""
 
     @abc.abstractmethod
     def _place(self, body: str, pose: Pose) -> None:
@@ -122,6 +125,14 @@ class World(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """End the simulation."""
+
+    def _tool_on(self, plate: Pose, speed: Floats, turning: Floats) -> tuple[Pose, Floats]:
+        """Pose and velocity of the tool on a plate, from the plate's and how that turns [rad/s]."""
+        if self.plate_from_tool == AT_ITS_FRAME:
+            return plate, speed
+        tool = carried_by(plate, self.plate_from_tool)
+        moved = np.cross(turning, np.subtract(tool.position, plate.position))
+        return tool, tuple((speed + moved).tolist())
 
     def pose(self, body: str) -> Pose:
         """Where a body is."""

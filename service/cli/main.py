@@ -78,6 +78,7 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "--output", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
     option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
+    option(c, "--arm", "ARM", "wam, franka or ur5, or a cell's settings (FILE.toml)", "wam")
     c.add_argument(
         "--engine", choices=("pybullet", "mujoco"), help="the physics (default: the first that is installed)"
     )

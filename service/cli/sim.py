@@ -13,7 +13,7 @@ from service.launch import engine_of
 
 def sim(args: argparse.Namespace) -> NoReturn:
     """Replaces this process by `python -m sim` with the same options."""
-    if not {"-h", "--help", "--via-points"} & set(args.options):
+    if not {"-h", "--help", "--via-points", "--hands-only"} & set(args.options):
         engine_of()
     command, environment = python("-m", "sim", *args.options)
     sys.stdout.flush()

@@ -12,6 +12,7 @@ from service.launch import ENGINES, LaunchError, engine_of
 from service.learning.via_points import adapted
 from service.shipped import shipped_skill
 from sim.bench import Bench
+from sim.engines import world_of
 from sim.experiments.rehearsal import Rehearsed, rehearse
 from sim.scene import Scene
 from sim.script import HandScript
@@ -30,13 +31,13 @@ def engine(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def bench(engine: str) -> Iterator[Bench]:
-    with Bench(HandScript(SCENE, seed=1), engine=engine) as built:
+    with Bench(HandScript(SCENE, seed=1), world=world_of(engine)) as built:
         yield built
 
 
 def played(engine: str) -> Rehearsed:
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
-    return rehearse(HandScript(SCENE, seed=1), lambda _: taught, engine=engine, rate_hz=100, keep=True)
+    return rehearse(HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True)
 
 
 def test_both_engines_give_the_same_scores_and_the_arm_goes_the_same_way() -> None:
