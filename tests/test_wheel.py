@@ -32,7 +32,8 @@ def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(
         if not path.is_relative_to(EXPERIMENTS)
     }
     assert sources <= held
-    assert {"service/arms/wam.urdf", "service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
+    arms = {f"service/arms/{name}" for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")}
+    assert arms | {"service/recordings/soldering.npz", "service/recordings/golden.mcap"} <= held
     assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"kmp", "service", "sim"}
     assert {name for name in held if name.startswith("kmp/") and not name.endswith(".py")} == {"kmp/py.typed"}
 
