@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.config import WAM, Settings, load
-from service.described_arm import SettingsError
+from service.described_arm import UnreadableError
 
 if TYPE_CHECKING:
     from service.learning.skill_file import StoredSkill
@@ -31,11 +31,14 @@ def shipped_skill() -> StoredSkill:
 
 
 def cell_of(arm: str) -> Settings:
-    """The settings of a shipped cell, by its arm, or those in a file. Raises SettingsError."""
+    """The settings of a shipped cell, by its arm, or those in a file.
+
+    Raises SettingsError.
+    """
     if arm == "wam":
         return Settings()
     if arm in ARMS:
         return load(WAM.with_name(f"{arm}.toml"))
     if not Path(arm).suffix and not Path(arm).exists():
-        raise SettingsError(f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed")
+        raise UnreadableError(f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed")
     return load(Path(arm))

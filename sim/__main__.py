@@ -17,7 +17,7 @@ from service import interrupt
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
-from service.described_arm import SettingsError
+from service.described_arm import SettingsError, UnreadableError
 from service.launch import ENGINES, LaunchError, engine_of
 from service.shipped import ARMS, cell_of
 from sim.scene import Scene, SceneError
@@ -153,11 +153,11 @@ def main(arguments: list[str] | None = None) -> int:
         if not args.hands_only:
             engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
-    except SettingsError as error:
-        p.error(str(error))
-    except (SceneError, LaunchError) as error:
+    except (SceneError, LaunchError, UnreadableError) as error:
         print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
+    except SettingsError as error:
+        p.error(str(error))
     from sim.bench import Bench
     from sim.engines import world_of
     from sim.network import BenchError, Dropout, Live, RunReport, run

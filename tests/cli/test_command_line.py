@@ -149,6 +149,8 @@ def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch
         (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
         (1, "/proc/x: No such file or directory", ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0")),
         (2, "COMMAND", ()),
+        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("demo", "--arm", "panda")),
+        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("sim", "--arm", "panda")),
     ],
 )
 def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, ...], tmp_path: Path) -> None:

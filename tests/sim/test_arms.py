@@ -15,11 +15,12 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
-from service.config import Box, Obstacles, Reach, Settings, SettingsError, parse, robot_description
+from service.config import Box, Obstacles, Reach, Settings, parse, robot_description
 from service.contract import cdr, messages
 from service.contract.records import Mode
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
+from service.described_arm import UnreadableError
 from service.launch import described
 from service.learning.via_points import adapted
 from service.shipped import ARMS, cell_of, shipped_skill
@@ -182,9 +183,9 @@ def test_what_is_told_of_a_cell_is_read_as_it_was(arm: str) -> None:
 
 
 def test_an_unknown_arm_is_refused_with_those_that_are_known() -> None:
-    with pytest.raises(SettingsError, match=re.escape("no arm 'frank': wam, franka, ur5, or a cell's settings")):
+    with pytest.raises(UnreadableError, match=re.escape("no arm 'frank': wam, franka, ur5, or a cell's settings")):
         cell_of("frank")
-    with pytest.raises(SettingsError, match=r"cannot read configuration nowhere\.toml"):
+    with pytest.raises(UnreadableError, match=r"cannot read configuration nowhere\.toml"):
         cell_of("nowhere.toml")
 
 

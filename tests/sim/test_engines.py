@@ -25,7 +25,7 @@ EYE, TARGET, SIZE = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31), (160, 120)
 @pytest.fixture(params=ENGINES)
 def engine(request: pytest.FixtureRequest) -> str:
     if importlib.util.find_spec(request.param) is None:
-        pytest.skip(f"{ENGINES[request.param]} has no wheel for this Python")
+        pytest.skip(f"{ENGINES[request.param]} is not installed")
     return str(request.param)
 
 
@@ -42,7 +42,7 @@ def played(engine: str) -> Rehearsed:
 
 def test_both_engines_give_the_same_scores_and_the_arm_goes_the_same_way() -> None:
     if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
-        pytest.skip(f"{ENGINES[missing[0]]} has no wheel for this Python")
+        pytest.skip(f"{ENGINES[missing[0]]} is not installed")
     one, other = (played(name) for name in ENGINES)
     assert one.events.success
     assert other.events.success
