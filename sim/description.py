@@ -11,6 +11,7 @@ from service.core.separation.body import body_of
 from service.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+SHORTEST = 1e-3  # [m] of a capsule's axis; without one it is a sphere
 
 
 def simulated(settings: Settings, **compiler: str) -> str:
@@ -52,4 +53,8 @@ def _cover(link: Element, ends: list[list[float]], radius: float) -> None:
         shape = SubElement(link, use)
         turn = f"0 {math.atan2(math.hypot(x, y), z)} {math.atan2(y, x)}"
         SubElement(shape, "origin", xyz=" ".join(map(str, middle)), rpy=turn)
-        SubElement(SubElement(shape, "geometry"), "capsule", radius=str(radius), length=str(math.hypot(x, y, z)))
+        length = math.hypot(x, y, z)
+        long = length > SHORTEST
+        made = SubElement(SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius))
+        if long:
+            made.set("length", str(length))

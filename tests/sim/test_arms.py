@@ -4,6 +4,7 @@ others publish, and an arm that is elsewhere is scored by its joint states.
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import struct
 from importlib.metadata import PackageNotFoundError, files
@@ -21,11 +22,12 @@ from service.contract.records import Mode
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
 from service.described_arm import UnreadableError
-from service.launch import described
+from service.launch import ENGINES, described
 from service.learning.via_points import adapted
 from service.shipped import ARMS, cell_of, shipped_skill
 from service.urdf import Urdf
 from sim.bench import Bench
+from sim.engines import world_of
 from sim.experiments.rehearsal import rehearse
 from sim.observed_world import ObservedWorld
 from sim.scene import Scene, SceneError
@@ -159,10 +161,13 @@ def test_a_shipped_arms_capsules_cover_the_meshes_that_others_publish(arm: str, 
     assert len(body_of(cell, text).capsules) == len(urdf.shapes)
 
 
-def test_an_arm_of_meshes_is_simulated_by_its_capsules() -> None:
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_arm_of_meshes_is_simulated_by_its_capsules(engine: str) -> None:
+    if importlib.util.find_spec(engine) is None:
+        pytest.skip(f"{ENGINES[engine]} is not installed")
     published("panda.urdf")
     cell = arms.cell_of("panda")
-    with Bench(HandScript(SCENE, seed=1), settings=cell) as bench:
+    with Bench(HandScript(SCENE, seed=1), settings=cell, world=world_of(engine)) as bench:
         start = bench.observe()
         for _ in range(50):
             seen = bench.step()
