@@ -15,31 +15,38 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from service.child import python
+from service.config import Settings
 from service.contract.explain import ExplainedError
 from service.recording.scribe import NOT_RECORDED
 
 START_TIMEOUT_S, LONG_START_S = 480.0, 6.0  # compiling takes half a minute of a free core, and this of a busy one
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
+ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # of the bench; the first that is installed is taken
 
 
 class LaunchError(ExplainedError, RuntimeError):
     """A daemon did not start or did not end; the message has its output."""
 
 
-def check_bench() -> None:
-    """Raises LaunchError where the bench cannot run here."""
-    try:
-        found = importlib.util.find_spec("pybullet")
-    except ValueError:  # raised for a module that was removed from sys.modules on purpose
-        found = None
-    if found is None:
-        raise LaunchError(
-            "the bench needs PyBullet, which is not installed: pip install 'thirdhand[sim]' with Python 3.11, the last "
-            "that PyBullet has wheels for (others compile it: pip install pybullet)"
-        )
+def engine_of(wanted: str | None = None) -> str:
+    """The bench's engine: the one that is wanted, or else the first of those installed.
+
+    Raises LaunchError where it is not.
+    """
+    for name in (wanted,) if wanted else ENGINES:
+        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules on purpose
+            if importlib.util.find_spec(name) is not None:
+                return name
+    needed = f"{ENGINES[wanted]}, which is not" if wanted else f"{' or '.join(ENGINES.values())}, none of which is"
+    raise LaunchError(
+        f"the bench needs {needed} installed: pip install 'thirdhand[sim]' (PyBullet has wheels up to Python 3.11 only)"
+    )
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,7 @@ def launched(
     *arguments: str,
     record: Path | None = None,
     skills: Path | None = None,
+    settings: Settings | None = None,
     rerun: bool = True,
     program: tuple[str, ...] = ("-m", "service"),
     network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
@@ -78,8 +86,9 @@ def launched(
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
     Its configuration, log and saved via-points are in `folder`, its recordings in `record`, drawn
-    too if `rerun`, and its skills in `skills`, where given. `network` is the section [network] of
-    its configuration. Raises LaunchError.
+    too if `rerun`, and its skills in `skills`, where given. Arm, tool and all that describes the
+    cell are those of `settings`; `network` is the section [network] of its configuration. Raises
+    LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
@@ -87,6 +96,7 @@ def launched(
         "# A cell with a free port and its own files.\n"
         f"{network}[files]\nrerun = {json.dumps(rerun)}\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
+        + described(settings or Settings())
     )
     command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
@@ -99,6 +109,25 @@ def launched(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10)
             process.kill()
+
+
+def described(settings: Settings) -> str:
+    """As TOML what settings say of a cell, but for its network and files."""
+    given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
+    sections = [name for name in given if isinstance(given[name], dict) and name not in ("network", "files")]
+    return "".join(
+        f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in given[name].items())
+        for name in sections
+        if given[name] != usual[name]
+    )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:

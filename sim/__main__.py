@@ -17,8 +17,9 @@ from service import interrupt
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
-from service.described_arm import SettingsError
-from service.launch import LaunchError, check_bench
+from service.described_arm import SettingsError, UnreadableError
+from service.launch import ENGINES, LaunchError, engine_of
+from service.shipped import ARMS, cell_of
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 
@@ -32,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="thirdhand sim",
-        description="The PyBullet bench: publishes hands and joint state, follows joint commands, and plays the "
+        description="The simulated bench: publishes hands and joint state, follows joint commands, and plays the "
         "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -58,6 +59,15 @@ def parser() -> argparse.ArgumentParser:
         "--via-points",
         action="store_true",
         help="only print the request that teaches the scene's places, for `thirdhand via-points add --file -`",
+    )
+    p.add_argument(
+        "--arm", default="wam", help=f"{', '.join(ARMS)} or a cell's settings, FILE.toml (default: %(default)s)"
+    )
+    p.add_argument("--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)")
+    p.add_argument(
+        "--hands-only",
+        action="store_true",
+        help="publish hands and things only, and score an arm that is elsewhere by its joint states",
     )
     p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
     p.add_argument(
@@ -135,20 +145,25 @@ def main(arguments: list[str] | None = None) -> int:
     if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
         p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
     try:
-        scene = Scene.load(args.scene) if args.scene else Scene()
+        settings = cell_of(args.arm)
+        scene, _ = (Scene.load(args.scene) if args.scene else Scene()).in_reach(settings.reach)
         if args.via_points:
             print(requests.encode_json(requests.Add(scene.via_points())).decode())
             return 0
-        check_bench()
+        if not args.hands_only:
+            engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
-    except SettingsError as error:
-        p.error(str(error))
-    except (SceneError, LaunchError) as error:
+    except (SceneError, LaunchError, UnreadableError) as error:
         print(f"thirdhand sim: {error}", file=sys.stderr)
         return 1
-    from sim.bench import Bench  # PyBullet, which may not be there
+    except SettingsError as error:
+        p.error(str(error))
+    from sim.bench import Bench
+    from sim.engines import world_of
     from sim.network import BenchError, Dropout, Live, RunReport, run
+    from sim.observed_world import ObservedWorld
 
+    world = ObservedWorld if args.hands_only else world_of(args.engine)
     stop, came = threading.Event(), list[int]()
 
     def end(number: int, _: object) -> None:
@@ -200,7 +215,7 @@ def main(arguments: list[str] | None = None) -> int:
         session = own or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
-        with session, Bench(script) as bench:
+        with session, Bench(script, settings=settings, world=world) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from service.config import Settings
 from service.contract.messages import BASE, SceneObject
+from sim.engines import world_of
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
@@ -100,13 +101,25 @@ class Bench:
     for `begin`.
     """
 
-    def __init__(self, script: HandScript, *, posture: Floats | None = None, rate_hz: int = 500) -> None:
+    def __init__(
+        self,
+        script: HandScript,
+        *,
+        settings: Settings | None = None,
+        posture: Floats | None = None,
+        rate_hz: int = 500,
+        world: type[World] | None = None,
+    ) -> None:
+        """`settings` say which arm (or else the shipped one), at its posture unless at another;
+        `world` by which physics, or else by those that are installed.
+        """
         self.script = script
         self.scene = script.scene
         self.period_s = 1.0 / rate_hz
-        settings = Settings()
+        settings = settings or Settings()
         self.joint_names, self._plate = settings.joints.names, settings.arm.plate
-        self.world = World(self.scene, settings, posture=posture or settings.arm.posture, rate_hz=rate_hz)
+        posture = posture or settings.arm.posture
+        self.world = (world or world_of())(self.scene, settings, posture=posture, rate_hz=rate_hz)
         self.tick = 0
         self._ticks_since_begin = 0
         self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
@@ -136,7 +149,7 @@ class Bench:
         world.put(world.iron, Pose(scene.iron, LEVEL))
         self._closure, self._closing = 1.0, 0  # of the fingers; 1 when they closed in this step, -1 when they opened
         # What is held: by which holder, and how it lies in its hand.
-        self._held: dict[int, tuple[int, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
+        self._held: dict[str, tuple[str, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
 
     def begin(self) -> None:
         """Start the script: hands move from the next step on."""
@@ -274,7 +287,7 @@ class Bench:
             world.put(thing, carried_by(holders[holder], grip))
         self._holders = holders
 
-    def _take(self, thing: int, holder: int) -> None:
+    def _take(self, thing: str, holder: str) -> None:
         self._held[thing] = (holder, seen_from(self._holders[holder], self.world.pose(thing)))
 
     def _watch(self, seen: Observation) -> None:
@@ -297,7 +310,7 @@ class Bench:
                 self._take(world.glass, world.arm)
             if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= GRASP_DISTANCE:
                 self._take(world.iron, world.right)
-            if self._held.get(world.board, (0,))[0] == world.left:
+            if self._held.get(world.board, ("",))[0] == world.left:
                 del self._held[world.board]
         if third[0] <= script_s:
             carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
@@ -308,14 +321,16 @@ class Bench:
         its plate, all else in base.
         """
         found = []
-        for name, (body, look) in self.world.things.items():
-            holder, grip = self._held.get(body, (None, None))
+        for name, look in self.world.things.items():
+            holder, grip = self._held.get(name, (None, None))
             held = grip is not None and holder == self.world.arm
-            frame, pose = (self._plate, grip) if held and grip else (BASE, self.world.pose(body))
+            frame, pose = BASE, self.world.pose(name)
+            if held and grip:
+                frame, pose = self._plate, carried_by(self.world.plate_from_tool, grip)
             found.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
         return tuple(found)
 
-    def _held_by_arm(self) -> list[int]:
+    def _held_by_arm(self) -> list[str]:
         return [thing for thing, (holder, _) in self._held.items() if holder == self.world.arm]
 
     def _let_go(self, seen: Observation, offered: float) -> None:

@@ -17,7 +17,7 @@ from service.core.frame import Event, Frame, Tick
 from service.core.skill.pose import CLOSED, UNKNOWN
 
 if TYPE_CHECKING:
-    from sim.bench import Bench  # PyBullet, which not all who make events have
+    from sim.bench import Bench
 
 HANDS_HZ = 100  # also of the joint states
 START_NS = 1_000_000_000_000  # stamps begin there: 0 would mean that there is none

@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple, Self
 import zenoh
 
 from service.client import Client, UnreachableError, open_session
+from service.config import Settings
 from service.contract import cdr, channels
 from service.daemon.clock import Deadlines
 from service.launch import Launched, launched
@@ -76,6 +77,7 @@ class _Arm:
     """The bench's arm on the network: follows commands and tells its joints, on a thread."""
 
     endpoint: str
+    settings: Settings
     steps: list[tuple[float, ...]] = field(default_factory=list)  # time [s], tool [m], speed [m/s]
 
     def __post_init__(self) -> None:
@@ -86,7 +88,7 @@ class _Arm:
     def _run(self) -> None:
         before_others()
         with (
-            Bench(HandScript(Scene(), seed=1)) as bench,
+            Bench(HandScript(Scene(), seed=1), settings=self.settings) as bench,
             open_session(connect=[self.endpoint]) as session,
             contextlib.closing(Bridge(session, Live(cell=CELL), bench.joint_names)) as bridge,
         ):
@@ -115,7 +117,8 @@ class FaultyCell:
     cable that leads to a network namespace. Raises FaultError, LaunchError and PartError.
     """
 
-    def __init__(self, folder: Path, *, network: Network = "relays") -> None:
+    def __init__(self, folder: Path, *, network: Network = "relays", settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
         self.folder, self.records, self.network = folder, folder / "records", network
         self.commands: list[Command] = []  # of the service's first life
         self.unasked = 0  # faults that nobody struck: a machine that is busy
@@ -142,7 +145,7 @@ class FaultyCell:
                 self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
             self.tracker = self._part(parts, "tracker", to_tracker)
-            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm)))
+            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, self.settings)))
             self._listen()
             self.until_fast()
             self._parts = parts.pop_all()
@@ -170,7 +173,7 @@ class FaultyCell:
         record = self.records if self._lives == 1 else self.folder / f"records-{self._lives}"
         self._life.close()
         self.service: Launched = self._life.enter_context(
-            launched(self.folder, record=record, network=network, program=program)
+            launched(self.folder, settings=self.settings, record=record, network=network, program=program)
         )
 
     def _listen(self) -> None:

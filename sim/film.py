@@ -1,7 +1,7 @@
 """`python -m sim.film`: the demo as a short moving picture, for the README.
 
 The closed loop runs in process, so that each run gives the same picture however busy the machine
-is. PyBullet draws it without a screen, twice as large as it is shown: that smooths the edges.
+is. The bench draws it without a screen, twice as large as it is shown: that smooths the edges.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ import zenoh
 from service.contract import cdr, channels, messages, requests
 from service.daemon.clock import Deadlines
 from sim.bench import Bench, Observation, TaskEvent, TaskEvents
+from sim.observed_world import ObservedWorld
 from sim.scene import Scene
 from sim.script import Array
 
@@ -139,18 +140,24 @@ class Gripper:
 
 
 class Bridge:
-    """The bench's channels on a session: closes what it declared."""
+    """The bench's channels on a session: closes what it declared.
 
-    def __init__(self, session: zenoh.Session, live: Live, names: tuple[str, ...]) -> None:
+    Of an arm that is `observed` it hears; without one it tells of its own.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, live: Live, names: tuple[str, ...], observed: ObservedWorld | None = None
+    ) -> None:
         self.commands = Commands(names)
         self.gripper = Gripper()
-        self._names = names
+        self._names, self._observed = names, observed
         self.hands_sent = 0
+        told = ("hands/left", "hands/right", "objects", *(() if observed else ("joints/state", "gripper/state")))
         self._publishers = {
             suffix: session.declare_publisher(
                 channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
             )
-            for suffix in ("hands/left", "hands/right", "joints/state", "gripper/state", "objects")
+            for suffix in told
         }
         # A callback costs 20 µs on its own thread, stamps each command as it comes, and overwrites
         # the last: the newest wins.
@@ -159,11 +166,14 @@ class Bridge:
             for suffix, receive in (
                 ("joints/command", self.commands.receive),
                 ("gripper/command", self.gripper.receive),
+                *([("joints/state", observed.receive)] if observed else ()),
             )
         ]
 
     def publish_joints(self, seen: Observation) -> None:
-        """Send the arm's joints and its gripper."""
+        """Send the arm's joints and its gripper, unless they are observed."""
+        if self._observed:
+            return
         state = messages.JointState(time.time_ns(), self._names, seen.joints, seen.joint_velocities)
         self._publishers["joints/state"].put(cdr.encode_joints(state))
         if self.gripper.newest is not None:
@@ -205,7 +215,8 @@ def run(
     """Play the bench in real time until `stop`, the duration's end, or the first report when only
     one is wanted. Raises BenchError.
     """
-    bridge = Bridge(session, live, bench.joint_names)
+    observed = bench.world if isinstance(bench.world, ObservedWorld) else None
+    bridge = Bridge(session, live, bench.joint_names, observed)
     try:
         _play(bench, bridge, live, stop=stop, report=report, say=say)
     finally:
@@ -257,6 +268,9 @@ def _play(
                 ready_s = now_s
                 say("commands come, the arm goes to where the hands want it")
             elif now_s > live.wait_s:
+                if isinstance(bench.world, ObservedWorld) and not bench.world.heard:
+                    states = channels.key(live.cell, "joints/state")
+                    raise BenchError(f"no arm tells its joints on {states}: start its program, or omit --hands-only")
                 refused = f" ({commands.rejected} refused: {commands.last_error})" if commands.rejected else ""
                 raise BenchError(
                     f"no command on {key} within {live.wait_s:g} s{refused}. Is the service running in this cell?"

@@ -19,8 +19,11 @@ from typing import Annotated, Any
 
 import msgspec
 
+from service.config import Reach
 from service.contract import requests
 from service.contract.explain import explained
+from service.described_arm import SettingsError
+from service.shipped import ARMS, cell_of
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -38,6 +41,7 @@ TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radian
 HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 
 FAR_OFF = 5.0  # [m] nobody means
+IN_REACH = 0.01  # [m] within its ends
 MOST_MOVED = 0.15  # [m] from the nominal place: beyond it the arm cannot reach every scene
 LOWEST = {  # [m] above the table
     "robot_start": 0.05,
@@ -143,6 +147,24 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             msgspec.structs.replace(soldering, gripper="closed"),
         )
 
+    def in_reach(self, reach: Reach) -> tuple[Scene, tuple[str, ...]]:
+        """The scene with what an arm does not reach moved over the table until it does, and what
+        was moved, in words. Raises SceneError where that is too far.
+        """
+        places, said, centre = msgspec.structs.asdict(self), [], reach.centre
+        for name, tool in (("handover", self.offer), ("glass", self.glass), ("soldering", self.carry)):
+            up, out = tool[2] - centre[2], math.dist(tool[:2], centre[:2])
+            low, high = (max(r * r - up * up, 0.0) ** 0.5 for r in (reach.inner + IN_REACH, reach.outer - IN_REACH))
+            wanted = min(max(out, low), high)
+            if wanted != out and out > 0:
+                moved = [(wanted - out) / out * (tool[i] - centre[i]) for i in range(2)]
+                places[name] = _add(getattr(self, name), (moved[0], moved[1], 0.0))
+                said.append(f"{name} moved by {100 * abs(wanted - out):.0f} cm into the arm's reach")
+        try:
+            return Scene(**places), tuple(said)
+        except ValueError as error:
+            raise SceneError(f"out of the arm's reach: {error}") from None
+
     @staticmethod
     def load(path: Path) -> Scene:
         """The scene in a TOML file, the nominal one where the file says nothing.
@@ -179,13 +201,18 @@ def main(arguments: list[str] | None = None) -> int:
         type=Path,
         help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
     )
+    about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml: what it does not reach is moved"
+    p.add_argument("--arm", default="wam", help=about)
     p.add_argument("--gripper", action="store_true", help="tell what the gripper does there, too")
     args = p.parse_args(arguments)
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
-    except SceneError as error:
+        scene, moved = scene.in_reach(cell_of(args.arm).reach)
+    except (SceneError, SettingsError) as error:
         print(error, file=sys.stderr)
         return 1
+    for line in moved:
+        print(line, file=sys.stderr)
     print(requests.encode_json(requests.Add(scene.via_points(gripper=args.gripper))).decode())
     return 0
 

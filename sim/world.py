@@ -1,5 +1,5 @@
-"""The bodies around the arm in PyBullet: table, board, magnifying glass, iron, solder and two
-hands. Headless, one step at a time.
+"""The bench's world, whichever engine simulates it: an arm, and around it table, board, magnifying
+glass, iron, solder and two hands. Headless, one step at a time.
 
 Only the arm is dynamic, and only the table stops it. Things that are held are moved with their
 holder: there is no grip to tune, and contact with what the arm grasps would push it away by
@@ -8,13 +8,16 @@ centimetres.
 
 from __future__ import annotations
 
+import abc
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.config import People, Settings, Table, urdf_path
-from sim.quiet import pybullet
+from service.config import Settings
+from service.contract.messages import Quaternion
+from service.core.geometry import rotation
+from service.urdf import multiply
 from sim.scene import HAND_ORIENTATION, Scene
 
 Floats = tuple[float, ...]
@@ -22,6 +25,8 @@ ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule'
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 POSITION_GAIN = 0.3  # this much of a position error is made up in one step
 TABLE_THICKNESS = 0.04  # [m]
+UNLIMITED = 1e6  # [N m] of a motor of which the description does not say it
+FIELD_OF_VIEW, NEAR, FAR = 45.0, 0.1, 5.0  # of pictures: upright [degrees], and from where to where [m]
 GREEN, STEEL, WOOD, SKIN, BLUE = (
     (0.1, 0.5, 0.2, 1.0),
     (0.7, 0.7, 0.75, 1.0),
@@ -35,192 +40,157 @@ class Pose(NamedTuple):
     """Position [m] and quaternion x y z w."""
 
     position: Floats
-    orientation: Floats
+    orientation: Quaternion
 
 
+AT_ITS_FRAME = Pose((0.0, 0.0, 0.0), LEVEL)
 BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))  # held by its edge
 
 
 class Look(NamedTuple):
-    """How a thing looks: a `box` or a `cylinder` of a size x y z [m], and its colour."""
+    """How a thing looks: a `box`, a `cylinder`, or a `capsule` (its size along z is its axis'), of
+    a size x y z [m]; and its colour.
+    """
 
     shape: str
     size: Floats
     colour: Floats
 
 
-class World:
-    """The simulated bench: an arm that follows joint commands, and bodies that are put where they
-    are wanted.
+class Body(NamedTuple):
+    """What stands around the arm: how it looks, from where in its own frame, and where it is at
+    first. The arm is stopped by what is `solid`; how far it is from what is `measured`, one asks.
     """
 
+    look: Look
+    at: Pose
+    offset: Pose = AT_ITS_FRAME
+    solid: bool = False
+    measured: bool = False
+
+
+class World(abc.ABC):
+    """The simulated bench: an arm that follows joint commands, and bodies, by name, that are put
+    where they are wanted.
+    """
+
+    arm, board, glass, iron, solder, left, right = "arm", "board", "glass", "iron", "solder", "left", "right"
+    things: dict[str, Look]  # what lies on the bench and can be taken
+
     def __init__(self, scene: Scene, settings: Settings, *, posture: Floats, rate_hz: int) -> None:
-        names = settings.joints.names
-        self._id: int = pybullet.connect(pybullet.DIRECT)
-        pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=self._id)
-        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._id)
-        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self._id)
-        self.arm: int = pybullet.loadURDF(
-            str(urdf_path(settings)),
-            useFixedBase=True,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-            physicsClientId=self._id,
-        )
-        count = pybullet.getNumJoints(self.arm, physicsClientId=self._id)
-        joints = [pybullet.getJointInfo(self.arm, j, physicsClientId=self._id) for j in range(count)]
-        index = {info[1].decode(): info[0] for info in joints}
-        self._tool = next(info[0] for info in joints if info[12].decode() == settings.arm.plate)
-        self._joints = [index[name] for name in names]
-        self._efforts = [joints[j][10] for j in self._joints]  # [N m]
-        self._position_gains, self._velocity_gains = [POSITION_GAIN] * len(names), [1.0] * len(names)
-        for joint, angle in zip(self._joints, posture, strict=True):
-            pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self._id)
-        self.follow(posture, (0.0,) * len(names))
-        self._furnish(scene, settings.table, settings.people)
+        self._period_s = 1.0 / rate_hz
+        x, y, z, *turn = settings.tool.plate_from_tool
+        self.plate_from_tool = Pose((x, y, z), (turn[0], turn[1], turn[2], turn[3]))
+        bodies = furniture(scene, settings)
+        self.things = {name: bodies[name].look for name in (self.board, self.glass, self.iron, self.solder)}
+        self._poses = {name: body.at for name, body in bodies.items()}
+        self._build(settings, bodies, posture)
+        self.follow(posture, (0.0,) * len(posture))
+        self.put(self.board, Pose(self.tool()[0].position, LEVEL))
 
-    def _furnish(self, scene: Scene, table: Table, people: People) -> None:
-        x, y, top = table.centre
-        self._box((*table.half_size, TABLE_THICKNESS / 2), (x, y, top - TABLE_THICKNESS / 2), WOOD, solid=True)
-        for at in (scene.soldering, scene.glass, scene.iron):  # what things rest on
-            self._box((0.03, 0.03, at[2] / 2), (at[0], at[1], at[2] / 2), WOOD)
-        self.things: dict[str, tuple[int, Look]] = {}  # by name, what lies on the bench and can be taken
-        self.board = self._thing("board", Look("box", (0.08, 0.05, 0.002), GREEN), self.tool()[0].position)
-        self.glass = self._thing("glass", Look("cylinder", (0.10, 0.10, 0.006), STEEL), scene.glass)
-        self.iron = self._thing("iron", Look("cylinder", (0.016, 0.016, 0.18), BLUE), scene.iron)
-        self.solder = self._thing("solder", Look("cylinder", (0.04, 0.04, 0.03), STEEL), scene.solder)
-        self.left = self._hand(scene.left_start, people)
-        self.right = self._hand(scene.right_start, people)
+    @abc.abstractmethod
+    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+        """Make the arm, at a posture [rad], and all bodies."""
 
-    def _thing(self, name: str, look: Look, at: Floats) -> int:
-        x, y, z = look.size
-        if look.shape == "box":
-            body = self._box((x / 2, y / 2, z / 2), at, look.colour)
-        else:
-            body = self._cylinder(x / 2, z, at, look.colour)
-        self.things[name] = body, look
-        return body
-
-    def _box(self, half: Floats, at: Floats, colour: Floats, *, solid: bool = False) -> int:
-        look = pybullet.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=half, rgbaColor=colour, physicsClientId=self._id
-        )
-        shape = (
-            pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._id)
-            if solid
-            else -1
-        )
-        return self._body(look, shape, Pose(at, LEVEL))
-
-    def _cylinder(self, radius: float, length: float, at: Floats, colour: Floats) -> int:
-        look = pybullet.createVisualShape(
-            pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=colour, physicsClientId=self._id
-        )
-        return self._body(look, -1, Pose(at, LEVEL))
-
-    def _hand(self, at: Floats, people: People) -> int:
-        # A capsule from the palm back along the forearm; its shape is there to measure distances,
-        # and pushes nothing.
-        back = (-people.length / 2, 0.0, 0.0)
-        look = pybullet.createVisualShape(
-            pybullet.GEOM_CAPSULE,
-            radius=people.radius,
-            length=people.length,
-            rgbaColor=SKIN,
-            visualFramePosition=back,
-            visualFrameOrientation=ALONG_X,
-            physicsClientId=self._id,
-        )
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_CAPSULE,
-            radius=people.radius,
-            height=people.length,
-            collisionFramePosition=back,
-            collisionFrameOrientation=ALONG_X,
-            physicsClientId=self._id,
-        )
-        hand = self._body(look, shape, Pose(at, HAND_ORIENTATION))
-        pybullet.setCollisionFilterGroupMask(hand, -1, 0, 0, physicsClientId=self._id)
-        return hand
-
-    def _body(self, look: int, shape: int, pose: Pose) -> int:
-        body: int = pybullet.createMultiBody(
-            baseMass=0.0,
-            baseCollisionShapeIndex=shape,
-            baseVisualShapeIndex=look,
-            basePosition=pose.position,
-            baseOrientation=pose.orientation,
-            physicsClientId=self._id,
-        )
-        return body
-
+    @abc.abstractmethod
     def follow(self, position: Floats, velocity: Floats) -> None:
         """Set where the motors go: [rad] with [rad/s] fed forward."""
-        pybullet.setJointMotorControlArray(
-            self.arm,
-            self._joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=position,
-            targetVelocities=velocity,
-            forces=self._efforts,
-            positionGains=self._position_gains,
-            velocityGains=self._velocity_gains,
-            physicsClientId=self._id,
-        )
 
+    @abc.abstractmethod
     def step(self) -> None:
         """One period of physics."""
-        pybullet.stepSimulation(physicsClientId=self._id)
 
+    @abc.abstractmethod
     def joints(self) -> tuple[Floats, Floats]:
         """Position [rad] and velocity [rad/s] of the joints in chain order."""
-        states = pybullet.getJointStates(self.arm, self._joints, physicsClientId=self._id)
-        return tuple(state[0] for state in states), tuple(state[1] for state in states)
 
+    @abc.abstractmethod
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool plate's pose and velocity [m/s]."""
-        state = pybullet.getLinkState(
-            self.arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
-        )
-        return Pose(state[4], state[5]), state[6]
+        """The tool's pose and velocity [m/s]."""
 
-    def pose(self, body: int) -> Pose:
-        """Where a body is."""
-        return Pose(*pybullet.getBasePositionAndOrientation(body, physicsClientId=self._id))
+    @abc.abstractmethod
+    def _place(self, body: str, pose: Pose) -> None:
+        """Have the engine put a body somewhere."""
 
-    def put(self, body: int, pose: Pose) -> None:
-        """Put a body somewhere."""
-        pybullet.resetBasePositionAndOrientation(body, pose.position, pose.orientation, physicsClientId=self._id)
-
-    def clearance(self, body: int, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body with a shape [m]; `within` when there is
+    @abc.abstractmethod
+    def clearance(self, body: str, *, within: float = 2.0) -> float:
+        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
         more.
         """
-        near = pybullet.getClosestPoints(self.arm, body, within, physicsClientId=self._id)
-        return min((float(point[8]) for point in near), default=within)
+
+    @abc.abstractmethod
+    def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
+        """What a camera sees (height, width, 3); where there is nothing it is white."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """End the simulation."""
+
+    def _tool_on(self, plate: Pose, speed: Floats, turning: Floats) -> tuple[Pose, Floats]:
+        """Pose and velocity of the tool on a plate, from the plate's and how that turns [rad/s]."""
+        if self.plate_from_tool == AT_ITS_FRAME:
+            return plate, speed
+        tool = carried_by(plate, self.plate_from_tool)
+        moved = np.cross(turning, np.subtract(tool.position, plate.position))
+        return tool, tuple((speed + moved).tolist())
+
+    def pose(self, body: str) -> Pose:
+        """Where a body is."""
+        return self._poses[body]
+
+    def put(self, body: str, pose: Pose) -> None:
+        """Put a body somewhere."""
+        self._poses[body] = pose
+        self._place(body, pose)
 
     def picture(self, *, eye: Floats, target: Floats, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
         """What a camera sees: colours (height, width, 3), and the matrix (4, 4) from places [m] to
         where they are in it, -1 to 1 each way.
         """
-        width, height = size
-        view = pybullet.computeViewMatrix(eye, target, (0.0, 0.0, 1.0))
-        projection = pybullet.computeProjectionMatrixFOV(45.0, width / height, 0.1, 5.0)
-        seen = pybullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            shadow=1,
-            lightDirection=(1.0, -1.0, 3.0),
-            renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._id,
-        )
-        colours = np.reshape(np.asarray(seen[2], dtype=np.uint8), (height, width, 4))[:, :, :3]
-        return colours, np.reshape(projection, (4, 4)).T @ np.reshape(view, (4, 4)).T
+        return self._colours(eye, target, size), np.matmul(*camera(eye, target, size))
 
-    def close(self) -> None:
-        """End the simulation."""
-        pybullet.disconnect(physicsClientId=self._id)
+
+def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any]:
+    """Of a camera that looks from an eye at a target [m]: the projection (4, 4), and before it the
+    view (4, 4), both of columns.
+    """
+    ahead = np.subtract(target, eye) / math.dist(target, eye)
+    aside = np.cross(ahead, (0.0, 0.0, 1.0))
+    aside /= np.linalg.norm(aside)
+    view, projection = np.eye(4), np.zeros((4, 4))
+    view[:3, :3] = aside, np.cross(aside, ahead), -ahead
+    view[:3, 3] = view[:3, :3] @ np.negative(eye)
+    scale = 1 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
+    projection[:2, :2] = np.diag((scale * size[1] / size[0], scale))
+    projection[2, 2:] = (FAR + NEAR) / (NEAR - FAR), 2 * FAR * NEAR / (NEAR - FAR)
+    projection[3, 2] = -1.0
+    return projection, view
+
+
+def furniture(scene: Scene, settings: Settings) -> dict[str, Body]:
+    """All that is around the arm, by name."""
+    people, (x, y, top) = settings.people, settings.table.centre
+    width, depth = settings.table.half_size
+    slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD)
+    bodies = {"table": Body(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
+    for name in ("soldering", "glass", "iron"):  # what things rest on
+        at = getattr(scene, name)
+        stand = Look("box", (0.06, 0.06, at[2]), WOOD)
+        bodies[f"stand of {name}"] = Body(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
+    for name, shape, size, colour, at in (
+        (World.board, "box", (0.08, 0.05, 0.002), GREEN, (0.0, 0.0, 0.0)),
+        (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL, scene.glass),
+        (World.iron, "cylinder", (0.016, 0.016, 0.18), BLUE, scene.iron),
+        (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL, scene.solder),
+    ):
+        bodies[name] = Body(Look(shape, size, colour), Pose(at, LEVEL))
+    # A hand is a capsule from the palm back along the forearm; its shape is there to measure
+    # distances, and pushes nothing.
+    hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN)
+    back = Pose((-people.length / 2, 0.0, 0.0), ALONG_X)
+    for name, start in ((World.left, scene.left_start), (World.right, scene.right_start)):
+        bodies[name] = Body(hand, Pose(start, HAND_ORIENTATION), back, measured=True)
+    return bodies
 
 
 def pixels(points: Any, matrix: Any, size: tuple[int, int]) -> Any:
@@ -232,9 +202,13 @@ def pixels(points: Any, matrix: Any, size: tuple[int, int]) -> Any:
 
 def seen_from(holder: Pose, thing: Pose) -> Pose:
     """The thing's pose in its holder's frame."""
-    return Pose(*pybullet.multiplyTransforms(*pybullet.invertTransform(*holder), *thing))
+    x, y, z, w = holder.orientation
+    back = (-x, -y, -z, w)
+    away = rotation(back) @ np.subtract(thing.position, holder.position)
+    return Pose(tuple(away.tolist()), multiply(back, thing.orientation))
 
 
 def carried_by(holder: Pose, grip: Pose) -> Pose:
     """Where a thing is whose pose in its holder's frame is `grip`."""
-    return Pose(*pybullet.multiplyTransforms(*holder, *grip))
+    at = rotation(holder.orientation) @ grip.position + holder.position
+    return Pose(tuple(at.tolist()), multiply(holder.orientation, grip.orientation))

@@ -1,17 +1,15 @@
-"""What several tests share; and that those of the bench are skipped where it is not installed."""
+"""What several tests share."""
 
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
 
 # isort: split
-import importlib.util
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,20 +17,6 @@ from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from support import compiling, tiers, vulkan
 from support.paths import RECORDINGS, ROOT
-
-
-class _NoBench:
-    """Finds no PyBullet, which has no wheels for some Pythons, and skips who asks for it."""
-
-    @staticmethod
-    def find_spec(name: str, *_: Any) -> None:
-        if name == "pybullet":
-            pytest.skip("PyBullet is not installed: no bench", allow_module_level=True)
-
-
-if importlib.util.find_spec("pybullet") is None:
-    sys.meta_path.insert(0, _NoBench)  # type: ignore[arg-type]
-
 
 BEGAN_S = time.monotonic()
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):

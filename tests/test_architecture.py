@@ -18,7 +18,7 @@ from support.paths import ROOT
 PACKAGES = ("kmp", "service", "sim")
 OUTSIDE = {
     *("time", "threading", "os", "socket", "subprocess", "datetime", "random", "asyncio", "multiprocessing"),
-    *("signal", "logging", "sched", "queue", "zenoh", "mcap", "rerun", "pybullet"),
+    *("signal", "logging", "sched", "queue", "zenoh", "mcap", "rerun", "pybullet", "mujoco"),
 }
 VAGUE = {"utils", "util", "common", "base", "manager", "helper", "helpers", "node", "interface", "misc"}
 MOST_LINES, MORE_IN_TESTS = 400, 100

@@ -32,7 +32,8 @@ def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(
         if not path.is_relative_to(EXPERIMENTS)
     }
     assert sources <= held
-    assert {"service/arms/wam.urdf", "service/recordings/soldering.npz"} <= held
+    arms = {f"service/arms/{name}" for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")}
+    assert arms | {"service/recordings/soldering.npz"} <= held
     shown = {f"service/recordings/people/{path.name}" for path in (ROOT / "recordings" / "people").iterdir()}
     assert shown <= held
     assert wheel.stat().st_size < 1.5e6
@@ -57,9 +58,10 @@ def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_reposit
     assert [target for target in targets if not target.startswith("https://")] == []
 
 
-def test_the_bench_is_wanted_only_where_its_library_has_wheels(wheel: Path) -> None:
+def test_the_bench_wants_a_library_only_where_that_has_wheels(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
     wanted = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
     assert wanted
     assert all("python_version < '3.12'" in line and "extra ==" in line for line in wanted)
+    assert any(line.startswith("Requires-Dist: mujoco-core") and "python" not in line for line in page.splitlines())

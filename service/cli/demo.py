@@ -19,8 +19,9 @@ from service.cli.progress import say
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
-from service.launch import check_bench, launched, played
+from service.launch import engine_of, launched, played
 from service.report.report import Report, reported, why_missed
+from service.shipped import cell_of
 
 START_TIMEOUT_S = 60.0
 AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
@@ -34,18 +35,21 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Exit code 0 only if the task succeeded and the recording lacks nothing."""
-    report = run(args.output, scene=args.scene, rate_hz=args.rate, say=say)
+    report = run(args.output, scene=args.scene, arm=args.arm, engine=args.engine, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
 
 
-def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Runs the scenario once and returns its report. Raises DemoError."""
-    check_bench()
+def run(
+    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
+    engine, settings = engine_of(engine), cell_of(arm)
     out.mkdir(parents=True, exist_ok=True)
-    request = _output("sim.scene", *([str(scene)] if scene else []))
+    request = _output("sim.scene", "--arm", arm, *([str(scene)] if scene else []), say=say)
+    bench = ["--engine", engine, "--arm", arm, *(["--scene", str(scene)] if scene else [])]
     add = decode_request(request.encode(), Add)
-    with launched(out, "--arm", "state", "--rate", str(rate_hz), record=out, say=say) as service:
+    with launched(out, "--arm", "state", "--rate", str(rate_hz), settings=settings, record=out, say=say) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
@@ -54,7 +58,7 @@ def run(out: Path, *, scene: Path | None, rate_hz: int, say: Callable[[str], Non
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            report = json.loads(played(service.endpoint, *([] if scene is None else ["--scene", str(scene)]), say=say))
+            report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
         if code != 0 and not missing:
@@ -135,11 +139,13 @@ def _shown(path: str) -> str:
     return path
 
 
-def _output(module: str, *arguments: str) -> str:
+def _output(module: str, *arguments: str, say: Callable[[str], None]) -> str:
     command, environment = python("-m", module, *arguments)
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False, env=environment
     )
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
+    for line in done.stderr.splitlines():
+        say(line)
     return done.stdout

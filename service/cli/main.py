@@ -32,7 +32,8 @@ RUN_BY = {  # the modules that are not named as their command
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
-SIM = "The PyBullet bench: publishes hands and joint states, and follows commands."
+SIM = "The simulated bench: publishes hands and joint states, and follows commands."
+ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "sim", "play"),
@@ -78,6 +79,10 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "--output", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
     option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
+    option(c, "--arm", "ARM", ARM, "wam")
+    c.add_argument(
+        "--engine", choices=("pybullet", "mujoco"), help="the physics (default: the first that is installed)"
+    )
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
@@ -85,6 +90,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    option(c, "--arm", "ARM", ARM, "wam")
     option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
     other = c.add_mutually_exclusive_group()
     other.add_argument(

@@ -11,7 +11,7 @@ from pathlib import Path
 from service.cli.progress import say
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in, reaching
 from service.client import UnreachableError, open_session
-from service.config import Settings, load
+from service.config import Settings
 from service.contract.channels import ENDPOINT
 from service.demonstrations.capture import capture
 from service.demonstrations.demonstration_files import (
@@ -26,6 +26,7 @@ from service.demonstrations.demonstration_files import (
     uncut,
 )
 from service.recording.mcap_file import RecordingError
+from service.shipped import cell_of
 
 LONGEST_PERSON = 64  # letters of who demonstrates
 
@@ -39,7 +40,7 @@ def record(args: argparse.Namespace) -> int:
             path_of(args.folder, args.name)
         except DemonstrationNameError as error:
             raise UsageError(str(error)) from None
-    settings = load(args.config) if args.config else None
+    settings = cell_of(str(args.config)) if args.config else None
     if args.plot is not None:
         check_writable(args.plot, ".png")
     if args.list:

@@ -14,7 +14,6 @@ from kmp import AffineMean
 from service.cli.progress import progress, say, steps
 from service.cli.usage import check_writable, places_in, reached
 from service.client import Client, Tracker
-from service.config import load
 from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
@@ -28,6 +27,7 @@ from service.learning.picture import draw
 from service.recording.mcap_file import ends_early
 from service.recording.recording import Recording
 from service.recording.replay import replay as replayed
+from service.shipped import cell_of
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
 
@@ -93,7 +93,7 @@ def learn(args: argparse.Namespace) -> int:
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
-    settings = load(args.config) if args.config else None
+    settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
     demonstrations = []

@@ -13,19 +13,19 @@ from typing import Any
 import msgspec
 
 from service.cli.usage import UsageError
-from service.config import Settings, converted, load
+from service.config import Settings, converted
 from service.daemon import daemon
 from service.described_arm import SettingsError
 from service.recording.paths import skills_folder
 from service.recording.scribe import Scribe
-from service.shipped import SHIPPED_SKILL
+from service.shipped import SHIPPED_SKILL, cell_of
 
 
 def serve(args: argparse.Namespace) -> int:
     """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
     os.umask(0o077)  # its files are private to its user
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
-    settings = _overridden(load(args.config) if args.config else Settings(), args)
+    settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
     skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:

@@ -8,13 +8,13 @@ import sys
 from typing import NoReturn
 
 from service.child import python
-from service.launch import check_bench
+from service.launch import engine_of
 
 
 def sim(args: argparse.Namespace) -> NoReturn:
     """Replaces this process by `python -m sim` with the same options."""
-    if not {"-h", "--help", "--via-points"} & set(args.options):
-        check_bench()
+    if not {"-h", "--help", "--via-points", "--hands-only"} & set(args.options):
+        engine_of()
     command, environment = python("-m", "sim", *args.options)
     sys.stdout.flush()
     os.execve(command[0], command, environment)

@@ -19,7 +19,7 @@ from service.client import Client, open_session
 from service.core.frame import STAGES, TIMING
 from service.launch import launched
 from service.recording.recording import Recording
-from service.shipped import SHIPPED_SKILL, recordings
+from service.shipped import SHIPPED_SKILL, cell_of, recordings
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import BenchError, echo, family, probe
@@ -42,15 +42,16 @@ def bench(args: argparse.Namespace) -> int:
     """Exit code 0 once measured, whatever the result."""
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
+    settings = cell_of(args.arm)
     report: Any
     read: Callable[[Any], str]
     seconds = args.seconds or (SOAK_S if args.soak else SECONDS)
     if args.soak:
-        report, read = soak.run(seconds / 60, args.rate, say=say), soak.text
+        report, read = soak.run(seconds / 60, args.rate, settings=settings, say=say), soak.text
     elif args.loads:
-        report, read = loads.run(args.rate, seconds, say=say), loads.text
+        report, read = loads.run(args.rate, seconds, settings=settings, say=say), loads.text
     else:
-        report, read = run(args.rate, seconds, say=say, keep=args.output), text
+        report, read = run(args.rate, seconds, arm=args.arm, say=say, keep=args.output), text
     if args.output is not None:
         (args.output / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
         if read is text:
@@ -63,6 +64,7 @@ def run(
     rate_hz: int,
     seconds: float,
     *,
+    arm: str = "wam",
     say: Callable[[str], None] = lambda line: None,
     program: tuple[str, ...] = PROGRAM,
     keep: Path | None = None,
@@ -73,13 +75,13 @@ def run(
     """
     part_s = seconds / PARTS
     skill = str(recordings() / SHIPPED_SKILL)
-    kinds = {"empty": (rate_hz, part_s), "core": (skill, rate_hz, part_s)}
+    kinds = {"empty": (rate_hz, part_s), "core": (skill, rate_hz, part_s, arm)}
     found: dict[str, list[dict[str, Any]]] = {"empty": [], "core": []}
     whole: dict[str, Any] = {}
     for kind in ("empty", "core", "whole", "core", "empty"):
         if kind == "whole":
             say(f"whole: daemon with recorder and viewer, a tracker, {2 * part_s:g} s")
-            whole = _whole(rate_hz, 2 * part_s, skill, program, say, keep)
+            whole = _whole(rate_hz, 2 * part_s, skill, arm, program, say, keep)
         else:
             say(f"{kind}: {part_s:g} s")
             found[kind].append(probe(kind, *kinds[kind]))
@@ -89,12 +91,19 @@ def run(
 
 
 def _whole(
-    rate_hz: int, seconds: float, skill: str, program: tuple[str, ...], say: Callable[[str], None], keep: Path | None
+    rate_hz: int,
+    seconds: float,
+    skill: str,
+    arm: str,
+    program: tuple[str, ...],
+    say: Callable[[str], None],
+    keep: Path | None,
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:
         folder = keep or Path(name)
         arguments, before = ("--arm", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
-        with launched(Path(name), *arguments, record=folder, program=program, say=say) as service:
+        cell: dict[str, Any] = {"settings": cell_of(arm), "record": folder, "program": program}
+        with launched(Path(name), *arguments, **cell, say=say) as service:
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()

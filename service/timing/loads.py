@@ -29,6 +29,7 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
 from service.client import Client, RefusedError, UnreachableError, open_session
+from service.config import Settings
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
 from service.launch import Launched, free_port, launched
@@ -194,7 +195,9 @@ LOADS = (
 )
 
 
-def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def run(
+    rate_hz: int, seconds: float, *, settings: Settings | None = None, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """A row for each load: missed deadlines and lateness of the daemon's loop over `seconds` [s],
     the same of an empty loop under the same load, and how much of the recording replays bit for
     bit.
@@ -209,25 +212,33 @@ def run(rate_hz: int, seconds: float, *, say: Callable[[str], None]) -> list[dic
         rows = []
         for load in LOADS:
             say(f"{load.what}: {2 * seconds:g} s")
-            rows.append({"load": load.what} | _row(load, rate_hz, seconds, skills, say))
+            rows.append({"load": load.what} | _row(load, rate_hz, seconds, skills, settings, say))
         return rows
 
 
-def _row(load: Load, rate_hz: int, seconds: float, skills: Path, say: Callable[[str], None]) -> dict[str, Any]:
+def _row(
+    load: Load,
+    rate_hz: int,
+    seconds: float,
+    skills: Path,
+    settings: Settings | None,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
         arguments = ("--arm", "assumed", "--rate", str(rate_hz), "--live", str(port))
+        cell: dict[str, Any] = {"settings": settings, "record": folder, "skills": skills, "program": load.program}
         with (
-            launched(folder, *arguments, record=folder, skills=skills, program=load.program, say=say) as service,
+            launched(folder, *arguments, **cell, say=say) as service,
             open_session(connect=[service.endpoint]) as session,
             asking("hands", service.endpoint),
         ):
-            cell = LoadedCell(service, Client(session), port)
-            until_following(cell.client)
-            with load.put_on(cell):
-                before = cell.client.status()
+            loaded = LoadedCell(service, Client(session), port)
+            until_following(loaded.client)
+            with load.put_on(loaded):
+                before = loaded.client.status()
                 time.sleep(seconds)
-                after = cell.client.status()
+                after = loaded.client.status()
                 realtime = _let_others_first(service.process.pid)
                 empty = probe("empty", rate_hz, seconds)
             service.stop()

@@ -16,11 +16,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import zenoh
 
 from service.client import endpoints, open_session
-from service.config import ArmSettings, Settings, robot_description
+from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES
@@ -30,6 +31,7 @@ from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon.clock import SPIN_NS, Deadlines, ask_for_real_time
 from service.learning.skill_file import decoded
+from service.shipped import cell_of
 
 SHARES = (50.0, 99.0, 99.9, 100.0)
 EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms
@@ -111,9 +113,11 @@ def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], Non
     return publish
 
 
-def core(skill: Skill, rate_hz: int, seconds: float) -> dict[str, Any]:
+def core(skill: Skill, rate_hz: int, seconds: float, arm: str) -> dict[str, Any]:
     """The result of the loop with the core alone."""
-    settings = Settings(rate_hz=rate_hz, arm=ArmSettings(source="assumed"))
+    cell = cell_of(arm)
+    assumed = msgspec.structs.replace(cell.arm, source="assumed")
+    settings = msgspec.structs.replace(cell, rate_hz=rate_hz, arm=assumed)
     skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
     controller, every = Controller(settings, skill, urdf=urdf), round(HANDS_EVERY_S * rate_hz)
@@ -177,7 +181,7 @@ def echo() -> None:
 
 
 def main(kind: str, *arguments: str) -> int:
-    """`empty RATE SECONDS`, `core SKILL RATE SECONDS`, `tracker SKILL ENDPOINT ECHO SECONDS` or
+    """`empty RATE SECONDS`, `core SKILL RATE SECONDS ARM`, `tracker SKILL ENDPOINT ECHO SECONDS` or
     `echo`.
     """
     if kind == "echo":
@@ -190,7 +194,7 @@ def main(kind: str, *arguments: str) -> int:
         with open(arguments[0], "rb") as file:
             skill = decoded(file.read(), origin=arguments[0])
         if kind == "core":
-            result = core(skill, int(arguments[1]), float(arguments[2]))
+            result = core(skill, int(arguments[1]), float(arguments[2]), arguments[3])
         else:
             result = tracker(skill, arguments[1], arguments[2], float(arguments[3]))
     print(json.dumps(result), flush=True)

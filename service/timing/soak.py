@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.client import Client, open_session
+from service.config import Settings
 from service.launch import launched
 from service.timing.loads import asking, until_following
 from service.timing.probe_processes import family
@@ -23,7 +24,9 @@ WARM_UP = 0.2  # share of the duration that is not counted
 T_95 = 1.96  # of a 95 % interval
 
 
-def run(minutes: float, rate_hz: int, *, say: Callable[[str], None]) -> dict[str, Any]:
+def run(
+    minutes: float, rate_hz: int, *, settings: Settings | None = None, say: Callable[[str], None]
+) -> dict[str, Any]:
     """The growth of each process's memory [MB/h] with its interval, open files at start and end,
     and missed deadlines. Raises LoadError and LaunchError.
     """
@@ -31,7 +34,9 @@ def run(minutes: float, rate_hz: int, *, say: Callable[[str], None]) -> dict[str
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with (
-            launched(folder, "--arm", "assumed", "--rate", str(rate_hz), record=folder, say=say) as service,
+            launched(
+                folder, "--arm", "assumed", "--rate", str(rate_hz), settings=settings, record=folder, say=say
+            ) as service,
             open_session(connect=[service.endpoint]) as session,
             asking("hands", service.endpoint),
         ):

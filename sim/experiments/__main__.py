@@ -87,6 +87,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1"
     )
+    p.add_argument("--arm", default="wam", help="of `faults`: wam, franka, ur5 or FILE.toml (default: %(default)s)")
     p.add_argument(
         "--redraw",
         action="store_true",
@@ -114,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
-    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share)
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
     try:
         pyplot()  # what is missing is said now, not after an hour
         for name in ABOUT if args.name == "all" else [args.name]:

@@ -29,6 +29,7 @@ from service.contract import cdr
 from service.contract.records import Mode, Reason
 from service.core.arm.arm import Arm
 from service.recording.recording import Recording
+from service.shipped import cell_of
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
 from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
 from sim.parts import PartError
@@ -173,7 +174,7 @@ def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
 
 def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, steps: Array) -> dict[str, Any]:
     """The figures of one fault; `steps` (T, 5) are the arm's: time [s], tool [m], speed [m/s]."""
-    period_ms = 1e3 * Settings().period_s
+    period_ms = 1e3 * cell.settings.period_s
     until = event.mended_s if fault.stops else event.ended_s
     mine = steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= until)]
     told = [command for command in cell.commands if event.struck_s <= command[0] <= until]
@@ -196,7 +197,7 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
         found |= {
             "rest_ms": 1e3 * (at_s - event.struck_s),
             "travelled_mm": 1e3 * way,
-            "commanded_mm": 1e3 * _commanded(told),
+            "commanded_mm": 1e3 * _commanded(told, cell.settings),
             "speed_at_the_end_m_per_s": float(mine[-1, 4]),
             "moves_again_ms": 1e3 * (event.moving_s - event.mended_s),
         }
@@ -212,11 +213,11 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
     return found
 
 
-def _commanded(told: list[Command]) -> float:
+def _commanded(told: list[Command], settings: Settings) -> float:
     """How far the commands led the tool [m]."""
     if len(told) < 2:
         return 0.0
-    arm = Arm(Settings(), robot_description(Settings()))
+    arm = Arm(settings, robot_description(settings))
     places = np.array([arm.at(np.array(cdr.decode_joints(payload).position)).position for _, _, payload in told])
     return way_to_rest(np.arange(len(places), dtype=np.float64), places)[1]
 
@@ -247,8 +248,10 @@ class Suffered:
     unasked: int = 0
 
 
-def suffered(names: Sequence[str], say: Callable[[str], None] = lambda line: None) -> Suffered:
-    """What came of some faults, each struck once.
+def suffered(
+    names: Sequence[str], say: Callable[[str], None] = lambda line: None, settings: Settings | None = None
+) -> Suffered:
+    """What came of some faults, each struck once, in a cell of some settings.
 
     Raises FaultError, LaunchError and PartError.
     """
@@ -261,7 +264,7 @@ def suffered(names: Sequence[str], say: Callable[[str], None] = lambda line: Non
                 say("disk full: mounting a small disk is not allowed here, left out")
             try:
                 if mine:
-                    _suffer(result, mine, folder, say, network=network)
+                    _suffer(result, mine, FaultyCell(folder, network=network, settings=settings), say)
             except PartError as error:
                 if network != "link":
                     raise
@@ -269,12 +272,10 @@ def suffered(names: Sequence[str], say: Callable[[str], None] = lambda line: Non
     return result
 
 
-def _suffer(
-    result: Suffered, names: Sequence[str], folder: Path, say: Callable[[str], None], *, network: Network
-) -> None:
-    """What came of some faults in one cell."""
+def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Callable[[str], None]) -> None:
+    """What came of some faults in one cell, which runs meanwhile."""
     events: list[Event] = []
-    with FaultyCell(folder, network=network) as cell:
+    with cell:
         for name in names:
             say(name)
             events.append(cell.suffer(name, FAULTS[name]))
@@ -308,7 +309,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The figures of every fault, or of a few where less than the full size is wanted."""
-    came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say)
+    came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say, cell_of(options.arm))
     print(table(came.figures), flush=True)
     _draw(results, came)
     return {

@@ -1,5 +1,5 @@
 """The closed loop in process, faster than real time: the service's core and its own loop, driven
-tick by tick with the PyBullet bench.
+tick by tick with the bench.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from sim.closed_loop import ClosedLoop
 from sim.scene import Scene
 from sim.script import Array, HandScript
 from sim.teach import demonstrations
+from sim.world import World
 
 TREMOR_M, NOISE_M = 0.0015, 0.0005  # of the hands and of the tracker, each axis
 
@@ -53,14 +54,17 @@ def rehearse(
     skill_for: Callable[[Bench], Skill],
     *,
     rate_hz: int = 500,
+    settings: Settings | None = None,
+    world: type[World] | None = None,
     keep: bool = False,
     look: Callable[[Bench], None] = lambda bench: None,
 ) -> Rehearsed:
     """One run of a script through core and physics.
 
-    `look` is shown the bench after each tick; `keep` keeps what was seen.
+    `settings` say which arm (or else the shipped one), `world` by which physics (or else the
+    first installed). `look` is shown the bench after each tick; `keep` keeps what was seen.
     """
-    settings = msgspec.structs.replace(Settings(), rate_hz=rate_hz)
+    settings = msgspec.structs.replace(settings or Settings(), rate_hz=rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
@@ -68,7 +72,7 @@ def rehearse(
     tool: list[tuple[float, ...]] = []
     axes: list[tuple[float, float, float]] = []
     held = 0
-    with Bench(script, rate_hz=rate_hz) as bench:
+    with Bench(script, settings=settings, world=world, rate_hz=rate_hz) as bench:
 
         def tap(_: Tick, frame: Frame) -> None:
             nonlocal held

@@ -150,6 +150,8 @@ def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch
         (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
         (1, "/proc/x: No such file or directory", ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0")),
         (2, "COMMAND", ()),
+        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("demo", "--arm", "panda")),
+        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("sim", "--arm", "panda")),
     ],
 )
 def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, ...], tmp_path: Path) -> None:
@@ -171,8 +173,6 @@ def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
 def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
-    if command == ("sim",):
-        pytest.importorskip("pybullet", reason="the bench needs PyBullet")
     arguments = [sys.executable, "-m", "service", *command, *NOBODY]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stderr is not None
@@ -183,7 +183,6 @@ def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tupl
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:
-    pytest.importorskip("pybullet", reason="the bench needs PyBullet")
     command = [sys.executable, "-m", "service", "sim", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 0)):
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:

@@ -64,8 +64,6 @@ def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
     [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],
 )
 def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
-    if name == "demo":
-        pytest.importorskip("pybullet", reason="the demo needs its bench")
     (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
     arguments = {
         "serve": ["--config", str(tmp_path / "cell.toml"), "--connect", nobody],
@@ -108,7 +106,6 @@ def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Pat
 
 
 def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="the demo needs its bench")
     said = tmp_path / "said"
     process = begun(["demo", "--output", str(tmp_path / "demo")], said)
     wait_for(lambda: "service at" in said.read_text(), 100)

@@ -16,6 +16,7 @@ from service import palette
 from service.cli.main import main
 from service.config import Settings
 from service.core.frame import blank
+from service.launch import ENGINES
 from service.recording.recording import Recorder, Recording
 from service.report.page import thinned
 from support.paths import RECORDINGS, ROOT
@@ -133,8 +134,10 @@ def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_
 def test_without_its_library_the_bench_says_so_in_one_line(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "pybullet", None)
+    for engine in ENGINES:
+        monkeypatch.setitem(sys.modules, engine, None)
     assert main(arguments) == 1
     [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"thirdhand {arguments[0]}: the bench needs PyBullet, which is not installed: pip install")
+    said = "the bench needs PyBullet or MuJoCo, none of which is installed: pip install"
+    assert line.startswith(f"thirdhand {arguments[0]}: {said}")
     assert not Path("nowhere").exists()

@@ -21,14 +21,15 @@ import pytest
 import zenoh
 
 from service.client import endpoints, open_session
-from service.config import WAM
+from service.config import WAM, Settings
 from service.contract import cdr, channels, messages
 from service.core.skill.pose import CLOSED, OPEN
 from service.learning.learn import learn
 from service.learning.via_points import adapted
 from sim.bench import Bench, Observation
 from sim.experiments.rehearsal import rehearse
-from sim.network import Commands, Dropout, Live, RunReport, run
+from sim.network import BenchError, Commands, Dropout, Live, RunReport, run
+from sim.observed_world import ObservedWorld
 from sim.scene import Scene
 from sim.script import GRIP_S, HandScript, Teacher
 from sim.teach import demonstrations
@@ -280,6 +281,44 @@ def test_the_bench_says_so_when_no_command_comes(network: tuple[zenoh.Session, s
     assert result.returncode == 1
     assert "no command on thirdhand/joints/command within 0.2 s" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_an_arm_elsewhere_is_scored_by_its_joint_states(network: tuple[zenoh.Session, str]) -> None:
+    """It stands where the board is offered: that is met, and nothing else."""
+    listening, endpoint = network
+    follower = Follower(Settings().arm.posture)
+    for _ in range(1000):
+        joints, _ = follower.command(SCENE.offer)
+    state = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, joints, STILL))
+    own, told, over = listening.declare_publisher("lab/joints/state"), list[str](), threading.Event()
+    heard = [
+        listening.declare_subscriber(f"lab/{key}", lambda sample: told.append(str(sample.key_expr)))
+        for key in ("joints/state", "hands/left", "objects")
+    ]
+
+    def tell() -> None:
+        while not over.wait(0.01):
+            own.put(state)
+
+    Service(listening, "lab")
+    reports: list[RunReport] = []
+    script, arm = HandScript(SCENE, seed=1, speed=20.0), threading.Thread(target=tell)
+    with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
+        with pytest.raises(BenchError, match="no arm tells its joints on lab/joints/state"):
+            run(bench, session, Live(cell="lab", wait_s=0.1), stop=threading.Event(), report=reports.append)
+        assert set(told) == {"lab/hands/left", "lab/objects"}
+        arm.start()
+        try:
+            run(bench, session, Live(cell="lab", once=True), stop=threading.Event(), report=reports.append)
+        finally:
+            over.set()
+            arm.join()
+    (report,) = reports
+    assert len(heard) == 3
+    assert report.events.handover.reached
+    assert report.events.handover.error_mm < 30.0
+    assert not report.events.grasp.reached
+    assert not report.events.carry.reached
 
 
 def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(

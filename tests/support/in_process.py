@@ -1,4 +1,4 @@
-"""Sessions in process: the core, driven tick by tick by the PyBullet bench or by hands alone,
+"""Sessions in process: the core, driven tick by tick by the bench or by hands alone,
 faster than real time.
 """
 

@@ -1,0 +1,60 @@
+"""The arm's URDF as the engines read it."""
+
+from __future__ import annotations
+
+import math
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from service.config import Settings, robot_description
+from service.core.separation.body import body_of
+from service.urdf import Urdf
+
+NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+SHORTEST = 1e-3  # [m] of a capsule's axis; without one it is a sphere
+
+
+def simulated(settings: Settings, **compiler: str) -> str:
+    """The arm's URDF, in which what is no joint of the chain is fixed.
+
+    An arm of meshes, whose files no engine would find, is of the capsules by which the service
+    keeps its distances. `compiler` are settings of MuJoCo's.
+    """
+    text, names = robot_description(settings), settings.joints.names
+    robot, urdf = ElementTree.fromstring(text), Urdf(text)
+    for joint in robot.findall("joint"):
+        if joint.get("name") not in names:
+            joint.set("type", "fixed")
+    links = {link.get("name"): link for link in robot.findall("link")}
+    for link in links.values():
+        if link.find("inertial") is None:  # a frame only; PyBullet would give it 1 kg
+            inertial = SubElement(link, "inertial")
+            SubElement(inertial, "mass", value="0")
+            SubElement(inertial, "inertia", NO_INERTIA)
+    if robot.find(".//mesh") is not None:
+        for link in links.values():
+            for shape in [*link.findall("visual"), *link.findall("collision")]:
+                link.remove(shape)
+        moved = {joint.name: joint.child for joint in urdf.joints}
+        for capsule in body_of(settings, text).capsules:
+            number = int(capsule["link"])
+            link = links[moved[names[number - 1]] if number else urdf.root]
+            _cover(link, capsule["ends"].tolist(), float(capsule["radius"]))
+    if compiler:
+        SubElement(SubElement(robot, "mujoco"), "compiler", compiler)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _cover(link: Element, ends: list[list[float]], radius: float) -> None:
+    """Gives a link a capsule between two ends [m], to be seen and to touch."""
+    start, end = ends
+    (x, y, z), middle = (end[i] - start[i] for i in range(3)), [(start[i] + end[i]) / 2 for i in range(3)]
+    for use in ("visual", "collision"):
+        shape = SubElement(link, use)
+        turn = f"0 {math.atan2(math.hypot(x, y), z)} {math.atan2(y, x)}"
+        SubElement(shape, "origin", xyz=" ".join(map(str, middle)), rpy=turn)
+        length = math.hypot(x, y, z)
+        long = length > SHORTEST
+        made = SubElement(SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius))
+        if long:
+            made.set("length", str(length))

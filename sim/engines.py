@@ -1,0 +1,17 @@
+"""Which physics the bench runs on: those that are installed, PyBullet before MuJoCo."""
+
+from __future__ import annotations
+
+from service.launch import engine_of
+from sim.world import World
+
+
+def world_of(engine: str | None = None) -> type[World]:
+    """The world of an engine, or of the first that is installed. Raises LaunchError."""
+    if engine_of(engine) == "pybullet":
+        from sim.pybullet_world import PyBulletWorld
+
+        return PyBulletWorld
+    from sim.mujoco_world import MujocoWorld
+
+    return MujocoWorld

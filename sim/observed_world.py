@@ -1,0 +1,78 @@
+"""The world of an arm that is elsewhere, real or simulated by others: it is where its joint states
+tell. Only hands and things are here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from service.config import Settings, robot_description
+from service.contract import cdr, messages
+from service.core.arm.arm import Arm
+from service.core.geometry import between_segments, place, quaternion_of
+from service.core.separation.body import body_of
+from sim.world import LEVEL, Body, Floats, Pose, World, carried_by
+
+
+class ObservedWorld(World):
+    """The bench's world around an arm that is observed: what steps and moves it is elsewhere."""
+
+    heard = False  # of the arm
+
+    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+        self._names = settings.joints.names
+        description = robot_description(settings)
+        self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies
+        self._newest: tuple[Floats, Floats] = posture, (0.0,) * len(posture)
+
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Keep one joint state; what is none is let pass, as the service tells. In any thread."""
+        try:
+            state = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), self._names)
+        except messages.WireError:
+            return
+        if messages.finite(state[0] + state[1]):
+            self._newest, self.heard = state, True
+
+    def follow(self, position: Floats, velocity: Floats) -> None:
+        """Nothing: the arm follows commands itself."""
+
+    def step(self) -> None:
+        """Nothing: time passes by itself."""
+
+    def joints(self) -> tuple[Floats, Floats]:
+        """Position [rad] and velocity [rad/s] of the joints in chain order."""
+        return self._newest
+
+    def tool(self) -> tuple[Pose, Floats]:
+        """The tool's pose and velocity [m/s]."""
+        position, velocity = self._newest
+        here, turn = self._arm.at(np.array(position)), np.empty(4)
+        quaternion_of(here.rotation, turn)
+        x, y, z, w = turn.tolist()
+        speed = here.jacobian[:3] @ velocity
+        return Pose(tuple(here.position.tolist()), (x, y, z, w)), tuple(speed.tolist())
+
+    def _place(self, body: str, pose: Pose) -> None:
+        """Nothing more than to know it."""
+
+    def clearance(self, body: str, *, within: float = 2.0) -> float:
+        """Smallest distance between the arm's capsules and a hand [m]; `within` when there is
+        more.
+        """
+        capsules, near = self._body.capsules, np.empty(9)
+        placed = np.empty((len(capsules), 2, 3))
+        place(np.array(self._newest[0]), self._body.frames, self._body.axes, capsules, placed)
+        at, look = self.pose(body), self._bodies[body].look
+        hand = np.array([at.position, carried_by(at, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position])
+        apart = [between_segments(one, hand, near) for one in placed] - capsules["radius"]
+        return min(within, float(apart.min()) - look.size[0] / 2)
+
+    def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
+        raise NotImplementedError("there is no engine that draws; thirdhand view live shows the cell")
+
+    def close(self) -> None:
+        """Nothing is held."""

@@ -1,0 +1,251 @@
+"""Any arm at the bench: the shipped cells do the soldering task, their descriptions are those that
+others publish, and an arm that is elsewhere is scored by its joint states.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import struct
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+
+from service.config import Box, Obstacles, Reach, Settings, parse, robot_description
+from service.contract import cdr, messages
+from service.contract.records import Mode
+from service.core.geometry import rotation
+from service.core.separation.body import body_of
+from service.described_arm import UnreadableError
+from service.launch import ENGINES, described
+from service.learning.via_points import adapted
+from service.shipped import ARMS, cell_of, shipped_skill
+from service.urdf import Urdf
+from sim.bench import Bench
+from sim.engines import world_of
+from sim.experiments.rehearsal import rehearse
+from sim.observed_world import ObservedWorld
+from sim.scene import Scene, SceneError
+from sim.script import HandScript
+from support import arms
+
+SCENE = Scene()
+# The maker's limits of an FR3's joint velocity at a position q [rad/s]: the least of `flat` and
+# sqrt(slope (end - q)) - off toward its upper end, likewise toward the lower one.
+FLAT = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
+SLOPE = np.array([12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0])
+OFF = np.array([0.3, 0.2, 0.2, 0.3, 0.35, 0.35, 0.35])
+LOWEST = np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196])
+HIGHEST = np.array([2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196])
+
+
+def fr3_velocities(q: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The lowest and highest velocity at positions (..., 7) that an FR3 accepts."""
+    high = np.minimum(FLAT, np.sqrt(np.maximum(SLOPE * (HIGHEST - q), 0.0)) - OFF)
+    low = np.maximum(-FLAT, OFF - np.sqrt(np.maximum(SLOPE * (q - LOWEST), 0.0)))
+    return low, high
+
+
+@pytest.mark.parametrize("arm", ["franka", "ur5"])
+def test_a_shipped_arm_does_the_task_within_its_limits_and_away_from_the_hands(arm: str) -> None:
+    cell, near = cell_of(arm), []
+    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
+
+    def look(bench: Bench) -> None:
+        if bench.tick % 10 == 0:
+            near.append(min(bench.world.clearance(bench.world.left), bench.world.clearance(bench.world.right)))
+
+    run = rehearse(HandScript(SCENE, seed=1), lambda _: taught, settings=cell, rate_hz=100, keep=True, look=look)
+    assert run.events.success
+    assert max(run.errors_mm) <= 3.0, run.errors_mm
+    frames, limits = run.frames, cell.joints
+    assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
+    assert (run.joints[:, 0] >= np.array(limits.lower) - 1e-3).all()
+    assert (run.joints[:, 0] <= np.array(limits.upper) + 1e-3).all()
+    assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
+    assert (np.abs(frames["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
+    assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 2e-3
+    assert min(near) > 0.01
+    if arm == "franka":
+        low, high = fr3_velocities(frames["joints"])
+        assert (frames["joint_velocities"] >= low).all()
+        assert (frames["joint_velocities"] <= high).all()
+
+
+def test_the_franka_cell_keeps_the_makers_velocity_limits_everywhere() -> None:
+    """Who can stop before an end at `upper` with `acceleration` is at most so fast there."""
+    limits = cell_of("franka").joints
+    lower, upper, acceleration = (np.array(getattr(limits, name)) for name in ("lower", "upper", "acceleration"))
+    assert (acceleration <= 10.0).all()
+    assert max(limits.jerk) <= 5000
+    for share in np.linspace(0.0, 1.0, 1001)[:, None]:
+        q = lower + share * (upper - lower)
+        fastest = np.minimum(limits.velocity, np.sqrt(2 * acceleration * (upper - q)))
+        slowest = -np.minimum(limits.velocity, np.sqrt(2 * acceleration * (q - lower)))
+        low, high = fr3_velocities(q)
+        assert (fastest <= high).all(), (q, fastest, high)
+        assert (slowest >= low).all(), (q, slowest, low)
+
+
+# --- descriptions ---------------------------------------------------------------------------------
+
+
+def published(name: str) -> Path:
+    """A file of `example-robot-data`; who asks is skipped where that is not installed."""
+    try:
+        return next(Path(str(one.locate())) for one in files("example-robot-data") or () if str(one).endswith(name))
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data, whose descriptions ours are compared with, is not installed")
+
+
+def tips(text: str, names: tuple[str, ...], tip: str, postures: npt.NDArray[np.float64]) -> list[pin.SE3]:
+    """Where a link is in postures (N, J) of some joints; others are at 0."""
+    model = pin.buildModelFromXML(text)
+    data, frame, placed = model.createData(), model.getFrameId(tip), []
+    for posture in postures:
+        q = pin.neutral(model)
+        for name, angle in zip(names, posture, strict=True):
+            q[model.joints[model.getJointId(name)].idx_q] = angle
+        pin.framesForwardKinematics(model, data, q)
+        placed.append(data.oMf[frame].copy())
+    return placed
+
+
+@pytest.mark.parametrize(
+    ("arm", "file", "theirs", "tip", "stand"),
+    [
+        ("franka", "panda.urdf", tuple(f"panda_joint{i}" for i in range(1, 8)), "panda_hand_tcp", (-0.15, 0, 0)),
+        ("ur5", "ur5_robot.urdf", (), "tool0", (0, 0, 0)),
+    ],
+)
+def test_a_shipped_arm_moves_as_the_one_that_others_describe(
+    arm: str, file: str, theirs: tuple[str, ...], tip: str, stand: tuple[float, float, float]
+) -> None:
+    cell = cell_of(arm)
+    names = cell.joints.names
+    postures = np.random.default_rng(0).uniform(cell.joints.lower, cell.joints.upper, (20, len(names)))
+    ours = tips(robot_description(cell), names, cell.arm.plate, postures)
+    for one, other in zip(ours, tips(published(file).read_text(), theirs or names, tip, postures), strict=True):
+        np.testing.assert_allclose(one.translation, other.translation + stand, atol=1e-4)
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-4)
+
+
+FR3_MESHES = {f"fr3_link{i}": f"panda_description/meshes/collision/link{i}.stl" for i in range(8)}
+UR5_LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+UR5_MESHES = {f"{one}_link": f"ur5/collision/{one.replace('_', '')}.stl" for one in UR5_LINKS}
+
+
+@pytest.mark.parametrize(
+    ("arm", "meshes"),
+    [("franka", FR3_MESHES | {"fr3_hand": "panda_description/meshes/collision/hand.stl"}), ("ur5", UR5_MESHES)],
+)
+def test_a_shipped_arms_capsules_cover_the_meshes_that_others_publish(arm: str, meshes: dict[str, str]) -> None:
+    cell = cell_of(arm)
+    text = robot_description(cell)
+    urdf = Urdf(text)
+    for link, file in meshes.items():
+        data = published(file).read_bytes()
+        triangles = np.frombuffer(data[84:], np.dtype("3<f4, 9<f4, <u2"), struct.unpack("<I", data[80:84])[0])
+        alone = [shape for shape in urdf.shapes if shape.link == link]
+        points, beyond = triangles["f1"].reshape(-1, 3), np.inf
+        for shape in alone:  # a cylinder's; the capsules that the service keeps apart are larger
+            local = (points - shape.translation) @ rotation(shape.rotation)
+            sides = np.column_stack((np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])))
+            beyond = np.minimum(beyond, np.hypot(*np.maximum(sides - (shape.size[0], shape.size[1] / 2), 0.0).T))
+        assert np.max(beyond) < 0.008, f"{link}: {1000 * np.max(beyond):.1f} mm"
+    assert len(body_of(cell, text).capsules) == len(urdf.shapes)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_arm_of_meshes_is_simulated_by_its_capsules(engine: str) -> None:
+    if importlib.util.find_spec(engine) is None:
+        pytest.skip(f"{ENGINES[engine]} is not installed")
+    published("panda.urdf")
+    cell = arms.cell_of("panda")
+    with Bench(HandScript(SCENE, seed=1), settings=cell, world=world_of(engine)) as bench:
+        start = bench.observe()
+        for _ in range(50):
+            seen = bench.step()
+        assert seen.joints == pytest.approx(start.joints, abs=1e-3)
+        assert seen.tool.position == pytest.approx(SCENE.robot_start, abs=0.03)
+        assert 0.2 < bench.world.clearance(bench.world.left) < 0.8
+
+
+# --- cells ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_what_is_told_of_a_cell_is_read_as_it_was(arm: str) -> None:
+    boxes = (Box(centre=(0.5, 0.6, 0.1), half_size=(0.1, 0.1, 0.1)),)
+    cell = msgspec.structs.replace(cell_of(arm), obstacles=Obstacles(boxes=boxes))
+    assert parse(described(cell), origin="cell.toml") == cell
+    assert described(Settings()) == ""
+
+
+def test_an_unknown_arm_is_refused_with_those_that_are_known() -> None:
+    with pytest.raises(UnreadableError, match=re.escape("no arm 'frank': wam, franka, ur5, or a cell's settings")):
+        cell_of("frank")
+    with pytest.raises(UnreadableError, match=r"cannot read configuration nowhere\.toml"):
+        cell_of("nowhere.toml")
+
+
+def test_places_out_of_reach_are_moved_into_it_and_said() -> None:
+    for arm in ARMS:
+        assert SCENE.in_reach(cell_of(arm).reach) == (SCENE, ())
+    short = Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.6)
+    moved, said = SCENE.in_reach(short)
+    assert said == ("handover moved by 2 cm into the arm's reach", "glass moved by 5 cm into the arm's reach",
+                    "soldering moved by 3 cm into the arm's reach")  # fmt: skip
+    for tool in (moved.offer, moved.glass, moved.carry):
+        assert np.linalg.norm(np.subtract(tool, short.centre)) <= short.outer
+    assert moved.robot_start == SCENE.robot_start
+    with pytest.raises(SceneError, match=r"out of the arm's reach: handover: .* lies 0.176 m from the nominal"):
+        SCENE.in_reach(Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.45))
+
+
+# --- an arm that is elsewhere ---------------------------------------------------------------------
+
+
+class _Sample:
+    def __init__(self, state: messages.JointState) -> None:
+        self.payload, self._bytes = self, cdr.encode_joints(state)
+
+    def to_bytes(self) -> bytes:
+        return self._bytes
+
+
+def test_an_arm_elsewhere_is_where_its_joint_states_tell() -> None:
+    tool = msgspec.structs.replace(Settings().tool, plate_from_tool=(0.02, 0.0, 0.1, 0.0, 0.0, 0.6, 0.8))
+    cell = msgspec.structs.replace(cell_of("franka"), tool=tool)
+    script = HandScript(SCENE, seed=1)
+    with Bench(script, settings=cell) as simulated, Bench(script, settings=cell, world=ObservedWorld) as observed:
+        speed = np.array([0.5, 0.2, -0.3, 0.2, 0.1, -0.2, 0.4])
+        at = np.array(cell.arm.posture)
+        for _ in range(100):
+            at = at + 0.002 * speed
+            seen = simulated.step(tuple(at), tuple(speed))
+        names = cell.joints.names[::-1]
+        state = messages.JointState(1, names, seen.joints[::-1], seen.joint_velocities[::-1])
+        observed.world.receive(_Sample(state))  # type: ignore[attr-defined]
+        again = observed.step()
+        assert again.tool.position == pytest.approx(seen.tool.position, abs=1e-5)
+        assert again.tool_velocity == pytest.approx(seen.tool_velocity, abs=1e-2)
+        turned = np.abs(np.dot(again.tool.orientation, seen.tool.orientation))
+        assert turned == pytest.approx(1.0, abs=1e-6)
+        for wrong in (names[1:], ("other",) * 7):
+            spoilt = messages.JointState(2, wrong, (0.0,) * len(wrong), ())
+            observed.world.receive(_Sample(spoilt))  # type: ignore[attr-defined]
+        assert observed.step().joints == seen.joints
+
+
+def test_an_arm_elsewhere_is_about_as_far_from_the_hands_as_one_that_is_simulated() -> None:
+    script, cell = HandScript(SCENE, seed=1), cell_of("franka")
+    with Bench(script, settings=cell) as simulated, Bench(script, settings=cell, world=ObservedWorld) as observed:
+        for side in (simulated.world.left, simulated.world.right):
+            apart = observed.world.clearance(side) - simulated.world.clearance(side)
+            assert -0.02 < apart < 0.001  # capsules are larger than what they cover

@@ -1,0 +1,131 @@
+"""One bench, two engines: the same scene with the same scores, whichever is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from service.launch import ENGINES, LaunchError, engine_of
+from service.learning.via_points import adapted
+from service.shipped import shipped_skill
+from sim.bench import Bench
+from sim.engines import world_of
+from sim.experiments.rehearsal import Rehearsed, rehearse
+from sim.scene import Scene
+from sim.script import HandScript
+from sim.world import LEVEL, Pose, carried_by, pixels, seen_from
+
+SCENE = Scene()
+EYE, TARGET, SIZE = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31), (160, 120)
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    if importlib.util.find_spec(request.param) is None:
+        pytest.skip(f"{ENGINES[request.param]} is not installed")
+    return str(request.param)
+
+
+@pytest.fixture
+def bench(engine: str) -> Iterator[Bench]:
+    with Bench(HandScript(SCENE, seed=1), world=world_of(engine)) as built:
+        yield built
+
+
+def played(engine: str) -> Rehearsed:
+    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
+    return rehearse(HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True)
+
+
+def test_both_engines_give_the_same_scores_and_the_arm_goes_the_same_way() -> None:
+    if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
+        pytest.skip(f"{ENGINES[missing[0]]} is not installed")
+    one, other = (played(name) for name in ENGINES)
+    assert one.events.success
+    assert other.events.success
+    assert max(*one.errors_mm, *other.errors_mm) < 3.0
+    assert np.abs(np.subtract(one.errors_mm, other.errors_mm)).max() < 0.1, (one.errors_mm, other.errors_mm)
+    apart_mm = 1000 * np.linalg.norm(one.tool - other.tool, axis=1)
+    assert 0.0 < apart_mm.max() < 1.0, f"{apart_mm.max():.3f} mm"
+
+
+def test_the_arm_follows_moving_commands(bench: Bench) -> None:
+    start, wrong = np.array(bench.observe().joints), []
+    for tick in range(500):
+        t = 0.002 * tick
+        position, velocity = start + 0.2 * (1 - np.cos(2 * t)), np.full(7, 0.4 * np.sin(2 * t))
+        seen = bench.step(tuple(position), tuple(velocity))
+        wrong.append(np.abs(np.array(seen.joints) - position - 0.002 * velocity).max())
+    assert max(wrong) < 1e-4  # [rad]
+
+
+def test_motors_are_no_stronger_than_the_description_says(bench: Bench) -> None:
+    start = np.array(bench.observe().joints)
+    for _ in range(20):  # no motor of 60 N m turns the stretched arm so fast within 40 ms
+        bench.world.follow(tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5))
+        bench.world.step()
+    turned = np.array(bench.world.joints()[1])
+    assert turned[1] == pytest.approx(-1.76, abs=0.05)  # [rad/s] of 100 wanted
+    assert np.abs(np.delete(turned, 1)).max() < 0.05  # what is strong enough holds against it
+
+
+def test_only_the_table_stops_the_arm(bench: Bench) -> None:
+    world = bench.world
+    tool = world.tool()[0].position
+    world.put(world.left, Pose(tool, LEVEL))  # a hand where the tool is pushes nothing
+    start = world.joints()[0]
+    for _ in range(50):
+        world.step()
+    assert world.clearance(world.left) < 0
+    assert world.joints()[0] == pytest.approx(start, abs=1e-3)
+    down = np.array(start)
+    for _ in range(1500):  # forward and down, into the table
+        down = down + 0.002 * np.array([0, 0.6, 0, 0, 0, 0, 0])
+        world.follow(tuple(down), (0.0,) * 7)
+        world.step()
+    assert world.joints()[0][1] < down[1] - 0.5
+    assert world.tool()[0].position[2] > -0.05  # before the table's edge, on which the forearm lies
+
+
+def test_a_hand_is_as_far_from_the_arm_as_its_shape_says(bench: Bench) -> None:
+    world = bench.world
+    assert world.clearance(world.left) == pytest.approx(0.603, abs=2e-3)
+    assert world.clearance(world.left, within=0.3) == pytest.approx(0.3)
+    x, y, z = world.tool()[0].position
+    world.put(world.left, Pose((x + 0.3, y, z - 0.3), LEVEL))  # it reaches back to the arm
+    assert world.clearance(world.left) < 0.3
+
+
+def test_pictures_show_what_is_there(bench: Bench) -> None:
+    try:
+        colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
+    except (ImportError, RuntimeError) as error:
+        pytest.skip(f"pictures of this engine need GL: {error}")
+    (across, down), *_ = pixels(np.array([np.add(SCENE.solder, (0, 0, 0.015))]), matrix, SIZE)
+    assert colours.shape == (120, 160, 3)
+    assert (colours[0, 0] == 255).all()  # the sky
+    red, _, blue = colours[round(down), round(across)].astype(int)
+    assert abs(red - blue) < 40  # grey: it stands on wood
+    (across, down), *_ = pixels(np.array([(1.0, -0.1, 0.0)]), matrix, SIZE)
+    red, _, blue = colours[round(down), round(across)].astype(int)
+    assert red - blue > 40
+
+
+def test_what_is_carried_keeps_its_place_in_the_hand() -> None:
+    turn = (0.5, 0.5, 0.5, 0.5)
+    holder, thing = Pose((0.1, 0.2, 0.3), turn), Pose((0.4, 0.2, 0.3), LEVEL)
+    grip = seen_from(holder, thing)
+    assert grip.position == pytest.approx((0.0, 0.0, 0.3))
+    again = carried_by(holder, grip)
+    assert again.position == pytest.approx(thing.position)
+    assert again.orientation == pytest.approx(thing.orientation)
+
+
+def test_an_engine_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
+    assert engine_of() == "msgspec"
+    with pytest.raises(LaunchError, match="needs NoneSuch, which is not installed"):
+        engine_of("none_such")
