@@ -4,12 +4,7 @@ publishes, whatever comes; and it is where it is told to be.
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
 import math
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,59 +15,13 @@ from service.arms import franka
 from service.arms.drive import DriveError
 from service.arms.playback import Playback
 from service.client import Command
-from service.config import JointSettings, Settings, parse, robot_description
+from service.config import JointSettings, Settings, robot_description
 from service.core.arm.arm import Arm
 from service.core.limiter.limiter import Limiter
-from support.paths import ROOT
+from support.franka_cell import STANDS, assert_allowed, cell, fr3, robot, simulated
 
 TICK, PERIOD = 0.002, franka.PERIOD_S  # [s]
-STANDS = np.array((0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785))  # where franky-sim begins
-ACCELERATION, JERK = 10.0, 5000.0  # as published
 Vector = npt.NDArray[np.float64]
-simulated = pytest.mark.skipif(
-    importlib.util.find_spec("franky_sim") is None or importlib.util.find_spec("pylibfranka") is None,
-    reason="franky-sim or pylibfranka is not installed: pip install franky-sim 'thirdhand[franka]'",
-)
-
-
-def fr3() -> JointSettings:
-    return JointSettings(
-        names=tuple(f"fr3_joint{i}" for i in range(1, 8)),
-        lower=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
-        upper=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
-        velocity=(1.5,) * 7,
-        acceleration=(6.0,) * 7,
-        jerk=(500.0,) * 7,
-    )
-
-
-def allowed(joints: Vector) -> tuple[Vector, Vector]:
-    """Least and greatest velocities at joints (N, 7), as published for the Franka Research 3."""
-    most = []
-    for q, sign in ((joints, 1.0), (-joints, -1.0)):
-        ends = np.array(
-            (
-                (2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196),
-                (2.7501, 1.7918, 2.9065, 3.0481, 2.8101, -0.54092, 3.0196),
-            )
-        )[0 if sign > 0 else 1]
-        offset = np.array((0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35))
-        falls = np.array((12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0))
-        fast = np.array((2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26))
-        most.append(np.clip(np.sqrt(falls * np.maximum(ends - q, 0.0)) - offset, 0.0, fast))
-    return -most[1], most[0]
-
-
-def assert_allowed(velocity: Vector, joints: Vector) -> None:
-    """Velocities (N, 7) written each millisecond from rest, with the arm at these joints (N, 7)."""
-    acceleration = np.diff(velocity, axis=0, prepend=0.0) / PERIOD
-    jerk = np.diff(acceleration, axis=0, prepend=0.0) / PERIOD
-    least, most = allowed(joints)
-    assert np.isfinite(velocity).all()
-    assert (velocity <= most).all()
-    assert (velocity >= least).all()
-    assert np.abs(acceleration).max() <= ACCELERATION
-    assert np.abs(jerk).max() <= JERK
 
 
 def motion(wanted: Vector) -> list[Command]:
@@ -108,63 +57,6 @@ def test_toward_its_ends_each_joint_is_slower_as_the_robot_asks(way: float, lost
     assert np.abs(np.array(velocity)).max() > 1.4
 
 
-# --- the robot -----------------------------------------------------------------------------------
-
-
-class Robot:
-    """A simulated robot at an address; once it is ended, what it was told."""
-
-    def __init__(self, address: str, file: Path) -> None:
-        self.address, self._file = address, file
-        self.new = self.velocity = self.joints = np.empty(0)
-
-    def load(self) -> None:
-        with np.load(self._file) as cycles:
-            self.new, self.velocity, self.joints = cycles["new"], cycles["velocity"], cycles["joints"]
-
-
-@contextlib.contextmanager
-def robot(tmp_path: Path, *options: str) -> Iterator[Robot]:
-    """Within it there is a robot."""
-    script, file = ROOT / "tests" / "support" / "franka_robot.py", tmp_path / "cycles.npz"
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(file), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    found = Robot(process.stdout.readline().strip(), file)
-    try:
-        yield found
-    finally:
-        process.stdin.close()
-        process.wait(20)
-        process.stdout.close()
-    found.load()
-
-
-def cell() -> Settings:
-    """A cell with the arm that franky-sim simulates."""
-    found = importlib.util.find_spec("franky_sim")
-    assert found is not None
-    assert found.origin is not None
-    joints = fr3()
-    return parse(
-        f"""
-        [arm]
-        urdf = "{Path(found.origin).parent / "assets" / "fr3.urdf"}"
-        plate = "fr3_hand_tcp"
-        posture = {STANDS.tolist()}
-        [joints]
-        lower = {list(joints.lower)}
-        upper = {list(joints.upper)}
-        velocity = {list(joints.velocity)}
-        acceleration = {list(joints.acceleration)}
-        jerk = {list(joints.jerk)}
-        """,
-        origin="cell.toml",
-    )
-
-
 @simulated
 @pytest.mark.parametrize(("jitter_s", "lost", "rms_rad"), [(0.0, 0.0, 4e-3), (0.001, 0.0, 4e-3), (0.003, 0.05, 5.5e-3)])
 def test_it_follows_within_its_limits_where_it_is_told_to_be(
@@ -175,7 +67,7 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     late = np.where(rng.uniform(size=len(commands)) < lost, math.inf, rng.uniform(0.0, 1.0, len(commands)) * jitter_s)
     arriving = sorted(((i * TICK + late[i], command) for i, command in enumerate(commands)), key=lambda one: one[0])
     measured, passed_s, at = [], 0.0, 0
-    with robot(tmp_path, "--in-step") as there:
+    with robot(tmp_path, "--fast") as there:
         arm = franka.FrankaArm(cell(), there.address)
         playback = Playback(
             arm.limits, arm.stands_at(), tick_s=TICK, period_s=arm.period_s, speed_limits=arm.speed_limits

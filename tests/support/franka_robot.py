@@ -1,7 +1,8 @@
 """A Franka on a loopback address, by franky-sim, as a process of its own: what it was told each
 millisecond, and where its joints were, goes to a file once it is ended by its standard input.
 
-python tests/support/franka_robot.py FILE [--in-step]: then a millisecond lasts until it was told.
+python tests/support/franka_robot.py FILE [--fast]: as fast as it is led, else in real time. Each
+millisecond lasts until it was told, so that none is missed on a busy machine.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from franky_sim.mujoco_simulator import MujocoSimulator
 FIRST_S, NEXT_S = 0.002, 5.0  # that a command is waited for
 
 
-def main(path: str, *, in_step: bool) -> None:
+def main(path: str, *, fast: bool) -> None:
     """Runs until standard input ends."""
     cycles: list[tuple[bool, Any, Any]] = []
     told: list[tuple[Any, bool]] = []
@@ -45,7 +46,7 @@ def main(path: str, *, in_step: bool) -> None:
                 told.clear()
                 robots[0].process_commands()
                 patience = time.monotonic() + (NEXT_S if led else FIRST_S)
-                while in_step and told and not told[0][1] and time.monotonic() < patience and not ended.is_set():
+                while told and not told[0][1] and time.monotonic() < patience and not ended.is_set():
                     time.sleep(2e-5)
                     told.clear()
                     robots[0].process_commands()
@@ -55,11 +56,11 @@ def main(path: str, *, in_step: bool) -> None:
                 sim.step()
                 robots[0].send_state()
                 due = max(due + 0.001, time.monotonic() - 0.02)
-                if not in_step or not led:
+                if not (fast and led):
                     time.sleep(max(due - time.monotonic(), 0.0))
     new, velocity, joints = (np.array([cycle[i] for cycle in cycles]) for i in range(3))
     np.savez(path, new=new, velocity=velocity, joints=joints)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], in_step="--in-step" in sys.argv)
+    main(sys.argv[1], fast="--fast" in sys.argv)
