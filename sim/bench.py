@@ -106,6 +106,7 @@ class Bench:
         self.period_s = 1.0 / rate_hz
         settings = Settings()
         self.joint_names, self._plate = settings.joints.names, settings.arm.plate
+        self.limits = settings.joints
         self.world = World(self.scene, settings, posture=posture or settings.arm.posture, rate_hz=rate_hz)
         self.tick = 0
         self._ticks_since_begin = 0
