@@ -118,6 +118,7 @@ class Bench:
         self.period_s = 1.0 / rate_hz
         settings = settings or Settings()
         self.joint_names, self._plate = settings.joints.names, settings.arm.plate
+        self.limits = settings.joints
         posture = posture or settings.arm.posture
         self.world = (world or world_of())(self.scene, settings, posture=posture, rate_hz=rate_hz)
         self.tick = 0

@@ -9,6 +9,7 @@ import math
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -17,6 +18,8 @@ import msgspec
 import numpy as np
 import zenoh
 
+from service.arms.playback import Playback
+from service.client import Command
 from service.contract import cdr, channels, messages, requests
 from service.daemon.clock import Deadlines
 from sim.bench import Bench, Observation, TaskEvent, TaskEvents
@@ -27,6 +30,7 @@ from sim.script import Array
 THINGS_HZ = 10
 STOP_S = 0.5  # between the last hands and the end
 QUIET_S = 1.0  # without a command, after which that is said
+MOST_QUEUED = 256  # commands, while the bench is held up
 
 
 class BenchError(RuntimeError):
@@ -82,6 +86,7 @@ class Commands:
         self._names = names
         self._lock = threading.Lock()
         self._newest: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self._queue: deque[Command] = deque(maxlen=MOST_QUEUED)
         self.last_error = ""
         self.restart()
 
@@ -108,6 +113,7 @@ class Commands:
             return
         with self._lock:
             self._newest = command
+            self._queue.append(Command(0, *command, *(attachment or (-1, 0, 0))))
             self.count += 1
             if self._last_ns:
                 self.largest_gap_ms = max(self.largest_gap_ms, (now - self._last_ns) / 1e6)
@@ -121,6 +127,29 @@ class Commands:
         with self._lock:
             newest, self._newest = self._newest, None
         return newest or (None, None)
+
+    def queued(self) -> list[Command]:
+        """All commands not yet taken this way, as they came: what a `Playback` takes."""
+        with self._lock:
+            queued = list(self._queue)
+            self._queue.clear()
+        return queued
+
+
+class Led:
+    """The bench's arm, led as `thirdhand follow` leads a real one."""
+
+    def __init__(self, bench: Bench, bridge: Bridge) -> None:
+        self._bench, self._bridge, self._period_s = bench, bridge, bench.period_s
+        limits, joints = bench.limits, bench.observe().joints
+        self._playback = Playback(limits, joints, tick_s=bench.period_s, period_s=bench.period_s)
+
+    def step(self, periods: int = 1) -> tuple[Observation, bool]:
+        """The bench a period later, of so many that passed, and whether commands came."""
+        commands = self._bridge.commands.queued()
+        moved = self._playback.step(commands, elapsed_s=periods * self._period_s)
+        position, velocity = tuple(moved.position.tolist()), tuple(moved.velocity.tolist())
+        return self._bench.step(position, velocity, gripper=self._bridge.gripper.newest), bool(commands)
 
 
 class Gripper:
@@ -236,7 +265,8 @@ def _play(
     rate_hz = round(1.0 / bench.period_s)
     hands_every = max(1, round(rate_hz / live.hands_hz))
     things_every = max(1, round(rate_hz / THINGS_HZ))
-    deadlines = Deadlines(rate_hz)
+    led = Led(bench, bridge)
+    deadlines, before = Deadlines(rate_hz), -1
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running, spoke_s, quiet = False, 0.0, False
     said = missed_before = sent_before = begun_ns = 0
@@ -244,13 +274,13 @@ def _play(
         f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
     )
     while not stop.is_set():
-        now_s = deadlines.wait()[0] * bench.period_s
+        index = deadlines.wait()[0]
+        now_s = index * bench.period_s
         if now_s >= live.duration_s:
             return
-        position, velocity = commands.take()
-        seen = bench.step(position, velocity, gripper=bridge.gripper.newest)
+        (seen, commanded), before = led.step(index - before), index
         bridge.publish_joints(seen)
-        if position is not None:
+        if commanded:
             if quiet:
                 say("commands come again")
             spoke_s, quiet = now_s, False
@@ -264,7 +294,7 @@ def _play(
             bridge.publish_things(bench)
 
         if ready_s is None:
-            if position is not None:
+            if commanded:
                 ready_s = now_s
                 say("commands come, the arm goes to where the hands want it")
             elif now_s > live.wait_s:
@@ -298,7 +328,7 @@ def _play(
                     )
                 )
                 if live.once:
-                    _let_stop(bench, bridge, deadlines)
+                    _let_stop(bench, bridge, led, deadlines)
                     return
                 say("the hands go back")
                 bench.turn_back()
@@ -307,11 +337,11 @@ def _play(
             ready_s = now_s
 
 
-def _let_stop(bench: Bench, bridge: Bridge, deadlines: Deadlines) -> None:
+def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> None:
     """Without hands the service stops the arm; one that vanished before that would be a fault."""
     for _ in range(round(STOP_S / bench.period_s)):
         deadlines.wait()
-        bridge.publish_joints(bench.step(*bridge.commands.take(), gripper=bridge.gripper.newest))
+        bridge.publish_joints(led.step()[0])
 
 
 def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun_ns: int) -> RunReport:

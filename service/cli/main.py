@@ -36,7 +36,7 @@ SIM = "The simulated bench: publishes hands and joint states, and follows comman
 ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
-    "run": ("demo", "serve", "sim", "play"),
+    "run": ("demo", "serve", "follow", "sim", "play"),
     "stop and go on": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
@@ -85,6 +85,17 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "--rate", "HZ", "of the loop", 500)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+
+    c = command(
+        "follow",
+        "The arm's side: drives an arm by the commands of a running cell, and brakes it where they end.",
+        "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
+    )
+    c.add_argument("arm", metavar="ARM", help="franka, or simulated: an ideal one, to try a cell without any")
+    option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
+    option(c, "--robot", "ADDRESS", "of a Franka: name or IP address", "172.16.0.2")
+    option(c, "--wait", "S", "for the daemon, and for its first command", 60.0)
+    _reach(c)
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
     option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))

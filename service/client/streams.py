@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from service.contract.messages import BASE, JointState, PoseStamped, Quaternion,
 from service.contract.records import SIDES
 
 BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
+MOST_COMMANDS = 256  # that a follower keeps until it is asked for them: half a second's at 500 Hz
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
@@ -114,7 +116,7 @@ class Follower(AbstractContextManager["Follower"]):
         self.rejected, self.reason = 0, ""
         self._names = tuple(names)
         self._came = threading.Condition()
-        self._newest: Command | None = None
+        self._queue: deque[Command] = deque(maxlen=MOST_COMMANDS)
         self._state = publisher(session, cell, "joints/state", express=True)
         self._subscriber = session.declare_subscriber(channels.key(cell, "joints/command"), self._take)
 
@@ -123,9 +125,16 @@ class Follower(AbstractContextManager["Follower"]):
         on which the arm has to brake.
         """
         with self._came:
-            self._came.wait_for(lambda: self._newest is not None, timeout_s)
-            newest, self._newest = self._newest, None
-            return newest
+            self._came.wait_for(lambda: self._queue, timeout_s)
+        commands = self.commands()
+        return commands[-1] if commands else None
+
+    def commands(self) -> list[Command]:
+        """All commands that were not returned before, as they came: what a `Playback` takes."""
+        with self._came:
+            commands = list(self._queue)
+            self._queue.clear()
+        return commands
 
     def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
         """Publishes the joints as measured [rad, rad/s]; `stamp_ns` is when [ns], None: now."""
@@ -148,7 +157,7 @@ class Follower(AbstractContextManager["Follower"]):
             self.rejected, self.reason = self.rejected + 1, str(error)
             return
         with self._came:
-            self._newest = Command(message.stamp_ns, position, velocity, *attached)
+            self._queue.append(Command(message.stamp_ns, position, velocity, *attached))
             self._came.notify()
 
     def __exit__(self, *_: object) -> None:

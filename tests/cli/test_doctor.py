@@ -19,6 +19,7 @@ from types import ModuleType
 import pytest
 import zenoh
 
+from service.arms.drive import follow
 from service.cli.main import main
 from service.client import endpoints, open_session
 from service.config import Settings
@@ -56,9 +57,10 @@ def template() -> ModuleType:
 def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
     """The template's fake arm, driven on a session of its own."""
     settings, stop = Settings(), threading.Event()
-    arm = own_arm.FakeArm(settings.joints.names, settings.arm.posture)
+    arm = own_arm.FakeArm(settings)
     with open_session(connect=[endpoint]) as session:
-        driver = threading.Thread(target=own_arm.drive, args=(arm, session, "thirdhand", stop))
+        options = {"tick_s": settings.period_s, "stop": stop}
+        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs=options)
         driver.start()
         try:
             yield arm
@@ -225,7 +227,7 @@ def test_an_arm_whose_drives_are_off_is_told_with_a_joints_name(
         Tracker(session) as tracker,
     ):
         daemon = Daemon(service, session)
-        arm.move = lambda position, velocity: None  # type: ignore[attr-defined]
+        arm.write = lambda position, velocity: None  # type: ignore[attr-defined]
         daemon.until(lambda status: status["mode"] == "follow")
         mover = threading.Timer(0.7, setattr, (tracker, "left", NEAR_LEFT))
         mover.start()

@@ -22,6 +22,7 @@ from service.contract import cdr, messages
 from service.launch import Launched, launched
 from support.paths import ROOT
 
+LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
 
 
@@ -62,7 +63,9 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *arguments: str, before: str = "", drawn: bool = False) -> Iterator[Daemon]:
+def serving(
+    folder: Path, *arguments: str, before: str = "", drawn: bool = False, network: str = LISTENING
+) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
     process runs that Python. What it records is `drawn` only where that is looked at.
     """
@@ -72,7 +75,7 @@ def serving(folder: Path, *arguments: str, before: str = "", drawn: bool = False
         else ("-m", "service")
     )
     with (
-        launched(folder, *arguments, program=program, rerun=drawn) as service,
+        launched(folder, *arguments, program=program, rerun=drawn, network=network) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         yield Daemon(service, session)

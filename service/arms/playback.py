@@ -1,0 +1,231 @@
+"""Playback of joint commands: smooth motion at a drive's own rate, whatever a network made of them.
+
+Commands are queued by tick number and played back a little later: by a cubic through positions and
+velocities, as much behind as they come unevenly. What is written passes the joints' limiter, so it
+holds position, velocity, acceleration and jerk limits for any sequence of commands and losses.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.client import BRAKE_AFTER_S, Command
+from service.config import JointSettings
+from service.core.frame import Records, Vector, parameters
+from service.core.limiter.limiter import Limited, Limiter
+
+REJOIN_AFTER_S = 0.1  # without a command; then only one is followed that begins where the arm stands ...
+REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # ... so nearly
+MOST_TICKS = 50  # that a sequence skips: others are another daemon's, or one's that started anew
+MOST_DELAY_S = BRAKE_AFTER_S  # behind the newest command: beyond it the arm brakes all the same
+FEEDBACK = 8.0  # [1/s] of a position error that becomes velocity ...
+MOST_FEEDBACK_RADPS = 0.25  # ... and not more, as after a pause
+DAMPING = 30.0  # [1/s] of a velocity error that becomes acceleration, at most ...
+SETTLED_RADPS = 1.0  # ... and where this much of it needs no more jerk than there is
+JERK_SHARE = 0.999  # of the greatest: rounding
+CATCH_UP_S, MOST_CATCH_UP = 0.1, 0.05  # in which the delay becomes as needed; share of the speed that it may cost
+FORGET = 0.005  # [s/s] by which the delay shrinks while commands come evenly
+MOST_ELAPSED_S = 0.1  # between two steps; what is longer was a clock that stepped
+CLOCK_SHARE = 0.02  # of the time that a loop is off, made up each step
+HELD_S = 0.004  # an acceleration, beyond the newest command
+SLOW_RADPS = 0.01  # a slower motion does not tell how long it took
+TOLERANCE = 1e-6  # of limits [rad, rad/s]: rounding of who commands
+
+SpeedLimits: TypeAlias = Callable[[Vector, Vector], tuple[Vector, Vector]]
+"""Least and greatest velocity (J,) [rad/s] of joints at a position and velocity (J,)."""
+
+
+class Knot(NamedTuple):
+    """A command in the queue; `time_s` is when in the motion it is, which stands still while a
+    daemon misses its deadlines.
+    """
+
+    tick: int
+    time_s: float
+    values: Vector  # (2, J): position, velocity [rad, rad/s]
+
+
+class Playback:
+    """What a drive is to do in each of its periods, given the commands that came.
+
+    `limits` are the drive's, of acceleration and jerk as well; an arm may be allowed less where it
+    stands: `speed_limits`. `tick_s` is the commands' period, `period_s` the drive's, `position`
+    (J,) [rad] where the arm stands at rest. Nothing here reads a clock, so none can step.
+    """
+
+    def __init__(
+        self,
+        limits: JointSettings,
+        position: Sequence[float] | Vector,
+        *,
+        tick_s: float,
+        period_s: float,
+        speed_limits: SpeedLimits | None = None,
+    ) -> None:
+        self.refused, self.reason = 0, ""  # commands that were not followed, and why the last one was not
+        self._tick_s, self._period_s, self._speed_limits = tick_s, period_s, speed_limits
+        self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
+        self._max_velocity, max_jerk = np.array(limits.velocity), np.array(limits.jerk)
+        self._parameters = parameters(
+            period_s=period_s,
+            max_acceleration=np.array(limits.acceleration),
+            most_change=JERK_SHARE * period_s * max_jerk,  # [rad/s²] in a period
+            damping=np.minimum(DAMPING, np.sqrt(max_jerk / SETTLED_RADPS)),
+        )
+        self._limiter = Limiter(limits, period_s)
+        self._state = np.zeros((3, len(limits.names)))  # as written: position, velocity, acceleration
+        self._state[0] = position
+        self._knots: deque[Knot] = deque()
+        self._newest: Knot | None = None  # of the sequence in force
+        self._now = self._heard = self._owed = 0.0  # [s] counted in steps; when the newest came; off the drive's clock
+        self._offset = self._needed = 0.0
+        here = Knot(0, 0.0, self._state[:2]), Knot(1, tick_s, self._state[:2])
+        self._knots.extend(here)
+        self._moved()  # compiled now: there is no time for it in a period
+        self._knots.clear()
+        self._moved()
+        self._offset = self._needed = 0.0  # [s] from the motion's time to the time when it is written
+
+    @property
+    def following(self) -> bool:
+        """Whether commands are played back; else the arm brakes, or stands."""
+        return len(self._knots) > 1
+
+    @property
+    def delay_ticks(self) -> float:
+        """How many ticks behind the newest command the arm is led, when that comes."""
+        return 0.0 if self._newest is None else (self._newest.time_s + self._offset - self._heard) / self._tick_s
+
+    def step(
+        self,
+        commands: Iterable[Command] = (),
+        *,
+        measured: Sequence[float] | Vector | None = None,
+        elapsed_s: float = -1.0,
+    ) -> Limited:
+        """Position, velocity and acceleration (J,) [rad, rad/s, rad/s²] at the end of this period,
+        after what came since the last.
+
+        `measured` (J,) [rad] closes the loop over a drive that takes velocities. `elapsed_s` since
+        the last step keeps the pace of a loop that is not punctual; else each is one period.
+        """
+        if measured is not None:
+            self._state[0] = measured
+        if 0.0 <= elapsed_s <= MOST_ELAPSED_S:
+            self._owed += elapsed_s - self._period_s
+        made_up = min(max(CLOCK_SHARE * self._owed, -0.1 * self._period_s), 0.1 * self._period_s)
+        self._owed -= made_up
+        self._now += self._period_s + made_up
+        for command in commands:
+            if reason := self._take(command):
+                self.refused, self.reason = self.refused + 1, reason
+        if self._now - self._heard > BRAKE_AFTER_S:
+            self._knots.clear()
+        moved = self._moved()
+        self._state = np.stack(moved[:3])
+        return moved
+
+    def _moved(self) -> Limited:
+        """The joints a period later."""
+        q, dq, ddq = self._state
+        return self._limiter.step(q, dq, ddq, self._wanted()) if self.following else self._limiter.stop(q, dq, ddq)
+
+    def _take(self, command: Command) -> str:
+        """Queues a command; why not, if it is not to be followed."""
+        position, velocity = np.array(command.position), np.array(command.velocity)
+        at, last = self._state[0], self._newest
+        if not position.shape == velocity.shape == at.shape:
+            return f"{len(command.position)} joints, {len(at)} needed"
+        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+            return "a joint that is not finite"
+        outside = np.maximum(np.minimum(self._lower, at) - position, position - np.maximum(self._upper, at))
+        if outside.max() > TOLERANCE:
+            return f"joint {outside.argmax() + 1} outside its limits: {position[outside.argmax()]:.3f} rad"
+        if (fast := np.abs(velocity) - self._max_velocity).max() > TOLERANCE:
+            return f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} rad/s"
+        tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
+        silent_s = self._now - self._heard
+        if last is None or silent_s > REJOIN_AFTER_S or abs(tick - last.tick) > MOST_TICKS:
+            off = np.abs(position - at).max()
+            if self._state[1:].any() or off > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
+                return f"a new sequence that does not begin where the arm stands: {off:.3f} rad off, or moving"
+            self._knots.clear()
+            time_s = self._now
+        elif tick <= last.tick:
+            return ""  # late or twice: the cubic goes on without it
+        else:
+            ticks = tick - last.tick
+            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * self._tick_s + TOLERANCE).any():
+                return "a jump from the command before"
+            time_s = last.time_s + self._tick_s * _steps(last, position, velocity, ticks, self._tick_s)
+        latest = self._now - time_s + MOST_DELAY_S
+        if self._knots:  # a segment is of use from now on, and should have been when it began
+            self._needed = min(max(self._needed, self._now - self._knots[-1].time_s), latest)
+            self._offset = min(self._offset, latest)
+        else:
+            self._needed = self._offset = self._now - time_s
+        self._newest, self._heard = Knot(tick, time_s, np.stack((position, velocity))), self._now
+        self._knots.append(self._newest)
+        return ""
+
+    def _wanted(self) -> Vector:
+        """The velocities (J,) [rad/s] for this period."""
+        slower = min(max((self._needed - self._offset) / CATCH_UP_S, -MOST_CATCH_UP), MOST_CATCH_UP)
+        self._offset += slower * self._period_s
+        self._needed -= FORGET * self._period_s
+        playhead_s = self._now - self._offset
+        while len(self._knots) > 2 and self._knots[1].time_s <= playhead_s:
+            self._knots.popleft()
+        one, other = self._knots[0], self._knots[1]
+        span = np.array((one.time_s, other.time_s, playhead_s, slower))
+        wanted: Vector = np.empty_like(self._state[1])
+        _aim(self._state, one.values, other.values, span, self._parameters, wanted)
+        if self._speed_limits is not None:
+            wanted = np.clip(wanted, *self._speed_limits(self._state[0], self._state[1]))
+        return wanted
+
+
+def _steps(last: Knot, position: Vector, velocity: Vector, ticks: int, tick_s: float) -> float:
+    """How many ticks the motion has gone on since the last command, by how far it came: fewer than
+    tick numbers say where these jumped over deadlines that were missed.
+    """
+    mean = 0.5 * (last.values[1] + velocity)
+    if ticks == 1 or np.abs(mean).max() < SLOW_RADPS:
+        return float(ticks)
+    return float(np.clip((position - last.values[0]) @ mean / (mean @ mean * tick_s), 1.0, ticks))
+
+
+@compiled
+def _aim(state: Vector, one: Vector, other: Vector, span: Vector, parameters: Records, wanted: Vector) -> None:
+    """Into `wanted` (J,) [rad/s] the joints' velocities after this period, on their way to where
+    the cubic between two commands (2, J) is then. Beyond these it goes on at constant acceleration
+    for HELD_S, then at constant velocity.
+
+    span (4,): times [s] of both commands and of the playhead, and the share by which that is slow.
+    """
+    given = parameters[0]
+    lasts_s, playhead_s = span[1] - span[0], span[2] - span[0]
+    inside_s = min(max(playhead_s, 0.0), lasts_s)
+    beyond_s, u = playhead_s - inside_s, inside_s / lasts_s
+    held_s = min(max(beyond_s, -HELD_S), HELD_S)
+    for i in range(len(wanted)):
+        begin, end, way = lasts_s * one[1, i], lasts_s * other[1, i], other[0, i] - one[0, i]
+        bend, twist = 3.0 * way - 2.0 * begin - end, begin + end - 2.0 * way
+        position = one[0, i] + u * (begin + u * (bend + u * twist))
+        velocity = (begin + u * (2.0 * bend + u * 3.0 * twist)) / lasts_s
+        acceleration = (2.0 * bend + u * 6.0 * twist) / lasts_s**2
+        position += beyond_s * velocity + held_s * (beyond_s - 0.5 * held_s) * acceleration
+        velocity = (velocity + held_s * acceleration) * (1.0 - span[3])
+        if held_s != beyond_s:
+            acceleration = 0.0
+        error = position - state[0, i] - velocity * given.period_s
+        velocity += min(max(FEEDBACK * error, -MOST_FEEDBACK_RADPS), MOST_FEEDBACK_RADPS)
+        acceleration += given.damping[i] * (velocity - acceleration * given.period_s - state[1, i])
+        change = min(max(acceleration - state[2, i], -given.most_change[i]), given.most_change[i])
+        acceleration = min(max(state[2, i] + change, -given.max_acceleration[i]), given.max_acceleration[i])
+        wanted[i] = state[1, i] + given.period_s * acceleration

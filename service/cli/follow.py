@@ -1,0 +1,53 @@
+"""`thirdhand follow`: the arm's side, which drives an arm by a cell's commands."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+
+from service.arms.drive import Drive, DriveError, say
+from service.arms.drive import follow as driven
+from service.arms.franka import FrankaArm
+from service.arms.simulated import SimulatedArm
+from service.cli.usage import reaching
+from service.client import Client
+from service.config import Settings, load
+from service.daemon.clock import ask_for_real_time
+
+ARMS = ("franka", "simulated")
+MOST_RATE_OFF = 0.3  # share of it: deadlines that a busy machine misses ...
+MEASURED_TICKS = 200  # ... once so many tell it
+
+
+def follow(args: argparse.Namespace) -> int:
+    """Exit code 0 once it was ended, with the arm at rest. Raises DriveError, UnreachableError."""
+    if args.arm not in ARMS:
+        raise DriveError(
+            f"no arm {args.arm!r}; {' and '.join(ARMS)} are shipped, and examples/own_arm.py is where one's own begins"
+        )
+    settings = load(args.config) if args.config else Settings()
+    reach = reaching(args)
+    cell = settings.cell if args.config and not args.cell else reach.cell
+    with reach.session() as session:
+        status = Client(session, cell).wait_until_ready(timeout_s=args.wait)
+        if status.joints != settings.joints.names:
+            raise DriveError(
+                f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; here "
+                f"{len(settings.joints.names)} were configured, {', '.join(settings.joints.names)}: "
+                "give --config, the daemon's own settings"
+            )
+        if status.tick > MEASURED_TICKS and abs(status.rate_hz / settings.rate_hz - 1.0) > MOST_RATE_OFF:
+            raise DriveError(
+                f"the daemon of cell {cell} runs at {status.rate_hz:.0f} Hz, {settings.rate_hz} are configured here: "
+                "give --config, the daemon's own settings, with rate_hz in it"
+            )
+        drive: Drive = FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        ask_for_real_time()
+        say(f"{args.arm} of cell {cell} is driven; Ctrl-C ends it")
+        playback = driven(drive, session, cell, tick_s=settings.period_s, stop=stop, wait_s=args.wait)
+    say(f"ended at rest, {playback.delay_ticks:.1f} ticks behind; {playback.refused} commands were refused")
+    return 0

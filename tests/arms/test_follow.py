@@ -1,0 +1,206 @@
+"""`thirdhand follow`: bad input ends in a sentence; a daemon killed in motion in an arm at rest,
+which follows again once there is another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from zenoh.handlers import RingChannel
+
+from service.arms.drive import follow
+from service.arms.simulated import SimulatedArm
+from service.client import UnreachableError, endpoints, open_session
+from service.config import Settings
+from service.contract import cdr
+from support.arms import MODELS, toml_of
+from support.cell import LEFT, Tracker, serving, told
+from support.franka_cell import assert_allowed, franka_toml, robot, simulated
+from support.paths import ROOT
+
+NEAR_LEFT = (0.85, -0.30, 0.10)
+STILL_RADPS = 0.02  # of a measured joint at rest
+
+
+@contextlib.contextmanager
+def hub(folder: Path) -> Iterator[zenoh.Session]:
+    """A router to which all connect, so that a daemon may come and go."""
+    (folder / "router.json5").write_text('{mode: "router"}')
+    with open_session(listen=["tcp/127.0.0.1:0"], zenoh_config=folder / "router.json5") as session:
+        yield session
+
+
+class Following:
+    """A running `thirdhand follow`, and what it says."""
+
+    def __init__(self, *arguments: str) -> None:
+        command = [sys.executable, "-m", "service", "follow", *arguments]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        self.said: list[str] = []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        self.said += iter(self.process.stderr.readline, "")
+
+    def until(self, line: str, times: int = 1, timeout_s: float = 60.0) -> None:
+        self.waits(lambda: sum(line in said for said in self.said) >= times, timeout_s)
+
+    def waits(self, what: Callable[[], bool], timeout_s: float = 60.0) -> None:
+        end = time.monotonic() + timeout_s
+        while not what():
+            if time.monotonic() > end:
+                raise TimeoutError(f"not within {timeout_s} s: {self.said}")
+            assert self.process.poll() is None, self.said
+            time.sleep(0.005)
+
+    def ended(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(20)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._reader.join(10)
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+
+
+@contextlib.contextmanager
+def following(*arguments: str) -> Iterator[Following]:
+    running = Following(*arguments)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+class Joints:
+    """The arm's joints as it tells them last."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._subscriber = session.declare_subscriber("thirdhand/joints/state", self._take)
+        self.position = self.velocity = np.zeros(7)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        state = cdr.decode_joints(sample.payload.to_bytes())
+        self.position, self.velocity = np.array(state.position), np.array(state.velocity)
+
+    def moving(self) -> bool:
+        return bool(np.abs(self.velocity).max() > 0.05)
+
+
+def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -> None:
+    """Kills a daemon in motion, and starts another, which the arm then follows; stops that in
+    motion as well; and ends with the arm at rest.
+    """
+    config = folder / "arm.toml"
+    config.write_text(network)
+    with hub(folder) as session, Tracker(session) as tracker:
+        at, joints = ("--connect", *endpoints(session)), Joints(session)
+        with following(arm, *at, "--config", str(config), *more) as running:  # it waits for the daemon
+            with serving(folder, *at, network=network) as daemon:
+                running.until("commands come")
+                for attempt in range(20):
+                    tracker.left = LEFT if attempt % 2 else NEAR_LEFT
+                    with contextlib.suppress(TimeoutError):
+                        running.waits(joints.moving, 3.0)
+                        break
+                daemon.process.kill()
+            running.until("the arm brakes")
+            running.waits(lambda: not np.abs(joints.velocity).max() > STILL_RADPS, 5.0)
+            stands = joints.position
+            time.sleep(0.3)
+            assert np.abs(joints.position - stands).max() < 1e-3
+            with serving(folder, *at, network=network) as daemon:
+                running.until("commands come", times=2)
+                tracker.left = LEFT if tracker.left == NEAR_LEFT else NEAR_LEFT
+                running.waits(joints.moving)
+                daemon.end()
+                running.until("the arm brakes", times=2)
+            assert running.ended() == 0
+    assert re.search(r"ended at rest, \d+\.\d ticks behind; 0 commands were refused", running.said[-1])
+
+
+PATIENT = """[network]
+listen = ["tcp/127.0.0.1:0"]
+[arm]
+silent_ms = 1000
+fault_error_rad = 0.5
+"""
+
+
+def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(tmp_path: Path) -> None:
+    killed_and_started_again(tmp_path, "simulated", PATIENT)
+
+
+@simulated
+def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path: Path) -> None:
+    network = franka_toml().replace("[arm]\n", "[arm]\nsilent_ms = 1000\nfault_error_rad = 0.5\n")
+    with robot(tmp_path) as there:
+        killed_and_started_again(
+            tmp_path, "franka", network + PATIENT.split("[arm]", maxsplit=1)[0], "--robot", there.address
+        )
+    assert there.new.mean() > 0.99
+    assert_allowed(there.velocity[there.new], there.joints[there.new])
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def refused(*arguments: str) -> str:
+    """What `thirdhand follow` says on standard error, of what fails."""
+    done = told("follow", *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    return line
+
+
+def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
+    assert "no arm 'frankia'; franka and simulated are shipped" in refused("frankia")
+    assert "is a daemon running" in refused("simulated", "--connect", "tcp/127.0.0.1:1")
+    six, slow = tmp_path / "six.toml", tmp_path / "slow.toml"
+    six.write_text(toml_of(MODELS["ur5"]))
+    slow.write_text("rate_hz = 200\n")
+    with serving(tmp_path) as daemon:
+        at = ("--connect", daemon.endpoint)
+        assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
+        assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
+        assert "here 6 were configured" in line
+        assert "give --config, the daemon's own settings" in line
+        assert "give --config with its own URDF" in refused("franka", *at)
+        daemon.until(lambda status: status["tick"] > 200)
+        assert "200 are configured here: give --config" in refused("simulated", *at, "--config", str(slow))
+
+
+def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
+    arm, told_so = SimulatedArm(Settings()), r"no command came on thirdhand/joints/command within 0\.3 s: is the daemon"
+    with open_session() as session, pytest.raises(UnreachableError, match=told_so):
+        follow(arm, session, "thirdhand", tick_s=0.002, stop=threading.Event(), wait_s=0.3)
+    assert arm.position.tolist() == list(Settings().arm.posture)
+
+
+def test_the_joints_are_told_by_their_names() -> None:
+    with open_session() as session:
+        heard = session.declare_subscriber("thirdhand/joints/state", RingChannel(1))
+        stop = threading.Event()
+        arm = threading.Thread(
+            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"tick_s": 0.002, "stop": stop}
+        )
+        arm.start()
+        state = cdr.decode_joints(heard.recv().payload.to_bytes())
+        stop.set()
+        arm.join(20)
+    assert (state.names, state.position) == (Settings().joints.names, Settings().arm.posture)

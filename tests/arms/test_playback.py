@@ -1,0 +1,322 @@
+"""Playback of commands: whatever the network, daemons and clocks do, what is written holds every
+limit; and where they do little, it is what was commanded, a little later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.arms.playback import REJOIN_AFTER_S, REJOIN_RAD, Playback
+from service.client import BRAKE_AFTER_S, Command
+from service.config import JointSettings
+from service.core.limiter.limiter import Limiter
+
+TICK = 0.002  # [s]
+COMMANDED = JointSettings()
+STRONG = JointSettings(velocity=(2.0,) * 7, acceleration=(30.0,) * 7, jerk=(4000.0,) * 7)
+WEAK = JointSettings(acceleration=(4.0,) * 7, jerk=(60.0,) * 7)  # cannot follow all that is commanded
+DRIVES = {"as commanded": COMMANDED, "stronger": STRONG, "weaker": WEAK}
+AT = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])
+LOWER, UPPER = np.array(COMMANDED.lower), np.array(COMMANDED.upper)
+Vector = npt.NDArray[np.float64]
+
+
+class Written(NamedTuple):
+    """What a drive was told, (N, 7) each, at rest before."""
+
+    position: Vector
+    velocity: Vector
+
+
+class Sent(NamedTuple):
+    """A command, and when it is received."""
+
+    at_s: float
+    command: Command
+
+
+def commanded(tick: int, position: Iterable[float], velocity: Iterable[float]) -> Command:
+    return Command(0, tuple(position), tuple(velocity), tick, 0, 0)
+
+
+def motion(wanted: Vector, *, at: Vector = AT, tick: int = 0) -> list[Command]:
+    """Commands as the service gives them, each tick, from rest."""
+    limiter, state = Limiter(COMMANDED, TICK), (at, np.zeros(7), np.zeros(7))
+    commands = [commanded(tick, at, np.zeros(7))]
+    for i, velocity in enumerate(wanted, start=1):
+        state = limiter.step(*state, velocity)[:3]
+        commands.append(commanded(tick + i, state[0], state[1]))
+    return commands
+
+
+def sway(seconds: float) -> Vector:
+    """Wanted velocities of a motion that is fast and smooth."""
+    times = TICK * np.arange(round(seconds / TICK))[:, None]
+    swayed: Vector = 1.2 * np.minimum(times, 1.0) * np.sin(2.0 * times + 0.5 * np.arange(7))
+    return swayed
+
+
+def sent(commands: Sequence[Command], late_s: Sequence[float] = (0.0,), begin_s: float = 0.0) -> list[Sent]:
+    """Commands on their way, tick by tick, each so late."""
+    return [
+        Sent(begin_s + i * TICK + late_s[i % len(late_s)], command)
+        for i, command in enumerate(commands)
+        if not math.isnan(late_s[i % len(late_s)])  # lost
+    ]
+
+
+def play(
+    playback: Playback, arriving: Iterable[Sent], seconds: float, period: float, elapsed: Sequence[float] = (-1.0,)
+) -> Written:
+    queue, written = sorted(arriving, key=lambda one: -one.at_s), []
+    for i in range(round(seconds / period)):
+        came: list[Command] = []
+        while queue and queue[-1].at_s <= i * period:
+            came.append(queue.pop().command)
+        written.append(playback.step(came, elapsed_s=elapsed[i % len(elapsed)]))
+    return Written(*(np.array([step[k] for step in written]) for k in range(2)))
+
+
+def assert_held(limits: JointSettings, written: Written, period: float, begin: Vector = AT) -> None:
+    position, velocity = np.vstack((begin, written.position)), np.vstack((np.zeros((2, 7)), written.velocity))
+    acceleration = np.diff(velocity, axis=0) / period
+    jerk = np.diff(acceleration, axis=0) / period
+    assert np.isfinite(position).all()
+    assert (position >= np.minimum(LOWER, begin)).all()
+    assert (position <= np.maximum(UPPER, begin)).all()
+    assert (np.abs(velocity) <= np.array(limits.velocity) * (1 + 1e-9)).all()
+    assert (np.abs(acceleration) <= np.array(limits.acceleration) * (1 + 1e-6)).all()
+    assert (np.abs(jerk) <= np.array(limits.jerk) * (1 + 1e-6)).all()
+    between = 0.5 * (velocity[2:] + velocity[1:-1])
+    assert (np.abs(np.diff(position, axis=0) / period - between) <= np.array(limits.jerk) * period**2 + 2e-6).all()
+
+
+# --- whatever comes ------------------------------------------------------------------------------
+
+speeds = st.tuples(*[st.sampled_from([0.0, 0.3, -0.7, 1.5, -1.5])] * 7)
+wishes = st.lists(st.tuples(speeds, st.integers(5, 60)), min_size=1, max_size=4)
+late = st.lists(
+    st.one_of(st.floats(0.0, 0.003), st.floats(0.0, 0.06), st.sampled_from([0.0, math.nan, 0.3])),
+    min_size=1,
+    max_size=40,
+)
+clocks = st.lists(st.sampled_from([0.001, 0.002, 0.0, 0.02, -1.0, 1e9, math.nan]), min_size=1, max_size=9)
+numbers = st.one_of(st.floats(), st.floats(-3.2, 3.2))
+hostile = st.builds(
+    commanded,
+    st.integers(-1, 400),
+    st.lists(numbers, min_size=6, max_size=8),
+    st.lists(numbers, min_size=7, max_size=7),
+)
+restarts = st.tuples(
+    st.integers(0, 150), st.integers(0, 2000), st.floats(-0.06, 0.06), st.sampled_from([0.0, 0.04, 0.5])
+)
+
+
+@pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
+@pytest.mark.parametrize("limits", DRIVES.values(), ids=DRIVES)
+@settings(derandomize=True, deadline=None, max_examples=40)
+@given(wishes, late, clocks, st.lists(st.tuples(st.floats(0.0, 0.4), hostile), max_size=6), st.none() | restarts)
+def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
+    limits: JointSettings,
+    period: float,
+    wishes: list[tuple[tuple[float, ...], int]],
+    late: list[float],
+    clocks: list[float],
+    hostile: list[tuple[float, Command]],
+    restart: tuple[int, int, float, float] | None,
+) -> None:
+    wanted = np.array([value for value, count in wishes for _ in range(count)])
+    commands = motion(wanted)
+    arriving = [*sent(commands, late), *(Sent(*one) for one in hostile)]
+    if restart is not None:  # by a daemon that counts anew, and takes the arm to be somewhere near
+        after, tick, off, silent_s = restart
+        commands, end = commands[:after], commands[min(after, len(commands) - 1)]
+        again = motion(-wanted, at=(np.array(end.position) + off).clip(LOWER, UPPER), tick=tick)
+        arriving = [*sent(commands, late), *sent(again, late, len(commands) * TICK + silent_s)]
+    playback = Playback(limits, AT, tick_s=TICK, period_s=period)
+    written = play(playback, arriving, len(wanted) * TICK + 1.0, period, clocks)
+    assert_held(limits, written, period)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 9.0, -9.0])
+@pytest.mark.parametrize("which", ["position", "velocity"])
+def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, which: str) -> None:
+    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    position, velocity = [*AT], [0.0] * 7
+    (position if which == "position" else velocity)[3] = bad
+    arriving = sent([commanded(i, position, velocity) for i in range(100)])
+    assert (play(playback, arriving, 0.3, 0.001).position == AT).all()
+    assert playback.refused == 100
+    assert "finite" in playback.reason or "limit" in playback.reason
+
+
+def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
+    commands = motion(sway(1.0))
+    jumping = [Sent(one.at_s, one.command._replace(position=tuple(AT))) for one in sent(commands)[300::50]]
+    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    kept = [one for i, one in enumerate(sent(commands)) if i < 300 or i % 50]
+    written = play(playback, [*kept, *jumping], 1.0, 0.001)
+    assert (playback.refused, playback.reason) == (4, "a jump from the command before")
+    late, off = behind(written, commands, 0.001)
+    assert late < 0.006
+    assert off < 2e-3
+
+
+def test_another_number_of_joints_is_refused_and_named() -> None:
+    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    playback.step([commanded(0, AT[:6], [0.0] * 6)])
+    assert playback.reason == "6 joints, 7 needed"
+
+
+# --- silence -------------------------------------------------------------------------------------
+
+
+def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow() -> None:
+    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(np.full((400, 7), 0.5))
+    written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
+    moving = np.abs(written.velocity).max(axis=1)
+    silent = round((len(commands) - 1) * TICK / 0.001)
+    assert moving[silent + round(BRAKE_AFTER_S / 0.001) - 2] == pytest.approx(0.5, abs=1e-3)
+    slowest, jerk = min(COMMANDED.acceleration), min(COMMANDED.jerk)
+    stop_s = BRAKE_AFTER_S + 0.5 / slowest + slowest / jerk
+    assert not moving[silent + round(stop_s / 0.001) + 3 :].any()
+    assert_held(COMMANDED, written, 0.001)
+
+
+def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
+    playback, commands = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), motion(sway(2.0))
+    cut = [one for one in sent(commands) if not 1.0 < one.at_s < 1.06]
+    written = play(playback, cut, 2.0, 0.001)
+    assert np.abs(written.position[-1] - commands[-1].position).max() < 0.01
+    assert_held(STRONG, written, 0.001)
+
+
+@pytest.mark.parametrize(
+    ("off", "speed", "followed"), [(0.0, 0.0, True), (0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.1, False)]
+)
+@pytest.mark.parametrize("at_start", [True, False])
+def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
+    off: float, speed: float, followed: bool, at_start: bool
+) -> None:
+    assert REJOIN_RAD == 0.05
+    playback, arm = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), AT
+    if not at_start:
+        arm = play(playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S, 0.001).position[-1]
+    where = arm + off * np.eye(7)[2]
+    after = [commanded(900 + i, where + i * TICK * speed, [speed] * 7) for i in range(40)]
+    written = play(playback, sent(after), 0.2, 0.001)
+    assert (written.position == arm).all() == (not followed or off == 0.0)
+    assert playback.refused == (0 if followed else 40)
+    assert followed or "begin where the arm stands" in playback.reason
+
+
+def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
+    """Half a second of motion comes at once, half a second late."""
+    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(sway(1.5))
+    held = [Sent(1.0, one.command) if 0.5 < one.at_s < 1.0 else one for one in sent(commands[:500])]
+    written = play(playback, held, 1.5, 0.001)
+    assert (written.position[1000:] == written.position[999]).all()
+    assert playback.refused > 200
+
+
+def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -> None:
+    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(sway(1.0), tick=70_000)
+    before = play(playback, sent(commands[:400]), 0.8 + 0.5, 0.001)
+    stands = before.position[-1]
+    again = motion(sway(1.0), at=stands)
+    written = play(playback, sent(again), 1.0, 0.001)
+    assert np.abs(written.position[-1] - again[-1].position).max() < 0.02
+    assert_held(COMMANDED, Written(*map(np.vstack, zip(before, written, strict=True))), 0.001)
+
+
+def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
+    """The one that came first is followed; the other's ticks are none of that sequence."""
+    one, other = motion(sway(1.0)), motion(-sway(1.0), tick=40_000)
+    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    written = play(playback, [*sent(one), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
+    assert np.abs(written.position[-1] - one[-1].position).max() < 0.01
+    assert playback.refused > 400
+
+
+# --- accuracy ------------------------------------------------------------------------------------
+
+
+def behind(written: Written, commands: Sequence[Command], period: float) -> tuple[float, float]:
+    """By how much it is late [s], and how far off it is beside that [rad]."""
+    times = TICK * np.arange(len(commands))
+    at, speed = (np.array([getattr(one, name) for one in commands]) for name in ("position", "velocity"))
+    when = period * np.arange(1, len(written.position) + 1)
+    where, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (at, speed))
+    error = written.position - where
+    late = -float((error * fast).sum() / (fast * fast).sum())
+    return late, float(np.abs(error + late * fast).max())
+
+
+@pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
+@pytest.mark.parametrize(
+    ("jitter_s", "lost", "delay_s", "off_rad", "share"),
+    [(0.0, 0.0, 0.004, 3e-4, 1.05), (0.001, 0.0, 0.006, 3e-4, 1.05), (0.006, 0.1, 0.016, 6e-3, 2.0)],
+)
+def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as_commanded(
+    period: float, jitter_s: float, lost: float, delay_s: float, off_rad: float, share: float
+) -> None:
+    rng = np.random.default_rng(3)
+    commands = motion(sway(6.0))
+    late_s = np.where(rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands)))
+    playback = Playback(STRONG, AT, tick_s=TICK, period_s=period)
+    written = play(playback, sent(commands, late_s.tolist()), 6.0, period)
+    late, off = behind(written, commands, period)
+    assert 0.0 < late < delay_s + period
+    assert off < off_rad
+    assert 0.9 <= playback.delay_ticks < (delay_s + period) / TICK
+    assert playback.refused == 0
+    jerk = np.diff(written.velocity, n=2, axis=0) / period**2
+    assert np.abs(jerk).max() < share * max(COMMANDED.jerk)
+
+
+def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None:
+    rng = np.random.default_rng(5)
+    commands = motion(sway(6.0))
+    late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))
+    playback, delays = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), []
+    for begin in range(0, 3000, 500):
+        play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0, 0.001)
+        delays.append(playback.delay_ticks)
+    assert delays[0] < 1.1
+    assert 2.5 < delays[1] < 8.0
+    assert delays[2] > delays[3] > delays[4]
+    assert delays[5] < 2.0
+
+
+@pytest.mark.parametrize("share", [0.97, 1.03])
+def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(share: float) -> None:
+    """A step is taken each 0.97 or 1.03 ms, by a drive whose period is 1 ms."""
+    commands = motion(sway(6.0))
+    playback = Playback(STRONG, AT, tick_s=TICK, period_s=0.001)
+    arriving = [Sent(one.at_s / share, one.command) for one in sent(commands)]
+    written = play(playback, arriving, 6.0 / share, 0.001, [0.001 * share])
+    assert np.abs(written.position[-1] - commands[-1].position).max() < 0.02
+    assert playback.delay_ticks < 3.0
+    assert_held(STRONG, written, 0.001)
+
+
+def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
+    """Ticks jump over these, but the motion goes on by one period."""
+    commands, jumped, tick = motion(sway(3.0)), [], 0
+    for i, command in enumerate(commands):
+        tick += 3 if i % 200 == 199 else 1
+        jumped.append(Sent(tick * TICK, command._replace(tick=tick)))
+    playback = Playback(STRONG, AT, tick_s=TICK, period_s=0.001)
+    written = play(playback, jumped, tick * TICK + 0.02, 0.001)
+    assert np.abs(np.diff(written.velocity, axis=0) / 0.001).max() < 6.0
+    assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(COMMANDED.jerk)
+    assert np.abs(written.position[-1] - commands[-1].position).max() < 0.03

@@ -1,0 +1,66 @@
+"""A Franka on a loopback address, by franky-sim, as a process of its own: what it was told each
+millisecond, and where its joints were, goes to a file once it is ended by its standard input.
+
+python tests/support/franka_robot.py FILE [--fast]: as fast as it is led, else in real time. Each
+millisecond lasts until it was told, so that none is missed on a busy machine.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from franky_sim import SimulationServer
+from franky_sim.mujoco_simulator import MujocoSimulator
+
+FIRST_S, NEXT_S = 0.002, 5.0  # that a command is waited for
+
+
+def main(path: str, *, fast: bool) -> None:
+    """Runs until standard input ends."""
+    cycles: list[tuple[bool, Any, Any]] = []
+    told: list[tuple[Any, bool]] = []
+    ended = threading.Event()
+
+    def wait() -> None:
+        sys.stdin.read()
+        ended.set()
+
+    threading.Thread(target=wait, daemon=True).start()
+    with MujocoSimulator() as sim:
+        robot = sim.add_robot()
+        control = robot.joint_velocity_control
+
+        def controlled(velocity: Any, has_new_command: bool = True) -> None:
+            told[:] = [(velocity, has_new_command)]
+            control(velocity, has_new_command)
+
+        robot.joint_velocity_control = controlled
+        with SimulationServer(sim) as server:
+            print(robot.hostname, flush=True)
+            robots, led, due = server.robot_servers, False, time.monotonic()
+            while not ended.is_set():
+                told.clear()
+                robots[0].process_commands()
+                patience = time.monotonic() + (NEXT_S if led else FIRST_S)
+                while told and not told[0][1] and time.monotonic() < patience and not ended.is_set():
+                    time.sleep(2e-5)
+                    told.clear()
+                    robots[0].process_commands()
+                led = bool(told) and (led or told[0][1])
+                if told:
+                    cycles.append((told[0][1], told[0][0], robot.inner_state.q))
+                sim.step()
+                robots[0].send_state()
+                due = max(due + 0.001, time.monotonic() - 0.02)
+                if not (fast and led):
+                    time.sleep(max(due - time.monotonic(), 0.0))
+    new, velocity, joints = (np.array([cycle[i] for cycle in cycles]) for i in range(3))
+    np.savez(path, new=new, velocity=velocity, joints=joints)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], fast="--fast" in sys.argv)
