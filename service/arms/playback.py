@@ -128,6 +128,8 @@ class Playback:
         for command in commands:
             if reason := self._take(command):
                 self.refused, self.reason = self.refused + 1, reason
+        if self._paused and self._newest is not None and self._heard == self._now:
+            self._needed = max(self._needed, self._now - self._newest.time_s)
         if self._now - self._heard > BRAKE_AFTER_S:
             self._knots.clear()
         moved = self._moved()
