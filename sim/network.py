@@ -31,6 +31,7 @@ THINGS_HZ = 10
 STOP_S = 0.5  # between the last hands and the end
 QUIET_S = 1.0  # without a command, after which that is said
 MOST_QUEUED = 256  # commands, while the bench is held up
+HEADROOM = 1.25  # of the arm's drives beyond what is commanded: else it could not catch up after that
 
 
 class BenchError(RuntimeError):
@@ -141,7 +142,9 @@ class Led:
 
     def __init__(self, bench: Bench, bridge: Bridge) -> None:
         self._bench, self._bridge, self._period_s = bench, bridge, bench.period_s
-        limits, joints = bench.limits, bench.observe().joints
+        names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
+        more = {name: tuple(HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
+        limits = msgspec.structs.replace(bench.limits, **more)
         self._playback = Playback(limits, joints, tick_s=bench.period_s, period_s=bench.period_s)
 
     def step(self, periods: int = 1) -> tuple[Observation, bool]:

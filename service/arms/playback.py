@@ -31,7 +31,8 @@ JERK_SHARE = 0.999  # of the greatest: rounding
 CATCH_UP_S, MOST_CATCH_UP = 0.1, 0.05  # in which the delay becomes as needed; share of the speed that it may cost
 FORGET = 0.005  # [s/s] by which the delay shrinks while commands come evenly
 MOST_ELAPSED_S = 0.1  # between two steps; what is longer was a clock that stepped
-CLOCK_SHARE = 0.02  # of the time that a loop is off, made up each step
+CLOCK_SHARE = 0.02  # of the time that a loop is off, made up each step ...
+PAUSE_S = 0.005  # ... and all of it after a pause, which tells nothing of the network
 HELD_S = 0.004  # an acceleration, beyond the newest command
 SLOW_RADPS = 0.01  # a slower motion does not tell how long it took
 TOLERANCE = 1e-6  # of limits [rad, rad/s]: rounding of who commands
@@ -89,6 +90,7 @@ class Playback:
         self._moved()  # compiled now: there is no time for it in a period
         self._knots.clear()
         self._moved()
+        self._paused = False  # the loop, before this step
         self._offset = self._needed = 0.0  # [s] from the motion's time to the time when it is written
 
     @property
@@ -118,12 +120,16 @@ class Playback:
             self._state[0] = measured
         if 0.0 <= elapsed_s <= MOST_ELAPSED_S:
             self._owed += elapsed_s - self._period_s
-        made_up = min(max(CLOCK_SHARE * self._owed, -0.1 * self._period_s), 0.1 * self._period_s)
+        self._paused = self._owed > PAUSE_S
+        most = 0.1 * self._period_s
+        made_up = self._owed if self._paused else min(max(CLOCK_SHARE * self._owed, -most), most)
         self._owed -= made_up
         self._now += self._period_s + made_up
         for command in commands:
             if reason := self._take(command):
                 self.refused, self.reason = self.refused + 1, reason
+        if self._paused and self._newest is not None and self._heard == self._now:
+            self._needed = max(self._needed, self._now - self._newest.time_s)
         if self._now - self._heard > BRAKE_AFTER_S:
             self._knots.clear()
         moved = self._moved()
@@ -165,7 +171,8 @@ class Playback:
             time_s = last.time_s + self._tick_s * _steps(last, position, velocity, ticks, self._tick_s)
         latest = self._now - time_s + MOST_DELAY_S
         if self._knots:  # a segment is of use from now on, and should have been when it began
-            self._needed = min(max(self._needed, self._now - self._knots[-1].time_s), latest)
+            needed = self._needed if self._paused else self._now - self._knots[-1].time_s
+            self._needed = min(max(self._needed, needed), latest)
             self._offset = min(self._offset, latest)
         else:
             self._needed = self._offset = self._now - time_s

@@ -309,6 +309,24 @@ def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(sh
     assert_held(STRONG, written, 0.001)
 
 
+def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
+    """The loop stands for 60 ms each second; the network is as punctual as ever."""
+    commands = motion(sway(6.0))
+    playback, queue = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), list(reversed(sent(commands)))
+    velocity: list[Vector] = []
+    now_s = before_s = 0.0
+    while now_s < 5.9:
+        now_s += 0.06 if len(velocity) % 1000 == 999 else 0.001
+        came = []
+        while queue and queue[-1].at_s <= now_s:
+            came.append(queue.pop().command)
+        moved, before_s = playback.step(came, elapsed_s=now_s - before_s), now_s
+        velocity.append(moved.velocity)
+        assert not playback.following or playback.delay_ticks < 3.0 or len(velocity) % 1000 < 5
+    assert np.abs(moved.position - commands[round(now_s / TICK)].position).max() < 0.015
+    assert np.abs(np.diff(np.array(velocity), axis=0)).max() <= 0.001 * max(STRONG.acceleration)
+
+
 def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
     """Ticks jump over these, but the motion goes on by one period."""
     commands, jumped, tick = motion(sway(3.0)), [], 0
