@@ -51,6 +51,7 @@ class HandSettings(Section, frozen=True):
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # each axis; a start, it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight
     still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is on its way
     still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # in which a hand comes to be still
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] off where it is expected: a hand has jumped ...
@@ -144,7 +145,8 @@ class People(Section, frozen=True):
 
     A hand is a capsule from where it is tracked toward the elbow. A part of the arm may approach it
     as fast as it can still stop `clearance` away, if the hand comes on as fast as now and the stop
-    begins `hands.stale_ms` (so long a hand may move unseen) and `reaction_ms` late.
+    begins `hands.stale_ms` (so long a hand may move unseen) and `reaction_ms` late. A hand that is
+    not seen for longer is taken to come ever faster, by 5 m/s², up to `unknown_speed`.
     """
 
     radius: Positive = 0.04  # [m] of hand and forearm

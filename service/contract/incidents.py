@@ -140,7 +140,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy = "start the tracker; `hand_age_ms` in the status names the hands that are there"
             remedy = _of_rejected(seen, *SIDES) or remedy
         case Reason.STALE_HAND:
-            about, found = "no accepted sample of a hand for 100 ms", _unseen(seen)
+            about = "no accepted sample of both hands for 100 ms, or of one for 500 ms; at once where the tool needs it"
+            found = _unseen(seen)
             remedy = "look at the tracker; growing counters under `rejected` mean that samples come and are refused; "
             remedy += f"a hand that the skill does without is waited for {GONE_S:g} s only"
             remedy = _of_rejected(seen, *SIDES) or remedy

@@ -21,6 +21,7 @@ from service.core.decision.decision import (
     FOLLOW,
     INSIDE,
     INSIDE_M,
+    NEEDED,
     READY,
     STARTS_MEASURED,
     TORN,
@@ -38,7 +39,7 @@ from service.core.frame import (
     frame_layout,
     state_layout,
 )
-from service.core.intake.intake import HANDS_KNOWN, Intake
+from service.core.intake.intake import HANDS_KNOWN, UNSEEN, Intake
 from service.core.limiter.limiter import LimiterStage
 from service.core.separation.separation import Separation
 from service.core.setpoint.setpoint import WRONG, SetpointStage
@@ -122,8 +123,10 @@ class Controller:
         known = self._take_in(tick, frame)
         lap("intake")
         known |= self._alone(frame)
-        wanted = self._skill.step(state, frame) if known & HANDS_KNOWN else None
-        known |= TORN * (wanted is not None and wanted.torn)
+        unseen = UNSEEN.index(side) if (side := known & sum(UNSEEN)) else None
+        wanted = self._skill.step(state, frame, unseen) if known & HANDS_KNOWN else None
+        if wanted is not None:
+            known |= TORN * wanted.torn | NEEDED * wanted.needs
         lap("skill")
         here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
         lap("decision")

@@ -1,4 +1,4 @@
-"""The daemon's ends of its cell's streams: reads newest samples, publishes each tick's outputs."""
+"""The daemon's ends of its cell's streams: reads what came, publishes each tick's outputs."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from service.core.frame import Event
 from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
+ARM = "joints/state"
+MOST_ARRIVALS = 4  # of a hand in a tick, the newest: what a network held back comes at once; a flood costs no tick
 
 
 def access(settings: Settings) -> dict[str, Any]:
@@ -66,7 +68,7 @@ class CellStreams:
         cell, domain = settings.cell, settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
-        inputs = [c for c in ros2.HEARD if c.key != "joints/state" or settings.arm.source == "state"]
+        inputs = [c for c in ros2.HEARD if c.key != ARM or settings.arm.source == "state"]
         keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
         if domain is not None:
             topics = [ros2.of_channel(cell, channel) for channel in (*inputs, *ros2.SAID)]
@@ -74,7 +76,10 @@ class CellStreams:
                 one for one in ros2.controllers(settings.ros2) if not one.heard or settings.arm.source == "state"
             ]
             keys += [(channels.BY_KEY[one.channel], ros2.key(domain, one)) for one in topics if one.heard]
-        self._subscribers = [(channel, session.declare_subscriber(key, RingChannel(1))) for channel, key in keys]
+        self._subscribers = [
+            (channel, session.declare_subscriber(key, RingChannel(1 if channel.key == ARM else MOST_ARRIVALS)))
+            for channel, key in keys
+        ]
         self._publishers = {
             channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
             for channel in channels.CHANNELS
@@ -83,13 +88,19 @@ class CellStreams:
         self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
-        """The newest message of each channel, if it is new and can be decoded."""
-        return [event for channel, source in self._subscribers if (event := self._receive(channel, source))]
+        """What came of the hands since the last call, and the arm's newest message; what can be
+        decoded.
+        """
+        events: list[Event] = []
+        for channel, source in self._subscribers:
+            for _ in range(MOST_ARRIVALS):
+                if (sample := source.try_recv()) is None:
+                    break
+                if event := self._decoded(channel, sample):
+                    events.append(event)
+        return events
 
-    def _receive(self, channel: channels.Channel, subscriber: Any) -> Event | None:
-        sample = subscriber.try_recv()
-        if sample is None:
-            return None
+    def _decoded(self, channel: channels.Channel, sample: Any) -> Event | None:
         arrivals = self._arrivals[channel.key]
         try:
             if len(sample.payload) > LARGEST_MESSAGE:

@@ -4,6 +4,7 @@ going on from a state bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import msgspec
@@ -116,13 +117,87 @@ def test_the_first_setpoint_is_where_the_tool_is(taught: Skill) -> None:
     assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.002
 
 
-def test_a_hand_that_falls_silent_brings_a_hold_within_100_ms_and_comes_back_without_a_jump(taught: Skill) -> None:
+def unseen(ticks: Iterable[Tick], when: range, *kinds: str) -> list[Tick]:
+    """Ticks without the samples of these kinds at that time."""
+    return [Tick(t.index, tuple(e for e in t.inbox if not (e.kind in kinds and t.index in when))) for t in ticks]
+
+
+@pytest.fixture(scope="module")
+def moving(taught: Skill) -> tuple[list[Tick], np.ndarray]:
+    """A scene's ticks, and the frames of all."""
+    ticks = list(ticks_of(HandScript(Scene(), seed=8)))
+    return ticks, frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
+
+
+def without(unseen_ms: float) -> Settings:
+    """Settings by which the arm does without a hand for so long."""
+    return msgspec.structs.replace(ASSUMED, hands=msgspec.structs.replace(ASSUMED.hands, unseen_ms=unseen_ms))
+
+
+@pytest.mark.parametrize(("side", "most"), [("left", 1.0), ("right", 0.6)], ids=["it conducts", "the other does"])
+def test_the_tool_goes_on_while_one_hand_is_out_of_sight_for_a_moment(
+    taught: Skill, moving: tuple[list[Tick], np.ndarray], side: str, most: float
+) -> None:
+    ticks, whole = moving
+    away = range(3300, 3540)
+    ticks = unseen(ticks[: away.stop + 500], away, f"hands/{side}")
+    going, held = (frames(Controller(without(ms), taught, urdf=URDF), ticks) for ms in (500.0, 0.0))
+    limits_hold(going)
+    no_jump(going)
+    assert modes(going[1:]) == [("follow", "none")]
+    assert modes(held[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
+    off, off_held = (
+        np.linalg.norm(seen["tool"] - whole["tool"][: len(seen)], axis=1)[away.start :].max() for seen in (going, held)
+    )
+    assert off < most * off_held
+
+
+def test_it_waits_at_once_where_the_hand_that_is_not_seen_matters_much(
+    taught: Skill, moving: tuple[list[Tick], np.ndarray]
+) -> None:
+    ticks = unseen(moving[0][:2400], range(1700, 2400), "hands/left")
+    seen = frames(Controller(without(1000.0), taught, urdf=URDF), ticks)
+    no_jump(seen)
+    assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand")]
+    needed = np.flatnonzero(seen["reason"] == Reason.STALE_HAND)[-1] + 1 - np.sum(seen["reason"] == Reason.STALE_HAND)
+    assert 1700 + 50 < needed < 1700 + 490
+    assert (seen["flags"][needed - 1] & Flag.UNSURE) > 0
+
+
+def test_a_hand_that_the_skill_does_not_need_makes_no_difference_while_it_is_not_seen(
+    taught: Skill, moving: tuple[list[Tick], np.ndarray]
+) -> None:
+    alone, away = replace(taught, conductor=0), range(1500, 1740)
+    ticks = moving[0][: away.stop]
+    whole = frames(Controller(ASSUMED, alone, urdf=URDF), ticks)
+    seen = frames(Controller(ASSUMED, alone, urdf=URDF), unseen(ticks, away, "hands/right"))
+    np.testing.assert_array_equal(seen["target"], whole["target"])
+    np.testing.assert_array_equal(seen["mode"], whole["mode"])
+    assert np.linalg.norm(seen["tool"] - whole["tool"], axis=1).max() < 0.02
+
+
+def test_who_is_not_seen_keeps_the_arm_farther_away(taught: Skill, moving: tuple[list[Tick], np.ndarray]) -> None:
+    away = range(3300, 3540)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), unseen(moving[0][: away.stop], away, "hands/left"))
+    limit = seen["hand_limit"][away.start :]
+    assert limit[-1] < limit[55] - 0.2
+
+
+def test_after_a_hold_for_a_hand_it_goes_on_with_both_only(
+    taught: Skill, moving: tuple[list[Tick], np.ndarray]
+) -> None:
+    ticks = unseen(moving[0][:2000], range(1500, 1700), "hands/left", "hands/right")
+    ticks = unseen(ticks, range(1700, 1720), "hands/left")
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
+    assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
+    assert seen["mode"][1719] == Mode.HOLD
+    assert seen["mode"][1720] == Mode.FOLLOW
+
+
+def test_hands_that_fall_silent_bring_a_hold_within_100_ms_and_comes_back_without_a_jump(taught: Skill) -> None:
     script = HandScript(Scene(), seed=8)
     silent = range(1500, 1900)
-    ticks = [
-        Tick(t.index, tuple(e for e in t.inbox if not (e.kind == "hands/left" and t.index in silent)))
-        for t in ticks_of(script)
-    ]
+    ticks = unseen(ticks_of(script), silent, "hands/left", "hands/right")
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
     limits_hold(seen)
     no_jump(seen)

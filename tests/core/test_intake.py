@@ -234,7 +234,7 @@ def test_stamps_at_the_ends_of_their_numbers_are_compared_without_overflow(first
 def test_a_stale_hand_stands_still_and_starts_anew() -> None:
     hands = Hands()
     follow(hands, lambda t: np.array([0.5 * t, 0.0, 0.0]), until_s=0.5)
-    hands.advance(50)
+    hands.advance(250)
     where = hands.state["hands"][LEFT].copy()
     assert not where[1:].any()
     hands.advance(100)

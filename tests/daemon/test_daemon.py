@@ -22,7 +22,7 @@ from zenoh.handlers import FifoChannel
 from service.cli.main import main
 from service.client import RefusedError
 from service.config import Settings, robot_description
-from service.contract import cdr, requests
+from service.contract import cdr, messages, requests
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
@@ -98,6 +98,38 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     assert not frames["joint_velocities"][-1].any()
     notes = [text for _, text, _ in Recording.open(recording).notes("requests")]
     assert any("handover" in note for note in notes)
+
+
+def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Path) -> None:
+    """They are recorded in their order, and replayed identically."""
+    records, period_ns, bursts = tmp_path / "records", 20_000_000, (3, 1, 3, 2, 3, 30, 3)
+    sent: list[list[int]] = []
+    with serving(tmp_path, "--arm", "assumed", "--rate", "50", "--record", str(records)) as daemon:
+        with Tracker(daemon.session):
+            daemon.until(following)
+        daemon.until(lambda s: s["mode"] == "hold")
+        publisher = daemon.session.declare_publisher("thirdhand/hands/left")
+        for count in bursts:
+            now_ns = time.time_ns()
+            sent.append([now_ns + k * period_ns // count for k in range(count)])
+            for stamp_ns in sent[-1]:
+                pose = messages.PoseStamped(stamp_ns, messages.BASE, LEFT, (0.0, 0.0, 0.0, 1.0))
+                publisher.put(cdr.encode_pose(pose))
+            time.sleep(5 * period_ns / 1e9)
+        assert daemon.end() == 0
+    (recording,) = records.glob("*.mcap")
+    result = replay(recording)
+    assert result.exact, result.text()
+    came = [
+        [cdr.decode_pose(payload).stamp_ns for kind, payload in step.events if kind == "hands/left"]
+        for step in Recording.open(recording).steps()
+    ]
+    assert max(len(stamps) for stamps in came) <= 4
+    taken = [stamp_ns for stamps in came for stamp_ns in stamps]
+    for burst in sent:
+        at = taken.index(burst[-1]) + 1
+        if len(burst) <= 4:
+            assert taken[at - len(burst) : at] == burst
 
 
 def test_taught_places_survive_a_restart(tmp_path: Path) -> None:

@@ -145,12 +145,12 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)), ("left", pose(1, (900.0, 0.0, 0.0))))
     assert cell.status(1.0).sources["left"].cause == "out_of_range"
     for k in range(1500):
-        seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1400 else ()
+        seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1200 else ()
         cell.tell(("right", pose(S + 1 + k, RIGHT)), ("arm", joints(k + 1)), *seen)
         if k % 50 == 0:
             told = cell.status(1.0 + k / 500)
     assert told.reason == "stale_hand"
-    assert told.because == "the left hand was last seen 102 ms ago"
+    assert told.because == "the left hand was last seen 502 ms ago"
     assert told.remedy.startswith("look at the tracker; growing counters")
     assert told.rejected == {"out_of_range": 1}
 

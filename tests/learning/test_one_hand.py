@@ -140,8 +140,8 @@ def test_it_is_served_without_a_hand_that_was_never_seen_or_has_gone_but_waits_f
     follow = (Mode.FOLLOW, Reason.NONE)
     assert set(modes(skill, 0, 0)[5:]) == {follow}
     lost = modes(skill, 300, 600, count=3200)
-    assert set(lost[10:640]) == {follow}  # and both are seen
-    assert set(lost[660:3090]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    assert set(lost[10:840]) == {follow}  # and both are seen
+    assert set(lost[860:3090]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(lost[3100:]) == {follow}  # 5 s after it was seen last
     again = modes(skill, 300, 600, one_to=3150, count=3300)
     assert set(again[3210:]) == {(Mode.HOLD, Reason.STALE_HAND)}

@@ -13,7 +13,7 @@ from service.config import Settings
 from service.contract.records import Mode, Reason
 from service.core.decision.leave import HELD, NOTICED, WayOut
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
-from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED
+from service.core.intake.intake import ARM_HEARD, ARM_STILL, CONTESTED, UNSEEN
 
 READY = 1  # an arm within its limits, and in nothing
 RETURNING = 2  # an arm on its way to that
@@ -42,6 +42,7 @@ STARTS_MEASURED = 2  # the arm appeared, where it is measured
 INSIDE = 64  # beside what the intake says: a part of the arm is inside of a thing ...
 TORN = 256  # it is not known which stage of the task it is
 ALONE = 128  # and that the hand that conducts the skill alone was seen, and the other never
+NEEDED = 512  # a hand that is not seen makes much of a difference
 INSIDE_M = 0.01  # [m] ... by more than capsules are larger than links
 
 
@@ -145,6 +146,8 @@ def _step(
     elif math.isnan(gate_m):
         unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ALONE
         reason = NO_HANDS if unseen else STALE_HAND
+    elif known & sum(UNSEEN) and (known & NEEDED or state.mode != FOLLOW):
+        reason = STALE_HAND
     else:
         ease = GATE_EASE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else AMBIGUOUS if known & TORN else NONE

@@ -44,6 +44,7 @@ HANDS_KNOWN = 1  # what a step says: both hands are seen
 ARM_HEARD = 2  # the arm has reported its joints lately enough
 ARM_STILL = 4  # ... and has reported one posture for a while
 CONTESTED = 8  # a hand or the arm is reported by two sources
+UNSEEN = (16, 32)  # the left or the right hand is not, but was a moment ago; the other one is
 CONTESTED_SHARE = 0.25  # share of the samples that jumped at which a source is contested
 SETTLED = 0.1  # share below which it is no more
 SCATTERED_M = 0.012  # standard deviation of a hand's samples, each axis, at which it is contested
@@ -90,11 +91,13 @@ class Intake:
         self._still_ticks = still_ticks(settings)
         self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
         # from the sample before to one that is late, and from that to now
-        self._models = models(settings.period_s, self.stale_ticks + math.ceil(LATE_S / settings.period_s) + 1)
+        unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        self._models = models(settings.period_s, unseen_ticks + math.ceil(LATE_S / settings.period_s) + 1)
         limits = np.array([settings.joints.lower, settings.joints.upper])
         self._parameters = parameters(
             period_s=settings.period_s,
             stale_ticks=self.stale_ticks,
+            unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
             jump=float(hands.jump),
@@ -133,7 +136,7 @@ class Intake:
     def advance(self, state: Record, ticks: int) -> None:
         """The state moved on by some ticks: fresh hands by their motion, others stand still."""
         state["tick"] += ticks
-        self._estimator.advance(state, ticks, self.stale_ticks)
+        self._estimator.advance(state, ticks, int(self._parameters["unseen_ticks"][0]))
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """One hand's sample filtered in, or counted as rejected."""
@@ -371,7 +374,11 @@ def _report(states: Records, frames: Records, parameters: Records) -> int:
         frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    known = HANDS_KNOWN if frame.hand_ages.min() >= 0 and frame.hand_ages.max() < given.stale_ticks else 0
+    known, least, most = 0, frame.hand_ages.min(), frame.hand_ages.max()
+    if 0 <= least < given.stale_ticks and most < given.unseen_ticks:
+        known = HANDS_KNOWN
+        if most >= given.stale_ticks:
+            known |= UNSEEN[0 if frame.hand_ages[0] == most else 1]
     if state.arm_tick >= 0 and state.tick - state.arm_tick < given.silent_ticks:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= given.still_ticks:

@@ -44,6 +44,7 @@ AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked a
 CHANGE_S = 0.07  # over which a hand's acceleration fades
 RAMP_S = 0.08  # of a braking, and until a hand's new velocity is known
 UNSURE = 0.2  # [m/s] a hand whose velocity's standard deviation is greater has only just been seen
+UNSEEN_MPS2 = 5.0  # [m/s²] a hand that is not seen comes ever faster, by so much
 CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
 
 
@@ -77,6 +78,8 @@ class Separation:
             room=np.array([PEOPLE_ROOM, THINGS_ROOM, THINGS_ROOM]),
             contact_speed=float(people.contact_speed),
             unknown_speed=float(people.unknown_speed),
+            unseen_s=np.array([settings.hands.stale_ms, settings.hands.unseen_ms]) / 1000,
+            period_s=settings.period_s,
             tremor_speed=float(people.tremor_speed),
             hand_radius=float(people.radius),
             forearm=people.length / np.linalg.norm(direction) * direction,
@@ -191,6 +194,11 @@ def _step(
         for mode in range(state.mode_probabilities.shape[1]):
             variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
         known, receives = variance <= UNSURE * UNSURE, _receives(contacts, state.hands, side)
+        age_s = (state.tick - state.hand_ticks[side]) * given.period_s
+        # of one that is not seen, while the arm may go on: by so much faster and nearer it may be
+        unseen_s = age_s - given.unseen_s[0] if given.unseen_s[0] < age_s < given.unseen_s[1] else 0.0
+        speed_up = min(UNSEEN_MPS2 * unseen_s, given.unknown_speed)
+        nearer = speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_MPS2)
         moment = _swiftness(state.hands[side, 1], given.tremor_speed) if known else 0.0
         for k in range(len(AHEAD_S) if moment > 0.0 else 1):
             ahead = moment * AHEAD_S[k]
@@ -210,14 +218,17 @@ def _step(
             for capsule in range(given.first, len(capsules)):
                 part, constraint = capsules[capsule], constraints[count]
                 distance = between_segments(parts[capsule], forearm, near) - part.radius - given.hand_radius
+                if k == 0:
+                    nearest_m = min(nearest_m, distance)
+                distance -= nearer
                 coming = 0.0
                 for i in range(3):
                     coming -= near[6 + i] * velocity[i]
-                coming = max(coming, 0.0) if known else given.unknown_speed
+                coming = max(coming, 0.0) + speed_up if known else given.unknown_speed
                 least = given.contact_speed if receives and part.link == joints else 0.0
                 if k == 0:
                     most = max(least, _allowed(parameters, PEOPLE, distance, coming))
-                    nearest_m, speed_limit = min(nearest_m, distance), min(speed_limit, most)
+                    speed_limit = min(speed_limit, most)
                 planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
                 if planned < part.max_speed:
                     constraint.planned = planned

@@ -82,6 +82,7 @@ class Wanted(NamedTuple):
     turning: Vector  # (3,) [rad/s]
     gate_m: float  # what is compared with the skill's threshold
     torn: bool  # it is not known which stage of the task it is
+    needs: bool  # a hand that is not seen: the tool may be far from where it is to be
 
 
 class Model(Protocol):

@@ -26,6 +26,7 @@ from service.core.skill.memory import LAG_S, delayed, remember
 from service.core.skill.model import COVARIANCE_ROUND_TO, NORMAL, REGION_95, Model, Regions, Seen, Target, Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
+from service.core.skill.unseen import off_m
 
 LARGEST_M = 1e3  # beyond it a target is as good as there
 OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
@@ -286,10 +287,9 @@ class SkillStage:
         state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
         state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
 
-    def step(self, state: Record, frame: Record) -> Wanted:
-        """What the skill asks for with the hands as they are, which must be known.
-
-        Covariances and the gripper are predicted anew only when a sample of a hand has come.
+    def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
+        """What the skill asks for with the hands, which must be known; `unseen` is the side of one
+        that is not seen now. Of new samples only covariances and gripper are predicted anew.
         """
         remember(as_array(state), self._period_s, self._lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
@@ -316,14 +316,15 @@ class SkillStage:
         passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
         recent_mps = recent(found.position, passed_s, state["trail"])
         reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
-        state["unsure"] = reach_m > (SURE_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
+        off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
+        state["unsure"] = math.hypot(reach_m, off) > (SURE_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
         frame["closure"] = state["closure"]
         _tell_stage(belief, frame)
         most = MOST_TORN * (EASE if state["reason"] == AMBIGUOUS else 1.0)
         if found.torn <= most:
             state["sure_tick"] = tick
         torn = (tick - int(state["sure_tick"])) * self._period_s > TORN_S
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn)
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn, off > UNSURE_M)
 
     def set_stage(self, state: Record, name: str) -> None:
         """The task has come to the via-point of this name. One that it has not changes nothing."""
