@@ -16,7 +16,7 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.arm.arm import Arm
 from service.core.controller import Controller
-from service.core.frame import Event, Tick, order
+from service.core.frame import Event, Tick, as_array, order
 from service.core.intake.arm_samples import still_ticks
 from service.core.limiter.limiter import Limiter
 from service.core.separation.separation import Separation
@@ -24,6 +24,7 @@ from service.core.skill import ORDER
 from service.core.skill.memory import delayed, moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
+from service.core.skill.unseen import deviation_m
 
 FOLLOWED_TICKS = 30  # after the arm is believed
 SAMPLE_EVERY = 5  # ticks, of the hands
@@ -72,6 +73,7 @@ def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         controller.step(Tick(index, (*hands, measured)))
+    deviation_m(as_array(controller.state), 0, settings.period_s)  # of a hand that is not seen for a moment
     controller.step(Tick(count, (order("hold"),)))
 
 

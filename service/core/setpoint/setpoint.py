@@ -72,6 +72,7 @@ class SetpointGenerator:
             max_jerk=float(tool.max_jerk),
             stop_acceleration=tool.stop_acceleration,
             stop_jerk=tool.stop_jerk,
+            stop_room=float(tool.stop_room),
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
             span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),
         )
@@ -180,7 +181,7 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
-    way += ROOM + STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE)
+    way += ROOM + given.stop_room * (STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE))
     # what is left of the room for a stop shrinks at BARRIER_RATE at most; linear between most and
     # least jerk
     used = min(BARRIER_RATE * dt, BARRIER_TIME / dt)
