@@ -33,7 +33,6 @@ Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
 
-
 BESIDE = (("arm", "urdf"), ("network", "certificate"), ("network", "zenoh_config"))  # the configuration, if relative
 PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
