@@ -123,14 +123,14 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden:
     assert ends[-1] == pytest.approx(golden.lasts_s) == pytest.approx(SECONDS, abs=0.05)
     held = {span.reason: span for span in golden.spans if span.mode is Mode.HOLD}
     for reason, (begin_s, end_s) in {
-        Reason.STALE_HAND: DROPOUT_S,
+        Reason.STALE_HAND: (DROPOUT_S[0] + 0.25, DROPOUT_S[1]),  # so long the tool could do without that hand
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: AWAY_S,
     }.items():
         assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
     # made in process, without a status: what the first frame of each holds
-    assert held[Reason.STALE_HAND].why == "the left hand was last seen 100 ms ago"
+    assert re.fullmatch(r"the left hand was last seen 2\d\d ms ago", held[Reason.STALE_HAND].why)
     assert (held[Reason.OPERATOR].why, held[Reason.OPERATOR].remedy) == ("somebody asked for it", "thirdhand resume")
     far = re.fullmatch(
         r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",

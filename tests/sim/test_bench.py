@@ -305,7 +305,7 @@ def test_an_arm_elsewhere_is_scored_by_its_joint_states(network: tuple[zenoh.Ses
     script, arm = HandScript(SCENE, seed=1, speed=20.0), threading.Thread(target=tell)
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
         with pytest.raises(BenchError, match="no arm tells its joints on lab/joints/state"):
-            run(bench, session, Live(cell="lab", wait_s=0.1), stop=threading.Event(), report=reports.append)
+            run(bench, session, Live(cell="lab", wait_s=1.0), stop=threading.Event(), report=reports.append)
         assert set(told) == {"lab/hands/left", "lab/objects"}
         arm.start()
         try:
