@@ -307,7 +307,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/scenes"),
         of("separation/random/closest_of_shapes_mm/least"),
     ],
-    "In 91 of these": [
+    "In 85 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
         of("separation/thrust/above_after_reaction"),
         of("separation/thrust/excess_after_reaction"),
@@ -321,7 +321,7 @@ SOURCES: dict[str, list[Source]] = {
         of("phase/ours/back_against_forth_rms_mm"),
         of("phase/promp/back_against_forth_rms_mm"),
         of("phase/hand_from_its_place_in_the_pause_mm", 0.1),
-        of("phase/ours/goes_on_in_the_pause_mm", 0.1),
+        of("phase/ours/goes_on_in_the_pause_mm"),
         of("phase/tremor_mm"),
         of("phase/tremor_in_space_rms_mm"),
         of("phase/ours/tremor_of_the_tool_in_the_pause_rms_mm"),
