@@ -18,14 +18,17 @@ RESTS_S = 0.1  # so long it is said: a message may be lost, and some controllers
 
 
 def brake(settings: Settings, frame: Frame, clock: Deadlines, streams: CellStreams) -> None:
-    """Commands the stop that follows the newest frame, tick by tick, and then rest."""
+    """Commands the stop that follows the newest frame, tick by tick; repeats the last command."""
     limiter, names = Limiter(settings.joints, settings.period_s), settings.joints.names
     q, dq, ddq = (frame[name].copy() for name in ("joints", "joint_velocities", "joint_accelerations"))
-    resting = 0
+    index, stamp_ns, resting = int(frame["tick"]), clock.stamp_ns, 0
     while frame["commanded"] and resting < RESTS_S * settings.rate_hz:
-        q, dq, ddq, _ = limiter.stop(q, dq, ddq)
-        resting += not dq.any()
-        index, _ = clock.wait()
+        deadline, _ = clock.wait()
+        if dq.any():
+            q, dq, ddq, _ = limiter.stop(q, dq, ddq)
+            index, stamp_ns = deadline, clock.stamp_ns
+        else:
+            resting += 1
         attachment = cdr.encode_attachment(Attachment(index, time.time_ns(), 0))
-        command = cdr.encode_command(clock.stamp_ns, names, q.tolist(), dq.tolist())
+        command = cdr.encode_command(stamp_ns, names, q.tolist(), dq.tolist())
         streams.publish("joints/command", command, attachment)
