@@ -12,8 +12,9 @@ from service.arms.franka import FrankaArm
 from service.arms.simulated import SimulatedArm
 from service.cli.usage import reaching
 from service.client import Client
-from service.config import Settings, load
+from service.config import Settings
 from service.daemon.clock import ask_for_real_time
+from service.shipped import cell_of
 
 ARMS = ("franka", "simulated")
 MOST_RATE_OFF = 0.3  # share of it: deadlines that a busy machine misses ...
@@ -26,7 +27,7 @@ def follow(args: argparse.Namespace) -> int:
         raise DriveError(
             f"no arm {args.arm!r}; {' and '.join(ARMS)} are shipped, and examples/own_arm.py is where one's own begins"
         )
-    settings = load(args.config) if args.config else Settings()
+    settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with reach.session() as session:

@@ -289,7 +289,7 @@ class SkillStage:
 
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
         """What the skill asks for with the hands, which must be known; `unseen` is the side of one
-        that is not seen now. Of new samples only covariances and gripper are predicted anew.
+        that is not seen now. Covariances and gripper are predicted anew at new samples only.
         """
         remember(as_array(state), self._period_s, self._lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
