@@ -30,12 +30,15 @@ from service.learning.via_points import adapted
 from service.recording.mcap_file import RecordingError
 from service.recording.recording import Recorder, Recording
 from service.recording.replay import ticks
+from service.recording.steps import checksum
 from sim.bench import Bench
-from sim.closed_loop import START_NS, ClosedLoop, hand_event
+from sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript
 
-STATE_EVERY = 500  # ticks
+WHOLE_EVERY = 500  # ticks: of all other frames a checksum is kept
+# Resolutions of a tracker and of joint encoders [m, rad, rad/s]: finer noise would fill the file.
+TRACKED, ENCODED, ENCODED_SPEED = 2.0**-15, 2.0**-14, 2.0**-10
 SECONDS = 20.0
 MOVED = Scene(handover=(0.66, -0.22, 0.33))
 # What happens when [s].
@@ -69,7 +72,7 @@ class Session:
         """The ticks of the session; now and then deadlines are missed."""
         jump = 0
         for tick in itertools.islice(self.loop.ticks(), self._tick(SECONDS)):
-            events, k = list(tick.inbox), tick.index
+            events, k = [_as_measured(event) for event in tick.inbox], tick.index
             if k in self._adopted:
                 events.append(Event("skill", self._adopted[k].file, self._adopted[k].for_loop()))
             if k in self._orders:
@@ -106,6 +109,20 @@ class Session:
         return (event,)
 
 
+def _as_measured(event: Event) -> Event:
+    """A sample to the resolution of what measures it."""
+    was = event.value
+    if event.kind == "joints/state":
+        position, velocity = _rounded(was.position, ENCODED), _rounded(was.velocity, ENCODED_SPEED)
+        return joints_event(was.names, position, velocity, was.stamp_ns)
+    now = was._replace(position=_rounded(was.position, TRACKED))
+    return Event(event.kind, cdr.encode_pose(now), now)
+
+
+def _rounded(values: tuple[float, ...], step: float) -> tuple[float, ...]:
+    return tuple((np.round(np.array(values) / step) * step).tolist())
+
+
 def record(
     path: Path,
     settings: Settings,
@@ -114,20 +131,32 @@ def record(
     *,
     follow: Tap = lambda tick, frame: None,
 ) -> list[Frame]:
-    """The frames of the core run on ticks, which are recorded and shown to `follow`."""
-    frames: list[Frame] = []
+    """The frames of the core run on ticks, which are shown to `follow` and recorded with a checksum
+    of each frame and command, and with every 500th frame as a whole.
+    """
+    steps: list[tuple[Tick, Frame]] = []
+    checksums: dict[int, int] = {}
     controller = Controller(settings, skill.for_loop(), urdf=robot_description(settings))
-    with Recorder(path, settings=settings, skill=skill.file, state=controller.state) as recorder:
+    start = controller.state
 
-        def keep(tick: Tick, frame: Frame) -> None:
-            frames.append(frame)
-            after = controller.state if len(frames) % STATE_EVERY == 0 else None
-            time_ns = START_NS + tick.index * round(settings.period_s * 1e9)
-            outputs = outgoing(frame, time_ns, settings.joints.names)
-            recorder.write(tick, frame, time_ns=time_ns, state=after, outputs=outputs)
+    def keep(tick: Tick, frame: Frame) -> None:
+        steps.append((tick, frame))
+        state = controller.state if tick.index % WHOLE_EVERY == 0 else None
+        outputs = outgoing(frame, _time_ns(tick, settings), settings.joints.names)
+        checksums[tick.index] = checksum(frame, outputs, state)
 
-        run(controller, source, [keep, follow])
-    return frames
+    run(controller, source, [keep, follow])
+    table = np.zeros(max(checksums, default=-1) + 1, "<u4")
+    table[[*checksums]] = [*checksums.values()]
+    with Recorder(path, settings=settings, skill=skill.file, state=start, checksums=table.tobytes()) as recorder:
+        for tick, frame in steps:
+            kept = frame if tick.index % WHOLE_EVERY == 0 else None
+            recorder.write(tick, kept, time_ns=_time_ns(tick, settings))
+    return [frame for _, frame in steps]
+
+
+def _time_ns(tick: Tick, settings: Settings) -> int:
+    return START_NS + tick.index * round(settings.period_s * 1e9)
 
 
 def make(path: Path, skill: StoredSkill) -> None:
@@ -139,20 +168,23 @@ def make(path: Path, skill: StoredSkill) -> None:
 
 
 def refresh(path: Path) -> dict[str, float]:
-    """Computes the frames of a golden session anew from its ticks; the largest change in each field
-    that changed.
+    """Computes the frames of a golden session anew from its ticks; in how many ticks something
+    changed, and the largest change in each field of the frames that are kept as a whole.
     """
     old = Recording.open(path)
     try:
-        before = [step.frame for step in old.steps() if step.frame is not None]
+        before = [step.frame for step in old.steps(whole=False) if step.frame is not None]
     except RecordingError:  # frames or states had another layout then: there is nothing to compare with
         before = []
     beside = path.with_suffix(".new")
     frames = record(beside, old.settings, decoded(old.skill, origin=str(path), recorded=True), ticks(old))
     beside.replace(path)
-    changes: dict[str, float] = {}
-    for was, now in zip(before, frames, strict=bool(before)):
-        for name, value in differences(was, now).items():
+    now = {int(frame["tick"]): frame for frame in frames}
+    checksums = Recording.open(path).checksums
+    changed = sum(checksums.get(tick) != was for tick, was in old.checksums.items())
+    changes = {"ticks": float(changed)} if changed else {}
+    for was in before:
+        for name, value in differences(was, now[int(was["tick"])]).items():
             changes[name] = float(np.fmax(changes.get(name, 0.0), value))
     return changes
 
@@ -183,14 +215,14 @@ def main(arguments: list[str] | None = None) -> int:
     p.add_argument(
         "--refresh",
         action="store_true",
-        help="keep the ticks, compute the frames anew, print the largest change per field",
+        help="keep the ticks, compute the frames anew, print how many and the largest change per field",
     )
     args = p.parse_args(arguments)
     try:
         if args.refresh:
             changes = refresh(args.output)
             print(
-                "\n".join(f"{name:<24} changed by at most {value:.3g}" for name, value in sorted(changes.items()))
+                "\n".join(f"{name:<24} changed: {value:.4g}" for name, value in sorted(changes.items()))
                 or "nothing changed"
             )
         else:

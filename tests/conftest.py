@@ -15,6 +15,7 @@ import pytest
 
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
+from service.recording.replay import replay
 from support import compiling, tiers, vulkan
 from support.paths import RECORDINGS, ROOT
 
@@ -76,6 +77,19 @@ def skill() -> Skill:
     """The shipped soldering skill, without places."""
     path = RECORDINGS / "soldering.npz"
     return decoded(path.read_bytes(), origin=str(path))
+
+
+@pytest.fixture(scope="session")
+def golden(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """The golden session with a frame for each tick: made by a replay, once for all workers if
+    none begins before another has ended.
+    """
+    own = tmp_path_factory.mktemp("whole")
+    whole = (own if worker_id == "master" else own.parent.parent) / "golden.mcap"
+    if not whole.exists():
+        assert replay(RECORDINGS / "golden.mcap", output=own / "replayed.mcap").within_tolerance
+        (own / "replayed.mcap").replace(whole)
+    return whole
 
 
 @pytest.fixture(scope="session")

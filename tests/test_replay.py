@@ -5,6 +5,7 @@ and with any number of BLAS threads.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,12 +15,14 @@ import pytest
 
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick
+from service.core.frame import Event, Frame, Tick
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
+from service.recording.mcap_file import RecordingError
 from service.recording.recording import Recorder, Recording
-from service.recording.replay import replay
-from sim.golden import refresh
+from service.recording.replay import replay, ticks
+from sim.closed_loop import joints_event
+from sim.golden import ENCODED, ENCODED_SPEED, refresh
 from sim.scene import Scene
 from sim.script import HandScript
 from support.cell import told
@@ -52,20 +55,56 @@ def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units
     assert done.stdout.splitlines()[-1] == native.stdout.splitlines()[-1]
 
 
-def test_the_golden_session_replays_from_a_state_in_its_middle() -> None:
-    result = replay(GOLDEN, after=6000)
+def test_the_golden_session_replays_from_a_state_in_its_middle(golden: Path) -> None:
+    result = replay(golden, after=6000)
     assert result.within_tolerance
     assert 3000 < result.ticks < 5000
 
 
-def test_the_golden_session_holds_what_it_is_meant_to() -> None:
-    seen = np.array([step.frame for step in Recording.open(GOLDEN).steps() if step.frame is not None])
+def test_the_golden_session_holds_what_it_is_meant_to(golden: Path) -> None:
+    seen = np.array([step.frame for step in Recording.open(golden).steps() if step.frame is not None])
     reasons = {Reason(r) for r in np.unique(seen["reason"])}
     assert {Reason.NONE, Reason.STALE_HAND, Reason.OPERATOR, Reason.FAR_FROM_DEMONSTRATIONS} <= reasons
     assert (seen["mode"] != Mode.FAULT).all()
     assert (seen["rejected"][-1] > 0).sum() >= 4
     assert (np.diff(seen["tick"]) > 1).any()
-    assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 15e6
+    assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 5e6
+
+
+def packed_bytes(folder: Path) -> int:
+    """The size of a git history with the folder as it is now, once it is packed."""
+    as_somebody = ["-c", "user.name=a", "-c", "user.email=b"]
+    for one in (["add", "."], [*as_somebody, "commit", "--quiet", "--message", "c"], ["gc", "--quiet"]):
+        subprocess.run(["git", *one], cwd=folder, check=True, timeout=60)
+    return sum(path.stat().st_size for path in folder.glob(".git/objects/pack/*"))
+
+
+def test_another_golden_session_adds_little_to_a_history(tmp_path: Path) -> None:
+    """With other joint states, and other frames at every tick."""
+    subprocess.run(["git", "init", "--quiet", "."], cwd=tmp_path, check=True, timeout=60)
+    path = tmp_path / "golden.mcap"
+    shutil.copy(GOLDEN, path)
+    before, old, noise = packed_bytes(tmp_path), Recording.open(GOLDEN), np.random.default_rng(0)
+    start, *steps = old.steps(whole=False)
+
+    def moved(event: Event) -> Event:
+        if event.kind != "joints/state":
+            return event
+        position = event.value.position + ENCODED * noise.integers(-16, 16, 7)
+        velocity = event.value.velocity + ENCODED_SPEED * noise.integers(-16, 16, 7)
+        return joints_event(event.value.names, tuple(position), tuple(velocity), event.value.stamp_ns)
+
+    checksums = noise.integers(0, 1 << 32, len(old.checksums), dtype="<u4").tobytes()
+    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state, checksums=checksums) as recorder:
+        for tick, step in zip(ticks(old), steps, strict=True):
+            if step.frame is not None:
+                step.frame["joints"] += noise.standard_normal(7)
+            other = Tick(tick.index, tuple(moved(event) for event in tick.inbox))
+            recorder.write(other, step.frame, time_ns=step.time_ns)
+    assert len(Recording.open(path).checksums) == len(old.checksums) > 10_000
+    added = packed_bytes(tmp_path) - before
+
+    assert 40_000 < added < 200_000
 
 
 @pytest.fixture(scope="module")
@@ -114,10 +153,10 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
 def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Path) -> None:
     recording = Recording.open(recorded)
     steps = list(recording.steps())
-    ticks = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
+    taken = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
     path = tmp_path / "gap.mcap"
     with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
-        for tick, step in zip(ticks, steps[1:], strict=True):
+        for tick, step in zip(taken, steps[1:], strict=True):
             if not 400 <= tick.index < 500:
                 recorder.write(
                     tick,
@@ -167,6 +206,57 @@ def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_pat
     path.write_bytes(recorded.read_bytes())
     assert refresh(path) == {}
     assert replay(path).exact
+    assert refresh(path) == {}
+
+
+@pytest.fixture
+def checked(recorded: Path, tmp_path: Path) -> Path:
+    """The short session, as the golden one is kept."""
+    path = tmp_path / "checked.mcap"
+    path.write_bytes(recorded.read_bytes())
+    refresh(path)
+    return path
+
+
+def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
+    recorded: Path, checked: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "whole.mcap"
+    done = told("replay", str(checked), "--exact", "--output", str(output))
+    assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
+    assert replay(output).exact
+    kept, whole, were = (
+        [step.frame for step in Recording.open(path).steps(whole=False)][1:] for path in (checked, output, recorded)
+    )
+    assert [frame.tobytes() for frame in whole] == [frame.tobytes() for frame in were]
+    assert [tick for tick, frame in enumerate(kept) if frame is not None] == [0, 500]
+    same = told("replay", str(output), "--output", str(output))
+    assert (same.returncode, "nor itself" in same.stderr) == (1, True)
+    assert replay(output).exact
+
+
+def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(checked: Path, tmp_path: Path) -> None:
+    recording = Recording.open(checked)
+    steps, path = list(recording.steps(whole=False)), tmp_path / "changed.mcap"
+    table = np.array([*recording.checksums.values()], "<u4")
+    table[601] ^= 1
+    with Recorder(
+        path, settings=recording.settings, skill=recording.skill, state=steps[0].state, checksums=table.tobytes()
+    ) as recorder:
+        for tick, step in zip(ticks(recording), steps[1:], strict=True):
+            recorder.write(tick, step.frame, time_ns=step.time_ns)
+    result = replay(path)
+    assert (result.ticks, result.identical, result.exact) == (1000, 999, False)
+    assert "first difference at tick 601: its checksum\nlargest differences: none in a frame" in result.text()
+
+
+def test_what_is_decided_behind_a_gap_is_not_written_as_if_there_were_none(recorded: Path, tmp_path: Path) -> None:
+    data = bytearray(recorded.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"whole\.mcap cannot be written: gap after tick \d+"):
+        replay(damaged, output=tmp_path / "whole.mcap")
 
 
 def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:

@@ -147,6 +147,7 @@ def parser() -> argparse.ArgumentParser:
         "--exact", action="store_true", help="forbid gaps, damage, a cut, and even differences below 10 µm and 10 µrad"
     )
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
+    option(c, "--output", "FILE", "a recording of what is decided now, to be reported, viewed or compared")
 
     c = command("record", record_options.ABOUT, record_options.EXAMPLE)
     record_options.add_options(c)

@@ -80,10 +80,12 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
 
 def replay(args: argparse.Namespace) -> int:
     """Exit code 0 if all frames are close enough; with `--exact`, complete and identical."""
+    if args.output:
+        check_writable(args.output, ".mcap")
     counts = [Recording.open(path).ticks() for path in args.files]
     total = None if None in counts or args.after is not None else sum(filter(None, counts))
     with progress("replaying", total=total) as done:
-        result = replayed(*args.files, after=args.after, progress=done)
+        result = replayed(*args.files, after=args.after, progress=done, output=args.output)
     print(result.text())
     return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
 

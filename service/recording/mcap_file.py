@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC, IndexType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
@@ -93,7 +93,7 @@ class McapFile:
     then holds what was written before.
     """
 
-    def __init__(self, path: Path, *, joints: int, attached: bool = True) -> None:
+    def __init__(self, path: Path, *, joints: int, attached: bool = True, compressed: bool = True) -> None:
         """`joints` is the arm's number of joints, on which the schemas depend.
 
         Without attachments and metadata (`attached` False) the file has no index of them: its
@@ -102,7 +102,8 @@ class McapFile:
         self.path = path
         self._stream = _WholeWrites(path)
         kinds = IndexType.ALL if attached else IndexType.CHUNK | IndexType.MESSAGE
-        self.writer = Writer(self._stream, chunk_size=1 << 62, index_types=kinds, enable_data_crcs=True)  # type: ignore[arg-type]
+        compression = CompressionType.ZSTD if compressed else CompressionType.NONE
+        self.writer = Writer(self._stream, 1 << 62, compression, kinds, enable_data_crcs=True)  # type: ignore[arg-type]
         self._definitions = definitions(joints)
         self._unflushed = 0  # bytes
         self._schemas: dict[str, int] = {}

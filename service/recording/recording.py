@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Self
 
 import msgspec
+import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
@@ -33,6 +34,7 @@ from service.urdf import Urdf
 from service.viewer.urdf_markers import with_markers
 
 OBJECTS = "objects"
+CHECKSUMS = "checksums.u32"  # for each tick number since 0, little endian
 FORMAT = "2"  # of State and Frame too: another format cannot be replayed
 _LATCHED = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
@@ -42,7 +44,11 @@ _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Recorder(McapFile):
-    """A recording that is being written; `flush` bounds what a kill can lose."""
+    """A recording that is being written; `flush` bounds what a kill can lose.
+
+    With `checksums` (4 bytes each tick number) frames may be left out. Such a file is not
+    compressed, so that a history that packs it stores only what differs from the one before.
+    """
 
     def __init__(
         self,
@@ -54,6 +60,7 @@ class Recorder(McapFile):
         urdf: str | None = None,
         metadata: Mapping[str, str] | None = None,
         time_ns: int = 0,
+        checksums: bytes = b"",
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
         self._settings, self.skill, self._state = settings, skill, state  # the skill in force, a file
@@ -62,7 +69,7 @@ class Recorder(McapFile):
         self._topics = {
             channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
         }
-        super().__init__(Path(path), joints=len(settings.joints.names))
+        super().__init__(Path(path), joints=len(settings.joints.names), compressed=not checksums)
         about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
         self.kept = self.pending = 0  # ticks in the file, ticks that wait for the end of their chunk
         try:
@@ -70,6 +77,8 @@ class Recorder(McapFile):
             self.attach("settings.json", msgspec.json.encode(settings), time_ns)
             self.attach("skill.npz", skill, time_ns)
             self.attach("arm.urdf", self._urdf.encode(), time_ns)
+            if checksums:
+                self.attach(CHECKSUMS, checksums, time_ns)
         except OSError:
             self.abandon()
             raise
@@ -88,7 +97,7 @@ class Recorder(McapFile):
     def write(
         self,
         tick: Tick,
-        frame: Record,
+        frame: Record | None,
         *,
         time_ns: int,
         timing: Record | None = None,
@@ -114,7 +123,8 @@ class Recorder(McapFile):
                 put("skill", cdr.encode_skill(event.payload), time_ns)
             else:
                 put(event.kind, event.payload, time_ns)
-        put("frame", encode(frame), time_ns)
+        if frame is not None:
+            put("frame", encode(frame), time_ns)
         if timing is not None:
             put("timing", encode(timing), time_ns)
         if state is not None:
@@ -124,7 +134,7 @@ class Recorder(McapFile):
             put("skill_in_force", cdr.encode_skill(skill), time_ns)
         for key, payload in outputs:
             put(key, payload, time_ns)
-        if tick.index % channels.BY_KEY["/tf"].every == 0:
+        if frame is not None and tick.index % channels.BY_KEY["/tf"].every == 0:
             put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
         self.part_ends()
 
@@ -187,10 +197,18 @@ class Recording:
     """A recording on disk: its settings, its skill, and its steps, which are read one by one."""
 
     def __init__(
-        self, path: Path, settings: Settings, skill: bytes, urdf: str, metadata: dict[str, str], *, truncated: bool
+        self,
+        path: Path,
+        settings: Settings,
+        attached: Mapping[str, bytes],
+        metadata: dict[str, str],
+        *,
+        truncated: bool,
     ) -> None:
-        self.path, self.settings, self.skill, self.urdf, self.metadata = path, settings, skill, urdf, metadata
-        self.truncated = truncated
+        self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, truncated
+        self.skill, self.urdf = attached["skill.npz"], attached.get("arm.urdf", b"").decode(errors="replace")
+        checksums = attached.get(CHECKSUMS, b"")
+        self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
         self.faults: list[FileFault] = []  # known once all steps are read
 
     @classmethod
@@ -221,8 +239,7 @@ class Recording:
             settings = msgspec.json.decode(parts["settings.json"], type=Settings)
         except msgspec.DecodeError as error:
             raise RecordingError(f"the settings in {path} are not understood: {error}") from None
-        urdf = parts.get("arm.urdf", b"").decode(errors="replace")
-        return cls(path, settings, parts["skill.npz"], urdf, about, truncated=ends_early(path))
+        return cls(path, settings, parts, about, truncated=ends_early(path))
 
     def ticks(self) -> int | None:
         """The number of ticks by the file's summary; None where the summary is missing."""
@@ -234,14 +251,20 @@ class Recording:
                 return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
         return None
 
-    def steps(self, *, outputs: bool = True) -> Iterator[Step]:
+    def steps(self, *, outputs: bool = True, whole: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.
 
         Without `outputs` only the inputs: so recordings of versions with other frames and states
-        can be read. Raises RecordingError on what cannot be decoded.
+        can be read. Raises RecordingError on what cannot be decoded, and where not all frames are
+        there as a `whole`.
         """
+        if outputs and whole and self.checksums:
+            raise RecordingError(
+                f"{self.path} keeps checksums of its frames: thirdhand replay {shlex.quote(str(self.path))} "
+                "--output whole.mcap writes a recording with all of them"
+            )
         messages = Messages(self.path)
-        yield from steps(messages, self.settings, outputs=outputs)
+        yield from steps(messages, self.settings, outputs=outputs, whole=not self.checksums)
         self.faults = messages.faults
         self.truncated = any(fault.cut for fault in messages.faults)
 

@@ -4,6 +4,7 @@ frame with what it decided then.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,11 +16,11 @@ from service.contract import channels
 from service.contract.messages import WireError
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, differences, encode
-from service.core.skill.skill import Skill
-from service.learning.skill_file import SkillError, decoded
+from service.core.outputs import Outputs, outgoing
+from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.recording.mcap_file import RecordingError, machine
-from service.recording.recording import Recording
-from service.recording.steps import Gap, Step
+from service.recording.recording import Recorder, Recording
+from service.recording.steps import Gap, Step, checksum
 
 TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
 POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
@@ -79,30 +80,38 @@ class Replay:
             lines.append("nothing to compare: the recording holds no state to start from")
         if self.first_difference:
             lines.append(self.first_difference)
-            lines.append(
-                "largest differences: "
-                + ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
-            )
+            largest = ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
+            lines.append(f"largest differences: {largest or 'none in a frame that is kept as a whole'}")
             if self.recorded_on != self.here:
                 lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
         return "\n".join(lines)
 
 
 def replay(
-    first: Path | str, *more: Path | str, after: int | None = None, progress: Callable[[int], None] | None = None
+    first: Path | str,
+    *more: Path | str,
+    after: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    output: Path | None = None,
 ) -> Replay:
     """Runs the core on a recording, and on those that follow it, and compares every frame.
+
+    What is decided now is written to `output`, which is for one recording without gaps.
 
     It starts from the first state or, with `after`, from the first one at or after that tick, and
     again from the state behind each gap. Two recordings join without a gap where the second begins
     with the state in which the first ends. Raises RecordingError.
     """
     recordings = [Recording.open(path) for path in (first, *more)]
+    if output is not None and (more or output.resolve() == Path(first).resolve()):
+        raise RecordingError(f"{output} is to hold what one other recording becomes: not several, nor itself")
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
     before: Step | None = None
     with threadpool_limits(1):
         for i, recording in enumerate(recordings):
-            segments = _Comparison(recording, result, after=after, before=before, follows=i > 0, progress=progress)
+            segments = _Comparison(
+                recording, result, after=after, before=before, follows=i > 0, progress=progress, output=output
+            )
             before = segments.compared()
             result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
             result.truncated = result.truncated or recording.truncated
@@ -113,10 +122,10 @@ class _Skills:
     """The skills of a recording by digest, as far as it has been read."""
 
     def __init__(self, recording: Recording) -> None:
-        self._found: dict[bytes, Skill] = {}
+        self._found: dict[bytes, StoredSkill] = {}
         self.decoded(recording.skill)
 
-    def decoded(self, data: bytes) -> Skill:
+    def decoded(self, data: bytes) -> StoredSkill:
         """The skill in the bytes of its file; the same object each time. Raises SkillError."""
         skill = decoded(data, origin="the recording", recorded=True)
         return self._found.setdefault(skill.digest, skill)
@@ -127,7 +136,7 @@ class _Skills:
             self.decoded(step.skill)
         return tuple(self._event(kind, payload) for kind, payload in step.events)
 
-    def in_force(self, start: Step) -> Skill | None:
+    def in_force(self, start: Step) -> StoredSkill | None:
         """The skill in force after a step with a state; None where it has not been read."""
         assert start.state is not None
         return self._found.get(start.state["skill"].tobytes())
@@ -154,14 +163,28 @@ class _Comparison:
         before: Step | None,
         follows: bool,
         progress: Callable[[int], None] | None,
+        output: Path | None,
     ) -> None:
         self._recording, self._result, self._after, self._progress = recording, result, after, progress
+        self._output = output
+        self._recorder: Recorder | None = None
         self._skills = _Skills(recording)
-        self._steps = recording.steps()
+        self._steps = recording.steps(whole=False)
         self._follows = follows  # another recording
         self._step = before  # the last that was read
         self._gap_at: Step | None = None
         self._controller: Controller
+
+    def _anew(self, skill: StoredSkill, start: Step) -> contextlib.AbstractContextManager[Recorder | None]:
+        """What takes down what is decided now, if that is asked for."""
+        if self._output is None:
+            return contextlib.nullcontext()
+        if self._result.missing:
+            raise RecordingError(f"{self._output} cannot be written: {self._result.missing[-1]}")
+        recording = self._recording
+        return Recorder(
+            self._output, settings=recording.settings, skill=skill.file, state=start.state, urdf=recording.urdf
+        )
 
     def compared(self) -> Step | None:
         """The last step, once all are compared."""
@@ -173,7 +196,8 @@ class _Comparison:
             assert skill is not None
             self._controller = Controller(self._recording.settings, skill, start.state, urdf=self._recording.urdf)
             self._step, self._gap_at = start, None
-            run(self._controller, self._ticks(), [self.compare])
+            with self._anew(skill, start) as self._recorder:
+                run(self._controller, self._ticks(), [self.compare])
             start = None if self._gap_at is None else self._next_start(self._gap_at)
         return self._step
 
@@ -240,18 +264,23 @@ class _Comparison:
 
     def compare(self, tick: Tick, frame: Frame) -> None:
         """Compares the newest tick's frame, and the state after it, with what was recorded."""
-        step, result = self._step, self._result
+        step, result, checksums = self._step, self._result, self._recording.checksums
         assert step is not None
-        assert step.frame is not None
-        different = differences(step.frame, frame)
-        if step.state is not None:
-            after = differences(step.state, self._controller.state)
-            different |= {f"state.{name}": value for name, value in after.items()}
+        different = {} if step.frame is None else differences(step.frame, frame)
+        state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
+        if step.state is not None and state is not None:
+            different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
+        outputs: Outputs = ()
+        if checksums or self._recorder:
+            outputs = outgoing(frame, step.time_ns, self._recording.settings.joints.names)
+        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        if self._recorder:
+            self._recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
         result.ticks += 1
-        result.identical += not different
-        if different and not result.first_difference:
+        result.identical += same
+        if not same and not result.first_difference:
             fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
-            result.first_difference = f"first difference at tick {tick.index}: {fields}"
+            result.first_difference = f"first difference at tick {tick.index}: {fields or 'its checksum'}"
         for name, value in different.items():
             result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
         if self._progress is not None and result.ticks % 1000 == 0:

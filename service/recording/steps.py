@@ -4,6 +4,7 @@ and where ticks are missing.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,7 +12,8 @@ from typing import Any, NamedTuple
 from service.config import Settings
 from service.contract import cdr, channels
 from service.contract.messages import WireError
-from service.core.frame import TIMING, Record, decode, frame_layout, state_layout
+from service.core.frame import TIMING, Frame, Record, decode, encode, frame_layout, state_layout
+from service.core.outputs import Outputs
 from service.recording.mcap_file import RecordingError
 from service.recording.mcap_reader import Messages
 
@@ -22,7 +24,8 @@ REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 class Step(NamedTuple):
     """One recorded tick: what it consumed, what it decided, and the state after it if recorded.
 
-    A step without `frame` holds only a state: before the first tick, or the first behind damage.
+    A step without `frame` holds only a state: before the first tick, or the first behind damage;
+    or of its frame a checksum is kept.
     Where ticks were `lost` before this one, replay continues from its `state` with the skill in
     force, which is recorded again where it may have changed. `damage` says why what was recorded
     before this step cannot be read; empty: it can.
@@ -58,9 +61,18 @@ class Gap:
         return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
 
 
-def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[Step]:
+def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
+    """A number (32 bits) for what a tick decided and published, and for the state after it if
+    given.
+    """
+    parts = (encode(frame), *(payload for _, payload in outputs), b"" if state is None else encode(state))
+    return zlib.crc32(b"".join(parts))
+
+
+def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
     """Every complete tick, in order, after the initial state if there is one; without `outputs`
-    only its inputs. Raises RecordingError on what cannot be decoded.
+    only its inputs; with a frame each where all are there as a `whole`. Raises RecordingError on
+    what cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
@@ -73,7 +85,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool) -> Iterator[
         if step is None:
             return
         numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
-        lacks_frame = outputs and "frame" not in step
+        lacks_frame = outputs and whole and "frame" not in step
         if len(messages.faults) > seen and (len(came) != len(numbers) or lacks_frame):
             return
         kinds = [_kind(number) for number in numbers]

@@ -31,10 +31,10 @@ def rows(path: Path) -> list[list[str]]:
 
 
 def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page, folder = tmp_path / "report.html", tmp_path / "tables"
-    assert main(["report", str(GOLDEN), str(GOLDEN), "--html", str(page), "--csv", str(folder)]) == 0
+    assert main(["report", str(golden), str(golden), "--html", str(page), "--csv", str(folder)]) == 0
     said = capsys.readouterr().out
     for words in ("Nothing is missing in it.", "hold: stale_hand", "Side by side", "difference", "same"):
         assert words in said
@@ -66,7 +66,7 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     assert float(modes[-1][0]) + float(modes[-1][1]) == pytest.approx(20.03, abs=0.02)
 
     heads, *ticks = rows(folder / "golden" / "ticks.csv")
-    frames = [step.frame for step in Recording.open(GOLDEN).steps() if step.frame is not None]
+    frames = [step.frame for step in Recording.open(golden).steps() if step.frame is not None]
     assert len(ticks) == len(frames)
     row = dict(zip(heads, ticks[5000], strict=True))
     assert int(row["tick"]) == int(frames[5000]["tick"])
@@ -74,12 +74,12 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
 
 
 def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty, cut = tmp_path / "empty.mcap", tmp_path / "cut.mcap"
     with Recorder(empty, settings=Settings(), skill=(RECORDINGS / "soldering.npz").read_bytes(), state=blank(STATE)):
         pass
-    whole = GOLDEN.read_bytes()
+    whole = golden.read_bytes()
     cut.write_bytes(whole[: len(whole) // 8])
     page = tmp_path / "page.html"
     assert main(["report", str(empty), str(cut), "--html", str(page), "--csv", str(tmp_path / "tables")]) == 0
@@ -98,6 +98,7 @@ def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
         ([str(RECORDINGS / "demonstration-1.mcap")], 1, "not a recording of thirdhand"),
         ([str(GOLDEN), "--html", "no/such/folder.html"], 2, "there is no folder no/such"),
         ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file, a folder needed"),
+        ([str(GOLDEN)], 1, f"keeps checksums of its frames: thirdhand replay {GOLDEN} --output whole.mcap"),
     ],
 )
 def test_what_cannot_be_read_or_written_is_said_first(

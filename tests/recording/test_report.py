@@ -32,7 +32,6 @@ from service.report.stages import LEAST_S
 from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
-from support.paths import RECORDINGS
 from support.wam import URDF
 
 SETTINGS = Settings()
@@ -113,15 +112,15 @@ class Told:
 
 
 @pytest.fixture(scope="module")
-def golden() -> Report:
-    return reported(RECORDINGS / "golden.mcap")
+def session(golden: Path) -> Report:
+    return reported(golden)
 
 
-def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden: Report) -> None:
-    ends = [span.start_s + span.lasts_s for span in golden.spans]
-    assert [span.start_s for span in golden.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
-    assert ends[-1] == pytest.approx(golden.lasts_s) == pytest.approx(SECONDS, abs=0.05)
-    held = {span.reason: span for span in golden.spans if span.mode is Mode.HOLD}
+def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:
+    ends = [span.start_s + span.lasts_s for span in session.spans]
+    assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
+    assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SECONDS, abs=0.05)
+    held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     for reason, (begin_s, end_s) in {
         Reason.STALE_HAND: (DROPOUT_S[0] + 0.25, DROPOUT_S[1]),  # so long the tool could do without that hand
         Reason.OPERATOR: HOLD_S,
@@ -138,30 +137,30 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(golden:
     )
     assert far is not None
     assert float(far[1]) > 11.0
-    assert golden.seconds(Mode.FOLLOW) + golden.seconds(Mode.HOLD) == pytest.approx(golden.lasts_s)
-    assert (golden.faults, golden.lacks) == ((), ())
+    assert session.seconds(Mode.FOLLOW) + session.seconds(Mode.HOLD) == pytest.approx(session.lasts_s)
+    assert (session.faults, session.lacks) == ((), ())
 
 
-def test_rejections_and_limits_are_those_of_the_frames(golden: Report) -> None:
-    frames = np.array([step.frame for step in Recording.open(golden.path).steps() if step.frame is not None])
-    assert sum(one.samples for one in golden.rejections) == int(frames[-1]["rejected"].sum())
-    assert all(BAD_S[0] <= one.first_s <= AWAY_S[1] + 0.1 for one in golden.rejections)
-    for limit in golden.limits:
+def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
+    frames = np.array([step.frame for step in Recording.open(session.path).steps() if step.frame is not None])
+    assert sum(one.samples for one in session.rejections) == int(frames[-1]["rejected"].sum())
+    assert all(BAD_S[0] <= one.first_s <= AWAY_S[1] + 0.1 for one in session.rejections)
+    for limit in session.limits:
         raised = (frames["flags"] & Flag[limit.name.upper()]) > 0
         assert limit.lasts_s == pytest.approx(raised.sum() * PERIOD_S)
         assert limit.times == sum(1 for begin, _ in runs(raised) if raised[begin])
-    assert {limit.name for limit in golden.limits} == {
+    assert {limit.name for limit in session.limits} == {
         str(flag.name).lower() for flag in Flag if (frames["flags"] & flag).any()
     }
-    assert golden.approach is not None
+    assert session.approach is not None
     known = (frames["hand_ages"] >= 0).any(axis=1)
-    assert golden.approach.distance_m == frames["hand_distance"][known].min()
+    assert session.approach.distance_m == frames["hand_distance"][known].min()
 
 
-def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(golden: Report) -> None:
-    by_name = [(place.name, place.start_s) for place in golden.places]
+def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
+    by_name = [(place.name, place.start_s) for place in session.places]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
-    first, again = [place for place in golden.places if place.name == "handover"]
+    first, again = [place for place in session.places if place.name == "handover"]
     assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
     assert first.end_s == pytest.approx(again.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
     assert first.best_m is not None
@@ -170,14 +169,14 @@ def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_we
     assert again.hands_m > 0.03
 
 
-def test_the_stages_of_a_task_are_told_in_their_order(golden: Report) -> None:
-    assert golden.stages[0].start_s < 0.5
-    assert [one.name for one in golden.stages][:3] == ["start to handover", "handover to glass", "glass to soldering"]
-    for one, after in itertools.pairwise(golden.stages):
+def test_the_stages_of_a_task_are_told_in_their_order(session: Report) -> None:
+    assert session.stages[0].start_s < 0.5
+    assert [one.name for one in session.stages][:3] == ["start to handover", "handover to glass", "glass to soldering"]
+    for one, after in itertools.pairwise(session.stages):
         assert one.name != after.name
         assert one.start_s + one.lasts_s <= after.start_s + 1e-9
-    frames = golden.columns.frames
-    for one in golden.stages:
+    frames = session.columns.frames
+    for one in session.stages:
         assert one.lasts_s > LEAST_S
         at = int((one.start_s + one.lasts_s / 2) / PERIOD_S)
         assert one.probable == pytest.approx(frames["stage_belief"][at], abs=0.5)
@@ -278,16 +277,16 @@ def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_n
     assert found.lasts_s == pytest.approx(1200 * PERIOD_S)
 
 
-def test_two_recordings_differ_in_the_settings_that_do(golden: Report, skill: Skill, tmp_path: Path) -> None:
+def test_two_recordings_differ_in_the_settings_that_do(session: Report, skill: Skill, tmp_path: Path) -> None:
     Told(skill, tmp_path / "a.mcap")
-    names = {name for name, *_ in differing_settings(golden, reported(tmp_path / "a.mcap"))}
+    names = {name for name, *_ in differing_settings(session, reported(tmp_path / "a.mcap"))}
     assert not {name for name in names if not name.startswith("made with ")}
 
 
-def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(golden: Report) -> None:
-    told = why_missed(golden, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
-    best_m = golden.best_m("glass")
+def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Report) -> None:
+    told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
+    best_m = session.best_m("glass")
     assert best_m is not None
     assert told.startswith("the arm followed; with the hands where 'glass' was taught the tool came within")
     assert told.endswith(f" {1000 * best_m:.0f} mm")
-    assert why_missed(golden, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
+    assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
