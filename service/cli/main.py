@@ -162,6 +162,9 @@ def parser() -> argparse.ArgumentParser:
     option(c, "files", "FILE", "a recording (.mcap); of two their differences", nargs="+")
     option(c, "--html", "FILE", "all of it with plots as one page, too")
     option(c, "--csv", "DIR", "each table, and every tick, as CSV files there, too")
+    option(c, "--lerobot", "DIR", "all as a new data set of LeRobot 3.0 there: joints, hands and commands, too")
+    option(c, "--fps", "N", "rows of it a second", 50, type=within(int, 1, 1000))
+    option(c, "--task", "TEXT", "of it, in words (default: the name of the skill)")
 
     c = command(
         "learn",

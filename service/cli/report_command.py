@@ -35,6 +35,8 @@ def report(args: argparse.Namespace) -> int:
         check_writable(args.html)
     if args.csv and args.csv.exists() and not args.csv.is_dir():
         raise UsageError(f"--csv {args.csv} is a file, a folder needed")
+    if args.lerobot and args.lerobot.exists():
+        raise UsageError(f"--lerobot {args.lerobot} is there already, a new folder needed")
     reports = []
     for path in args.files:
         with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
@@ -50,6 +52,13 @@ def report(args: argparse.Namespace) -> int:
     if args.csv:
         write_csv(reports, args.csv)
         console.print(f"tables in {args.csv}")
+    if args.lerobot:
+        from service.report import lerobot
+
+        columns = [one.columns for one in reports]
+        task = args.task or ", ".join({one.skill.name: one.tick for found in columns for one in found.skills})
+        parts, rows = lerobot.write(columns, args.lerobot, fps=args.fps, task=task)
+        console.print(f"data set {args.lerobot}: {parts} episodes, {rows} rows")
     if args.html:
         from service.report.page import page  # draws, which takes a while to import
 

@@ -196,16 +196,8 @@ def _take_hint(path: Path) -> str:
 class Recording:
     """A recording on disk: its settings, its skill, and its steps, which are read one by one."""
 
-    def __init__(
-        self,
-        path: Path,
-        settings: Settings,
-        attached: Mapping[str, bytes],
-        metadata: dict[str, str],
-        *,
-        truncated: bool,
-    ) -> None:
-        self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, truncated
+    def __init__(self, path: Path, settings: Settings, attached: Mapping[str, bytes], metadata: dict[str, str]) -> None:
+        self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, ends_early(path)
         self.skill, self.urdf = attached["skill.npz"], attached.get("arm.urdf", b"").decode(errors="replace")
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
@@ -239,7 +231,7 @@ class Recording:
             settings = msgspec.json.decode(parts["settings.json"], type=Settings)
         except msgspec.DecodeError as error:
             raise RecordingError(f"the settings in {path} are not understood: {error}") from None
-        return cls(path, settings, parts, about, truncated=ends_early(path))
+        return cls(path, settings, parts, about)
 
     def ticks(self) -> int | None:
         """The number of ticks by the file's summary; None where the summary is missing."""

@@ -109,10 +109,7 @@ def replay(
     before: Step | None = None
     with threadpool_limits(1):
         for i, recording in enumerate(recordings):
-            segments = _Comparison(
-                recording, result, after=after, before=before, follows=i > 0, progress=progress, output=output
-            )
-            before = segments.compared()
+            before = _Comparison(recording, result, after, before, i > 0, progress, output).compared()
             result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
             result.truncated = result.truncated or recording.truncated
     return result
@@ -151,40 +148,31 @@ class _Skills:
             raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
 
 
+@dataclass
 class _Comparison:
     """Compares a recording from gap to gap; each part is run by a controller of its own."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        result: Replay,
-        *,
-        after: int | None,
-        before: Step | None,
-        follows: bool,
-        progress: Callable[[int], None] | None,
-        output: Path | None,
-    ) -> None:
-        self._recording, self._result, self._after, self._progress = recording, result, after, progress
-        self._output = output
-        self._recorder: Recorder | None = None
-        self._skills = _Skills(recording)
-        self._steps = recording.steps(whole=False)
-        self._follows = follows  # another recording
-        self._step = before  # the last that was read
-        self._gap_at: Step | None = None
-        self._controller: Controller
+    recording: Recording
+    result: Replay
+    after: int | None
+    last: Step | None  # that was read
+    follows: bool  # another recording
+    progress: Callable[[int], None] | None
+    output: Path | None
+    recorder: Recorder | None = None
+    gap_at: Step | None = None
+
+    def __post_init__(self) -> None:
+        self._skills, self._steps = _Skills(self.recording), self.recording.steps(whole=False)
 
     def _anew(self, skill: StoredSkill, start: Step) -> contextlib.AbstractContextManager[Recorder | None]:
         """What takes down what is decided now, if that is asked for."""
-        if self._output is None:
+        if self.output is None:
             return contextlib.nullcontext()
-        if self._result.missing:
-            raise RecordingError(f"{self._output} cannot be written: {self._result.missing[-1]}")
-        recording = self._recording
-        return Recorder(
-            self._output, settings=recording.settings, skill=skill.file, state=start.state, urdf=recording.urdf
-        )
+        if self.result.missing:
+            raise RecordingError(f"{self.output} cannot be written: {self.result.missing[-1]}")
+        settings, urdf = self.recording.settings, self.recording.urdf
+        return Recorder(self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf)
 
     def compared(self) -> Step | None:
         """The last step, once all are compared."""
@@ -194,16 +182,16 @@ class _Comparison:
         while start is not None:
             skill = self._skills.in_force(start)
             assert skill is not None
-            self._controller = Controller(self._recording.settings, skill, start.state, urdf=self._recording.urdf)
-            self._step, self._gap_at = start, None
-            with self._anew(skill, start) as self._recorder:
+            self._controller = Controller(self.recording.settings, skill, start.state, urdf=self.recording.urdf)
+            self.last, self.gap_at = start, None
+            with self._anew(skill, start) as self.recorder:
                 run(self._controller, self._ticks(), [self.compare])
-            start = None if self._gap_at is None else self._next_start(self._gap_at)
-        return self._step
+            start = None if self.gap_at is None else self._next_start(self.gap_at)
+        return self.last
 
     def _begins(self, start: Step) -> bool:
         """Whether the first step has a state to start from; notes what is missing before it."""
-        before, result = self._step, self._result
+        before, result = self.last, self.result
         self._skills.events(start)
         joins = (
             before is not None
@@ -213,19 +201,19 @@ class _Comparison:
         )
         if joins:
             result.joined += 1
-        elif self._follows or start.lost or start.damage:
-            why = "" if start.lost else start.damage or f"{self._recording.path.name} begins anew"
+        elif self.follows or start.lost or start.damage:
+            why = "" if start.lost else start.damage or f"{self.recording.path.name} begins anew"
             self._note(start, why)
-        return start.state is not None and self._after is None and self._resumes(start)
+        return start.state is not None and self.after is None and self._resumes(start)
 
     def _note(self, step: Step, why: str) -> None:
-        before = None if self._step is None else self._step.tick
-        self._result.missing.append(Pause(before, step.tick, step.lost, why))
+        before = None if self.last is None else self.last.tick
+        self.result.missing.append(Pause(before, step.tick, step.lost, why))
 
     def _resumes(self, step: Step) -> bool:
         """Whether a controller can continue from the state of a step."""
         skill = self._skills.in_force(step)
-        for gap in reversed(self._result.missing):
+        for gap in reversed(self.result.missing):
             if gap.resumed is not None:
                 break
             if skill is None and "skill" not in gap.why:
@@ -237,8 +225,8 @@ class _Comparison:
         """The next step, `step` or later, from whose state a controller can continue."""
         while step is not None:
             self._skills.events(step)
-            self._step = step
-            wanted = self._after is None or step.tick >= self._after
+            self.last = step
+            wanted = self.after is None or step.tick >= self.after
             if step.state is not None and wanted and self._resumes(step):
                 return step
             step = next(self._steps, None)
@@ -249,33 +237,33 @@ class _Comparison:
     def _ticks(self) -> Iterator[Tick]:
         """The ticks up to the next gap. Raises RecordingError."""
         for step in self._steps:
-            assert self._step is not None
-            if step.tick <= self._step.tick:
+            assert self.last is not None
+            if step.tick <= self.last.tick:
                 raise RecordingError(
-                    f"{self._recording.path}: tick {step.tick} comes after tick {self._step.tick}; growing ticks needed"
+                    f"{self.recording.path}: tick {step.tick} comes after tick {self.last.tick}; growing ticks needed"
                 )
             if step.lost or step.damage:
                 self._note(step, step.damage)
-                self._gap_at = step
+                self.gap_at = step
                 return
             events = self._skills.events(step)
-            self._step = step
+            self.last = step
             yield Tick(step.tick, events)
 
     def compare(self, tick: Tick, frame: Frame) -> None:
         """Compares the newest tick's frame, and the state after it, with what was recorded."""
-        step, result, checksums = self._step, self._result, self._recording.checksums
+        step, result, checksums = self.last, self.result, self.recording.checksums
         assert step is not None
         different = {} if step.frame is None else differences(step.frame, frame)
         state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
         if step.state is not None and state is not None:
             different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
         outputs: Outputs = ()
-        if checksums or self._recorder:
-            outputs = outgoing(frame, step.time_ns, self._recording.settings.joints.names)
+        if checksums or self.recorder:
+            outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
         same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
-        if self._recorder:
-            self._recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
+        if self.recorder:
+            self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
         result.ticks += 1
         result.identical += same
         if not same and not result.first_difference:
@@ -283,8 +271,8 @@ class _Comparison:
             result.first_difference = f"first difference at tick {tick.index}: {fields or 'its checksum'}"
         for name, value in different.items():
             result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
-        if self._progress is not None and result.ticks % 1000 == 0:
-            self._progress(result.ticks)
+        if self.progress is not None and result.ticks % 1000 == 0:
+            self.progress(result.ticks)
 
 
 def ticks(recording: Recording) -> Iterator[Tick]:

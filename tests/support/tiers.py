@@ -76,6 +76,7 @@ SLOW = (  # the longest first: so they begin first
     "kmp/test_low_rank.py",
     "kmp/test_tutorial.py",
     "recording/test_sinks.py",
+    "recording/test_lerobot.py",
     "recording/test_damage.py",
     "daemon/test_via_point_requests.py",
     "daemon/test_skill_requests.py",
