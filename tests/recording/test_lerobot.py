@@ -12,9 +12,15 @@ from pyarrow import parquet
 
 from service.cli.main import main
 from service.contract import cdr
+from service.core.controller import Controller, run
+from service.core.frame import Tick
+from service.learning.skill_file import StoredSkill
 from service.recording.recording import Recorder, Recording
 from service.recording.replay import ticks
-from support.wam import JOINT_NAMES
+from sim.scene import Scene
+from sim.script import HandScript
+from support.in_process import ASSUMED, resting, ticks_of
+from support.wam import JOINT_NAMES, URDF
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)
@@ -108,6 +114,39 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
     item = found[found.meta.episodes["dataset_to_index"][0]]
     assert item["task"] == "Hold the board."
     assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (1, 0, (2, 7))
+
+
+def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
+    """A recording of an arm that tells nothing of its joints."""
+    controller = Controller(ASSUMED, skill, urdf=URDF)
+    with Recorder(path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf) as recorder:
+        run(controller, inputs, [lambda tick, frame: recorder.write(tick, frame, time_ns=tick.index * 2_000_000)])
+    return path
+
+
+def test_an_arm_that_tells_nothing_is_where_it_was_last_told_to_be(skill: StoredSkill, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "a.mcap", skill, list(ticks_of(HandScript(Scene(), seed=4)))[:1500])
+    assert main(["report", str(path), "--lerobot", str(tmp_path / "data"), "--fps", "500"]) == 0
+    rows = parquet.read_table(tmp_path / "data" / "data" / FIRST).to_pydict()
+    assert rows["observation.state"][1:] == rows["action"][:-1]
+    assert np.ptp(rows["action"], axis=0).max() > 0.1
+    tasks = parquet.read_table(tmp_path / "data" / "meta" / "tasks.parquet").to_pydict()
+    assert tasks["task"] == [skill.name]
+
+
+def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
+    skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    followed = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    of_another = recorded(tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1))
+    alone = recorded(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
+    for files, why in (
+        ([followed, of_another], "one arm is needed"),
+        ([alone], "nothing was commanded after both hands had been seen"),
+    ):
+        assert main(["report", *map(str, files), "--lerobot", str(tmp_path / "data")]) == 1
+        assert why in capsys.readouterr().err
+        assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(
