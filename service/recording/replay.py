@@ -55,11 +55,6 @@ class Replay:
     here: str = ""
 
     @property
-    def gaps(self) -> int:
-        """The number of gaps."""
-        return len(self.missing)
-
-    @property
     def exact(self) -> bool:
         """Whether nothing is missing and every frame is identical, bit for bit."""
         complete = not (self.missing or self.faults or self.truncated)
