@@ -16,7 +16,7 @@ from service.contract import channels
 from service.contract.messages import WireError
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, differences, encode
-from service.core.outputs import Outputs, outgoing
+from service.core.outputs import outgoing
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.recording.mcap_file import RecordingError, machine
 from service.recording.recording import Recorder, Recording
@@ -253,9 +253,7 @@ class _Comparison:
         state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
         if step.state is not None and state is not None:
             different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
-        outputs: Outputs = ()
-        if checksums or self.recorder:
-            outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
+        outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
         same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
         if self.recorder:
             self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
