@@ -14,10 +14,8 @@ import msgspec
 
 from service.cli.usage import UsageError
 from service.config import Settings, converted
-from service.daemon import daemon
+from service.daemon.start import Start
 from service.described_arm import SettingsError
-from service.recording.paths import skills_folder
-from service.recording.scribe import Scribe
 from service.shipped import SHIPPED_SKILL, cell_of
 
 
@@ -26,7 +24,6 @@ def serve(args: argparse.Namespace) -> int:
     os.umask(0o077)  # its files are private to its user
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
-    skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:
         try:
@@ -34,14 +31,24 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
-    scribe = Scribe(settings, folder=folder, live_port=args.live)
+    with Start(settings) as start:
+        from service.daemon import daemon  # heavy, while who asks is answered
+        from service.recording.paths import skills_folder
+        from service.recording.scribe import Scribe
 
-    def announce(running: daemon.Daemon) -> None:
-        where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
-        print(f"listening on {where} as cell {settings.cell}", flush=True)
+        def announce(running: daemon.Daemon) -> None:
+            where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
+            print(f"listening on {where} as cell {settings.cell}", flush=True)
 
-    skill = args.skill or skills / SHIPPED_SKILL
-    missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, announce=announce)
+        skills = skills_folder(settings)
+        missing = daemon.serve(
+            settings,
+            args.skill or skills / SHIPPED_SKILL,
+            skills=skills,
+            scribe=Scribe(settings, folder=folder, live_port=args.live),
+            start=start,
+            announce=announce,
+        )
     sys.stdout.flush()
     logging.shutdown()
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries

@@ -2,7 +2,8 @@
 control process need not.
 
 A skill is returned as a small pickle with its arrays in shared memory, so that the control process
-copies and solves nothing.
+copies and solves nothing. What it computes with is imported by the first request, so that a start
+costs nothing.
 """
 
 from __future__ import annotations
@@ -18,16 +19,18 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service import child
-from service.config import Settings, robot_description
+from service.config import Settings, ToolSettings, robot_description
 from service.contract.requests import ViaPoint
-from service.core.frame import Vector
-from service.core.way_out import WayOut
-from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.learning.via_points import MAX_GAIN, adapted
 
+if TYPE_CHECKING:
+    from service.core.frame import Vector
+    from service.learning.skill_file import StoredSkill
+
+MAX_GAIN = ToolSettings().max_gain
+AWAKE = b"\0"  # asks the process to be so, and is its answer
 TIMEOUT_S = 8.0  # shorter than a client waits
 
 
@@ -41,6 +44,14 @@ class SkillWorker:
         self._max_gain = max_gain
         self._busy = threading.Lock()
         self._child: child.Child | None = None
+        self._is_woken = self._is_awake = False  # whether it is to import what it needs, and has
+
+    def start(self) -> None:
+        """Starts the process, where it is not there; it sleeps until the first request."""
+        if self._child is None or self._child.process.poll() is not None:
+            self._end()
+            self._child = child.start("service.daemon.skill_worker", socket.SOCK_STREAM)
+            self._is_woken = self._is_awake = False
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
@@ -77,16 +88,20 @@ class SkillWorker:
             self._child = None
 
     def _ask(self, timeout_s: float, *request: Any) -> Any:
+        from service.learning.skill_file import SkillError
+
         with self._busy:
-            if self._child is None or self._child.process.poll() is not None:
-                self._end()
-                self._child = child.start("service.daemon.skill_worker", socket.SOCK_STREAM)
+            self.start()
+            assert self._child is not None
             try:
                 self._child.socket.settimeout(timeout_s)
+                if not self._is_awake:
+                    self._wake(self._child.socket)
                 _send(self._child.socket, pickle.dumps(request))
                 answer = _receive(self._child.socket)
             except TimeoutError:
-                self._end()
+                if self._is_awake:
+                    self._end()
                 raise SkillError(
                     f"the skill worker did not answer within {timeout_s:g} s; nothing was changed"
                 ) from None
@@ -96,6 +111,15 @@ class SkillWorker:
         if isinstance(answer, str):
             raise SkillError(answer)
         return answer
+
+    def _wake(self, channel: socket.socket) -> None:
+        """Has it import what it needs; where that takes too long, it goes on with it."""
+        if not self._is_woken:
+            channel.send(AWAKE)
+            self._is_woken = True
+        if not channel.recv(1):
+            raise EOFError
+        self._is_awake = True
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:
@@ -119,15 +143,23 @@ def _receive(channel: socket.socket) -> Any:
 def _work(*request: Any) -> StoredSkill | list[Vector]:
     """What one request asks for."""
     if isinstance(request[0], Settings):
+        from service.core.way_out import WayOut
+
         settings, *arguments = request
         return WayOut(settings, robot_description(settings)).find(*arguments)
-    return _skill(*request)
+    return skill_of(*request)
 
 
-def _skill(
+def skill_of(
     source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
-    """The skill in a file, or the one in force (the bytes of its file) through these via-points."""
+    """The skill in a file, or the one in force (the bytes of its file) through these via-points.
+
+    Raises SkillError.
+    """
+    from service.learning.skill_file import SkillError, decoded
+    from service.learning.via_points import adapted
+
     if isinstance(source, bytes):
         skill = adapted(
             decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain
@@ -146,8 +178,13 @@ def _main(descriptor: int) -> None:
     """The child: one request after the other until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     child.end_with_parent()
-    os.nice(10)
     with socket.socket(fileno=descriptor) as channel:
+        if not channel.recv(1):
+            return
+        from service.learning.skill_file import SkillError
+
+        os.nice(10)
+        channel.send(AWAKE)
         while True:
             try:
                 request = _receive(channel)

@@ -11,15 +11,15 @@ import os
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from service.config import ArmSettings, Files, Settings
 from service.daemon import daemon
 from service.daemon.daemon import Daemon
-from service.daemon.saved_via_points import state_folder
-from service.daemon.single_instance import Lock
 from service.daemon.skill_worker import SkillWorker
+from service.daemon.start import Start
 from service.network_settings import Network
 from service.recording.scribe import Scribe
 from service.shipped import recordings, shipped_skill
@@ -39,11 +39,8 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
             network=Network(listen=(), connect=(endpoint,), ros2_domain=ROS2_DOMAIN),
             files=Files(state=str(folder)),
         )
-        lock = Lock(state_folder(settings), cell)
-        scribe = Scribe(settings)
-        daemons.append(
-            Daemon(settings, skill, skill_worker=skill_worker, skills=recordings(), scribe=scribe, lock=lock)
-        )
+        more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": Start(settings)}
+        daemons.append(Daemon(settings, skill, skills=recordings(), **more))
         daemon.warm_up = lambda *_, **__: None  # once a process is enough
     for one, cell in zip(daemons, cells, strict=True):
         say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
