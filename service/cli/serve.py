@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import os
 import sys
@@ -16,7 +17,7 @@ from service.cli.usage import UsageError
 from service.config import Settings, converted
 from service.daemon.start import Start
 from service.described_arm import SettingsError
-from service.shipped import SHIPPED_SKILL, cell_of
+from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -24,6 +25,7 @@ def serve(args: argparse.Namespace) -> int:
     os.umask(0o077)  # its files are private to its user
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
+    skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:
         try:
@@ -32,15 +34,16 @@ def serve(args: argparse.Namespace) -> int:
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
     with Start(settings) as start:
+        gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
         from service.daemon import daemon  # heavy, while who asks is answered
-        from service.recording.paths import skills_folder
         from service.recording.scribe import Scribe
+
+        gc.enable()
 
         def announce(running: daemon.Daemon) -> None:
             where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
             print(f"listening on {where} as cell {settings.cell}", flush=True)
 
-        skills = skills_folder(settings)
         missing = daemon.serve(
             settings,
             args.skill or skills / SHIPPED_SKILL,

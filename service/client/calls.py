@@ -27,7 +27,7 @@ class Client:
     Only the reply of a live daemon counts, not one that a Zenoh storage kept.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 MAX_GAIN = ToolSettings().max_gain
 AWAKE = b"\0"  # asks the process to be so, and is its answer
-TIMEOUT_S = 8.0  # shorter than a client waits
+WAKE_S, TIMEOUT_S = 20.0, 8.0  # together shorter than a client waits
 
 
 class SkillWorker:
@@ -94,14 +94,15 @@ class SkillWorker:
             self.start()
             assert self._child is not None
             try:
-                self._child.socket.settimeout(timeout_s)
                 if not self._is_awake:
                     self._wake(self._child.socket)
+                self._child.socket.settimeout(timeout_s)
                 _send(self._child.socket, pickle.dumps(request))
                 answer = _receive(self._child.socket)
             except TimeoutError:
-                if self._is_awake:
-                    self._end()
+                if not self._is_awake:
+                    raise SkillError("the skill worker still starts; nothing was changed, try again") from None
+                self._end()
                 raise SkillError(
                     f"the skill worker did not answer within {timeout_s:g} s; nothing was changed"
                 ) from None
@@ -113,7 +114,8 @@ class SkillWorker:
         return answer
 
     def _wake(self, channel: socket.socket) -> None:
-        """Has it import what it needs; where that takes too long, it goes on with it."""
+        """Has it import what it needs; where that takes longer than WAKE_S, it goes on with it."""
+        channel.settimeout(WAKE_S)
         if not self._is_woken:
             channel.send(AWAKE)
             self._is_woken = True
