@@ -8,7 +8,7 @@ import threading
 
 from service.cli.progress import say
 from service.cli.usage import reaching
-from service.client import Client, StartingError
+from service.client import Client, StartingError, UnreachableError
 from service.config import Settings
 from service.described_arm import UnreadableError
 from service.shipped import cell_of
@@ -33,6 +33,8 @@ def follow(args: argparse.Namespace) -> int:
             client.status()
         except StartingError as error:
             say(f"{error}; it is waited for")
+        except UnreachableError:
+            pass  # nor is there one yet
         from service.arms.drive import Drive, DriveError  # heavy, as all below: nobody's absence is told sooner
         from service.arms.drive import follow as driven
         from service.arms.franka import FrankaArm
