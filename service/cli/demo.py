@@ -10,7 +10,7 @@ import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service.child import python
 from service.cli.progress import say
@@ -19,9 +19,6 @@ from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.launch import engine_of, launched, played
 from service.shipped import cell_of
-
-if TYPE_CHECKING:
-    from service.report.report import Report
 
 START_TIMEOUT_S = 60.0
 AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
@@ -93,7 +90,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     }
 
 
-def _why(found: Report, begun_s: float, events: dict[str, Any], name: str) -> str:
+def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
     """Why an event was missed, by the recording from the event before it on."""
     from service.report.report import why_missed
 

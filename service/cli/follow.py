@@ -8,7 +8,7 @@ import threading
 
 from service.cli.progress import say
 from service.cli.usage import reaching
-from service.client import Client, StartingError, UnreachableError
+from service.client import Client
 from service.config import Settings
 from service.described_arm import UnreadableError
 from service.shipped import cell_of
@@ -28,20 +28,13 @@ def follow(args: argparse.Namespace) -> int:
     reach = reaching(args)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with reach.session(at_once=True) as session:
-        client = Client(session, cell)
-        try:
-            client.status()
-        except StartingError as error:
-            say(f"{error}; it is waited for")
-        except UnreachableError:
-            pass  # nor is there one yet
         from service.arms.drive import Drive, DriveError  # heavy, as all below: nobody's absence is told sooner
         from service.arms.drive import follow as driven
         from service.arms.franka import FrankaArm
         from service.arms.simulated import SimulatedArm
         from service.daemon.clock import ask_for_real_time
 
-        status = client.wait_until_ready(timeout_s=args.wait)
+        status = Client(session, cell).wait_until_ready(timeout_s=args.wait)
         if status.joints != settings.joints.names:
             raise DriveError(
                 f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; here "

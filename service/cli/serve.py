@@ -15,7 +15,7 @@ import msgspec
 
 from service.cli.usage import UsageError
 from service.config import Settings, converted
-from service.daemon.start import Start
+from service.daemon.start import starting
 from service.described_arm import SettingsError
 from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 
@@ -33,7 +33,7 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
-    with Start(settings) as start:
+    with starting(settings) as start:
         gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
         from service.daemon import daemon  # heavy, while who asks is answered
         from service.recording.scribe import Scribe
@@ -44,14 +44,8 @@ def serve(args: argparse.Namespace) -> int:
             where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
             print(f"listening on {where} as cell {settings.cell}", flush=True)
 
-        missing = daemon.serve(
-            settings,
-            args.skill or skills / SHIPPED_SKILL,
-            skills=skills,
-            scribe=Scribe(settings, folder=folder, live_port=args.live),
-            start=start,
-            announce=announce,
-        )
+        skill, scribe = args.skill or skills / SHIPPED_SKILL, Scribe(settings, folder=folder, live_port=args.live)
+        missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
     sys.stdout.flush()
     logging.shutdown()
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries

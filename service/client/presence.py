@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from service.contract import channels
-from service.contract.requests import STARTING, Status
+from service.contract.requests import Status
 
 TIMEOUT_S = 5.0
 MOST_KEYS = 1000  # that Overheard remembers
@@ -19,14 +19,12 @@ MOST_KEYS = 1000  # that Overheard remembers
 
 class Cell(NamedTuple):
     """A cell that a daemon serves: its name, the daemon's Zenoh session, and its status, which is
-    None where the daemon does not answer in time, or access to it is denied, or is `starting`: how
-    far it is.
+    None where the daemon does not answer in time, or access to it is denied.
     """
 
     name: str
     session: str
     status: Status | None
-    starting: str = ""
 
 
 def living(session: zenoh.Session, cell: str, *, timeout_s: float = TIMEOUT_S) -> frozenset[str]:
@@ -55,17 +53,11 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
         for name in dict(found)
     ]
     statuses: dict[str, Status] = {}
-    starting: dict[str, str] = {}
     for replies in queries:
         for reply in replies:
-            if reply.replier_id is None:
-                continue
-            own = str(reply.replier_id.zid)
-            if reply.ok is not None:
-                statuses[own] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
-            elif reply.err and (text := reply.err.payload.to_bytes().decode(errors="replace")).startswith(STARTING):
-                starting[own] = text
-    return tuple(Cell(name, own, statuses.get(own), starting.get(own, "")) for name, own in found)
+            if reply.ok is not None and reply.replier_id is not None:
+                statuses[str(reply.replier_id.zid)] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
+    return tuple(Cell(name, own, statuses.get(own)) for name, own in found)
 
 
 class Overheard(AbstractContextManager["Overheard"]):

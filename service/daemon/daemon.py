@@ -89,7 +89,7 @@ class Daemon:
         self._stop = threading.Event()
         self._ended = threading.Event()
         urdf = robot_description(settings)
-        self._start, self._session = start, start.session  # who holds the cell
+        self._session = start.session
         warm_up(settings, skill, urdf=urdf)
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._measured_arm = MeasuredArm(settings, urdf)

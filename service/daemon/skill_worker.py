@@ -2,7 +2,7 @@
 control process need not.
 
 A skill is returned as a small pickle with its arrays in shared memory, so that the control process
-copies and solves nothing. What it computes with is imported by the first request, so that a start
+copies and solves nothing. What it computes with it imports when it is first asked, so that a start
 costs nothing.
 """
 
@@ -13,25 +13,29 @@ from service import one_blas_thread  # noqa: F401
 # isort: split
 import os
 import pickle
+import select
 import signal
 import socket
 import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service import child
-from service.config import Settings, ToolSettings, robot_description
+
+if __name__ == "__main__":
+    select.select([int(sys.argv[1])], [], [])
+
+# isort: split
+from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
+from service.core.frame import Vector
+from service.core.way_out import WayOut
+from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.via_points import MAX_GAIN, adapted
 
-if TYPE_CHECKING:
-    from service.core.frame import Vector
-    from service.learning.skill_file import StoredSkill
-
-MAX_GAIN = ToolSettings().max_gain
-AWAKE = b"\0"  # asks the process to be so, and is its answer
-WAKE_S, TIMEOUT_S = 20.0, 8.0  # together shorter than a client waits
+TIMEOUT_S, FIRST_S = 8.0, 25.0  # shorter than a client waits; the first answer comes after its imports
 
 
 class SkillWorker:
@@ -44,14 +48,13 @@ class SkillWorker:
         self._max_gain = max_gain
         self._busy = threading.Lock()
         self._child: child.Child | None = None
-        self._is_woken = self._is_awake = False  # whether it is to import what it needs, and has
+        self._first_s = FIRST_S  # that an answer of this child is waited for at least
 
     def start(self) -> None:
-        """Starts the process, where it is not there; it sleeps until the first request."""
+        """Starts the process, where it is not there."""
         if self._child is None or self._child.process.poll() is not None:
             self._end()
-            self._child = child.start("service.daemon.skill_worker", socket.SOCK_STREAM)
-            self._is_woken = self._is_awake = False
+            self._child, self._first_s = child.start("service.daemon.skill_worker", socket.SOCK_STREAM), FIRST_S
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
@@ -88,20 +91,14 @@ class SkillWorker:
             self._child = None
 
     def _ask(self, timeout_s: float, *request: Any) -> Any:
-        from service.learning.skill_file import SkillError
-
         with self._busy:
             self.start()
             assert self._child is not None
             try:
-                if not self._is_awake:
-                    self._wake(self._child.socket)
-                self._child.socket.settimeout(timeout_s)
+                self._child.socket.settimeout(max(timeout_s, self._first_s))
                 _send(self._child.socket, pickle.dumps(request))
-                answer = _receive(self._child.socket)
+                answer, self._first_s = _receive(self._child.socket), 0.0
             except TimeoutError:
-                if not self._is_awake:
-                    raise SkillError("the skill worker still starts; nothing was changed, try again") from None
                 self._end()
                 raise SkillError(
                     f"the skill worker did not answer within {timeout_s:g} s; nothing was changed"
@@ -112,16 +109,6 @@ class SkillWorker:
         if isinstance(answer, str):
             raise SkillError(answer)
         return answer
-
-    def _wake(self, channel: socket.socket) -> None:
-        """Has it import what it needs; where that takes longer than WAKE_S, it goes on with it."""
-        channel.settimeout(WAKE_S)
-        if not self._is_woken:
-            channel.send(AWAKE)
-            self._is_woken = True
-        if not channel.recv(1):
-            raise EOFError
-        self._is_awake = True
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:
@@ -145,8 +132,6 @@ def _receive(channel: socket.socket) -> Any:
 def _work(*request: Any) -> StoredSkill | list[Vector]:
     """What one request asks for."""
     if isinstance(request[0], Settings):
-        from service.core.way_out import WayOut
-
         settings, *arguments = request
         return WayOut(settings, robot_description(settings)).find(*arguments)
     return skill_of(*request)
@@ -159,9 +144,6 @@ def skill_of(
 
     Raises SkillError.
     """
-    from service.learning.skill_file import SkillError, decoded
-    from service.learning.via_points import adapted
-
     if isinstance(source, bytes):
         skill = adapted(
             decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain
@@ -180,13 +162,8 @@ def _main(descriptor: int) -> None:
     """The child: one request after the other until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     child.end_with_parent()
+    os.nice(10)
     with socket.socket(fileno=descriptor) as channel:
-        if not channel.recv(1):
-            return
-        from service.learning.skill_file import SkillError
-
-        os.nice(10)
-        channel.send(AWAKE)
         while True:
             try:
                 request = _receive(channel)

@@ -28,60 +28,31 @@ LOOPED = ("kmp.", "service.core.")  # modules of what the loop runs
 
 
 class Start:
-    """A context that holds a cell: its lock, Zenoh session and liveliness token.
-
-    Until `over` each request is refused with what is done and how far it is; the log tells it as it
-    changes. Raises OccupiedError, UnreachableError.
+    """Until it is `over` each request to a cell is refused with what is done and how far it is; the
+    log tells it as it changes.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
+        self.lock, self.session = lock, session
         self._compiled: list[str] = []  # what is being compiled, callers first
         self._functions: list[Any] = []  # all that the loop may call, once they are imported
         self._is_over = threading.Event()
-        network = settings.network
-        roles = network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),)
-        with contextlib.ExitStack() as opened:
-            self.lock = opened.enter_context(contextlib.closing(Lock(state_folder(settings), settings.cell)))
-            allow_descriptors()
-            with ahead_of_others():
-                self.session = open_session(
-                    connect=network.connect,
-                    listen=network.listen,
-                    certificate=network.certificate,
-                    zenoh_config=network.zenoh_config,
-                    more=BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
-                )
-            opened.enter_context(self.session)
-            self._token = occupy(self.session, settings.cell)
-            self._queryables = [
-                self.session.declare_queryable(channels.key(settings.cell, channel.key), self._refuse)
-                for channel in channels.CHANNELS
-                if channel.queryable
-            ]
-            threading.Thread(target=self._tell, name="start", daemon=True).start()
-            opened.callback(self.over)
-            self._opened = opened.pop_all()
-
-    def __enter__(self) -> Start:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._opened.close()
+        keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
+        self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
+        threading.Thread(target=self._tell, name="start", daemon=True).start()
 
     @property
     def told(self) -> str:
         """What is done, and how far it is."""
         if not self._functions:
-            return f"importing, {len(sys.modules)} modules so far"
+            return f"{STARTING}importing, {len(sys.modules)} modules so far"
         doing = f"compiling {self._compiled[-1]}" if self._compiled else "loading what is compiled"
         there = sum(bool(function.signatures) for function in self._functions)
-        return f"{doing}, {there} of {len(self._functions)} functions are there"
+        return f"{STARTING}{doing}, {there} of {len(self._functions)} functions are there"
 
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
-        """Within it what the loop may call, which is imported by now, is counted as it comes to be
-        there.
-        """
+        """Within it functions that the loop may call, imported by now, are counted as they come."""
         from numba.core import dispatcher, event  # heavy, which is why this has begun before
 
         compiled = self._compiled
@@ -108,18 +79,45 @@ class Start:
 
     def _refuse(self, query: zenoh.Query) -> None:
         with query:  # its end tells the client that no more replies come
-            query.reply_err(f"{STARTING}{self.told}".encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
+            query.reply_err(self.told.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
 
     def _tell(self) -> None:
         said = ""
         while not self._is_over.is_set():
             if (told := self.told) != said:
-                log.info("%s%s", STARTING, said := told)
+                log.info("%s", said := told)
             self._is_over.wait(TELL_EVERY_S)
 
 
 @contextlib.contextmanager
-def ahead_of_others() -> Iterator[None]:
+def starting(settings: Settings) -> Iterator[Start]:
+    """The start of the daemon of a cell, which is taken as long as the context lasts.
+
+    Raises OccupiedError, UnreachableError.
+    """
+    network = settings.network
+    roles = network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),)
+    with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:
+        allow_descriptors()
+        with _ahead_of_others():
+            session = open_session(
+                connect=network.connect,
+                listen=network.listen,
+                certificate=network.certificate,
+                zenoh_config=network.zenoh_config,
+                more=BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
+            )
+        with session:
+            token = occupy(session, settings.cell)  # noqa: F841  # the cell is free once it is gone
+            start = Start(lock, session, settings.cell)
+            try:
+                yield start
+            finally:
+                start.over()
+
+
+@contextlib.contextmanager
+def _ahead_of_others() -> Iterator[None]:
     """Threads started within it run before those of other processes, if that is granted.
 
     It is for the network's threads, which else wait up to 100 ms on a busy machine. They get no
