@@ -22,9 +22,9 @@ import msgspec
 from service.child import python
 from service.config import Settings
 from service.contract.explain import ExplainedError
-from service.recording.scribe import NOT_RECORDED
+from service.contract.requests import STARTING
 
-START_TIMEOUT_S, LONG_START_S = 480.0, 6.0  # compiling takes half a minute of a free core, and this of a busy one
+STUCK_S, LOOK_S = 60.0, 0.1  # a start that tells of nothing new for so long; how often that is looked for
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
 ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # of the bench; the first that is installed is taken
@@ -67,6 +67,8 @@ class Launched:
 
     def missing(self) -> str:
         """What its recordings lack, by the last line of its log; empty: nothing."""
+        from service.recording.scribe import NOT_RECORDED  # heavy, and launching is to begin at once
+
         last_lines = self.log.read_text().splitlines()[-1:]
         return "".join(line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED))
 
@@ -131,20 +133,26 @@ def _toml(value: Any) -> str:
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:
-    """The endpoint at which a daemon listens, by its output. Raises LaunchError."""
+    """The endpoint at which a daemon listens, by its output; what its log tells of its start is
+    passed on, and it is waited for as long as that goes on. Raises LaunchError.
+    """
     assert process.stdout is not None
-    if not select.select([process.stdout], [], [], LONG_START_S)[0]:
-        say("its first start on this machine compiles what the loop runs: about half a minute")
-    until = time.monotonic() + START_TIMEOUT_S
-    while (left_s := until - time.monotonic()) > 0 and select.select([process.stdout], [], [], left_s)[0]:
-        line = process.stdout.readline()
-        if line.startswith("listening on "):
-            return line.split()[2].rstrip(",")
-        if not line:
-            raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")
+    moved_s, last = time.monotonic(), "nothing"
+    with log.open() as lines:
+        while time.monotonic() - moved_s < STUCK_S:
+            if select.select([process.stdout], [], [], LOOK_S)[0]:
+                line = process.stdout.readline()
+                if line.startswith("listening on "):
+                    return line.split()[2].rstrip(",")
+                if not line:
+                    raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")
+            for line in lines:
+                if STARTING in line:
+                    moved_s, last = time.monotonic(), line.partition(STARTING)[2].strip()
+                    say(f"  {STARTING}{last}")
     raise LaunchError(
-        f"the service was not ready after {START_TIMEOUT_S:.0f} s. Start it again on a machine with a free core: "
-        f"what it has compiled is kept. It said: {log.read_text().strip() or 'nothing'}"
+        f"the service has got no further for {STUCK_S:g} s. Start it again on a machine with a free core: what it has "
+        f"compiled is kept. It said last: {last}"
     )
 
 

@@ -22,6 +22,11 @@ def recordings() -> Path:
     return next((folder for folder in folders if folder.is_dir()), folders[1])
 
 
+def skills_folder(settings: Settings) -> Path:
+    """The folder of a cell's skills and of the demonstrations that they were learned from."""
+    return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
+
+
 def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
     from service.learning.skill_file import decoded  # heavy, and most commands do without

@@ -32,7 +32,7 @@ def description(cell: Cell) -> str:
     """A daemon's status in one line."""
     now = cell.status
     if now is None:
-        return f"alive as Zenoh session {cell.session}, but without a status"
+        return f"alive as Zenoh session {cell.session}, but without a status: it starts, or may not be asked"
     mode = in_brief(now.mode, now.reason)
     hands = ", ".join(now.hand_age_ms) or "no hands"
     return f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"

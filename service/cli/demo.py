@@ -12,15 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from service.child import python
 from service.cli.progress import say
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.launch import engine_of, launched, played
-from service.report.report import Report, reported, why_missed
 from service.shipped import cell_of
 
 START_TIMEOUT_S = 60.0
@@ -45,6 +42,7 @@ def run(
 ) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
     engine, settings = engine_of(engine), cell_of(arm)
+    say("starting: the scene, then the service")
     out.mkdir(parents=True, exist_ok=True)
     request = _output("sim.scene", "--arm", arm, *([str(scene)] if scene else []), say=say)
     bench = ["--engine", engine, "--arm", arm, *(["--scene", str(scene)] if scene else [])]
@@ -67,6 +65,8 @@ def run(
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
+    from service.report.report import reported  # heavy, as below: first it says what it does
+
     recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
@@ -90,8 +90,10 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     }
 
 
-def _why(found: Report, begun_s: float, events: dict[str, Any], name: str) -> str:
+def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
     """Why an event was missed, by the recording from the event before it on."""
+    from service.report.report import why_missed
+
     names = list(events)
     before = [events[one]["time_s"] for one in names[: names.index(name)]]
     until_s = events[name]["time_s"] + AFTER_S
@@ -99,6 +101,8 @@ def _why(found: Report, begun_s: float, events: dict[str, Any], name: str) -> st
 
 
 def _percentiles(values: Any) -> dict[str, float]:
+    import numpy as np
+
     return dict(zip(("p50", "p99", "max"), np.percentile(values, (50, 99, 100)).round(1).tolist(), strict=True))
 
 

@@ -90,7 +90,7 @@ def _in_order_of_cause(
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
     yield judged(now.version == own_version, "daemon", found, wanted, "update the older one")
     if now.tick < 0:
-        yield wrong("loop", "no tick yet", "ticks", "wait: the first start on a machine compiles for half a minute")
+        yield wrong("loop", "no tick yet", "ticks", "wait: it begins once the recorder listens")
         return
     for name in now.sources:
         yield from _source(before, now, name, published)

@@ -19,7 +19,7 @@ import zenoh
 from service.cli.diagnosis import Finding, findings, wrong
 from service.cli.status import heard
 from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
-from service.client import Overheard, UnreachableError
+from service.client import Overheard, StartingError, UnreachableError
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.messages import WireError
@@ -60,6 +60,9 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
                 end = time.monotonic() + args.seconds
                 while time.monotonic() < end:
                     seen.append(next(told))
+        except StartingError as error:
+            yield wrong("daemon", str(error), "a daemon that is ready", "wait: it tells how far it is")
+            return
         except UnreachableError as error:
             cells = {
                 str(reply.ok.key_expr).split("/daemon/")[0]
@@ -68,7 +71,7 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
             }
             remedy = "start `thirdhand serve`; with certificates use an operator's or an observer's"
             if args.cell in cells:
-                remedy = "wait: the first start on a machine compiles for half a minute"
+                remedy = "ask again; see the log of `thirdhand serve` where it stays so"
             elif cells:
                 remedy = f"give --cell: {', '.join(sorted(cells))} can be reached here"
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)

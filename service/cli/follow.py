@@ -6,14 +6,11 @@ import argparse
 import signal
 import threading
 
-from service.arms.drive import Drive, DriveError, say
-from service.arms.drive import follow as driven
-from service.arms.franka import FrankaArm
-from service.arms.simulated import SimulatedArm
+from service.cli.progress import say
 from service.cli.usage import reaching
 from service.client import Client
 from service.config import Settings
-from service.daemon.clock import ask_for_real_time
+from service.described_arm import UnreadableError
 from service.shipped import cell_of
 
 ARMS = ("franka", "simulated")
@@ -24,13 +21,19 @@ MEASURED_TICKS = 200  # ... once so many tell it
 def follow(args: argparse.Namespace) -> int:
     """Exit code 0 once it was ended, with the arm at rest. Raises DriveError, UnreachableError."""
     if args.arm not in ARMS:
-        raise DriveError(
+        raise UnreadableError(
             f"no arm {args.arm!r}; {' and '.join(ARMS)} are shipped, and examples/own_arm.py is where one's own begins"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
     cell = settings.cell if args.config and not args.cell else reach.cell
-    with reach.session() as session:
+    with reach.session(at_once=True) as session:
+        from service.arms.drive import Drive, DriveError  # heavy, as all below: nobody's absence is told sooner
+        from service.arms.drive import follow as driven
+        from service.arms.franka import FrankaArm
+        from service.arms.simulated import SimulatedArm
+        from service.daemon.clock import ask_for_real_time
+
         status = Client(session, cell).wait_until_ready(timeout_s=args.wait)
         if status.joints != settings.joints.names:
             raise DriveError(

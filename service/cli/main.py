@@ -11,7 +11,6 @@ import contextlib
 import importlib
 import os
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -293,6 +292,8 @@ class _Version(argparse.Action):
     """Prints the version of the installed distribution."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib import metadata  # slow to import
+
         print(f"thirdhand {metadata.version('thirdhand')}")
         parser.exit()
 

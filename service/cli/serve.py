@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import os
 import sys
@@ -14,11 +15,9 @@ import msgspec
 
 from service.cli.usage import UsageError
 from service.config import Settings, converted
-from service.daemon import daemon
+from service.daemon.start import starting
 from service.described_arm import SettingsError
-from service.recording.paths import skills_folder
-from service.recording.scribe import Scribe
-from service.shipped import SHIPPED_SKILL, cell_of
+from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -34,14 +33,19 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
-    scribe = Scribe(settings, folder=folder, live_port=args.live)
+    with starting(settings) as start:
+        gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
+        from service.daemon import daemon  # heavy, while who asks is answered
+        from service.recording.scribe import Scribe
 
-    def announce(running: daemon.Daemon) -> None:
-        where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
-        print(f"listening on {where} as cell {settings.cell}", flush=True)
+        gc.enable()
 
-    skill = args.skill or skills / SHIPPED_SKILL
-    missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, announce=announce)
+        def announce(running: daemon.Daemon) -> None:
+            where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
+            print(f"listening on {where} as cell {settings.cell}", flush=True)
+
+        skill, scribe = args.skill or skills / SHIPPED_SKILL, Scribe(settings, folder=folder, live_port=args.live)
+        missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
     sys.stdout.flush()
     logging.shutdown()
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries

@@ -15,7 +15,7 @@ from zenoh.handlers import RingChannel
 from service import interrupt
 from service.cli.clients import ask
 from service.cli.usage import reached
-from service.client import UnreachableError, why_silent
+from service.client import Client, UnreachableError, why_silent
 from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
@@ -56,8 +56,9 @@ def _watch(args: argparse.Namespace) -> int:
 
 
 def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
-    """Each status as it comes. Raises UnreachableError once none does."""
+    """The status now, and each as it comes. Raises UnreachableError once none does."""
     key = channels.key(cell, "status")
+    yield Client(session, cell).status()
     with session.declare_subscriber(key, RingChannel(1)) as subscriber:
         heard = time.monotonic()
         while time.monotonic() - heard < SILENT_S:

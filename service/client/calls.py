@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from service.client.presence import living, why_silent
-from service.client.session import RETRY_S, RefusedError, UnreachableError, tried
+from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, tried
 from service.contract import channels, requests
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
@@ -22,11 +22,12 @@ Answer = TypeVar("Answer")
 class Client:
     """Requests to a running daemon as calls.
 
-    Each raises RefusedError with the daemon's message, or UnreachableError where nobody answers.
+    Each raises RefusedError with the daemon's message, UnreachableError where nobody answers, or
+    StartingError, one of these, where it tells how far its start is.
     Only the reply of a live daemon counts, not one that a Zenoh storage kept.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 10.0) -> None:
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s
@@ -80,7 +81,9 @@ class Client:
         return answer
 
     def wait_until_ready(self, *, timeout_s: float | None = 15.0) -> Status:
-        """The status, once a daemon answers on this cell; None: it waits until Ctrl-C."""
+        """The status, once a daemon is ready on this cell; it waits for `timeout_s` [s], and as
+        long as the daemon's start goes on. None: until Ctrl-C.
+        """
         return tried(self.status, timeout_s)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
@@ -108,6 +111,8 @@ class Client:
             text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")
             if text == "Timeout":
                 continue
+            if text.startswith(requests.STARTING):
+                raise StartingError(f"cell {self._cell} is {text}")
             if reply.replier_id is None or not self._is_alive(str(reply.replier_id.zid)):
                 kept = True
                 continue

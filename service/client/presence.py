@@ -33,9 +33,9 @@ def living(session: zenoh.Session, cell: str, *, timeout_s: float = TIMEOUT_S) -
 
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
-    """Why nothing comes of a cell: its daemon has not started yet, or there is none."""
+    """Why nothing comes of a cell: its daemon begins or ends just now, or there is none."""
     if living(session, cell):
-        return "its daemon is still starting: wait, a first start compiles for half a minute"
+        return "its daemon is there, but begins or ends, or may not be asked: try again"
     return "is the daemon running there, and is the cell's name right?"
 
 

@@ -27,6 +27,10 @@ class UnreachableError(ExplainedError, OSError):
     """There is no Zenoh session, or nobody answers."""
 
 
+class StartingError(UnreachableError):
+    """The daemon is not ready yet; the message tells what it does and how far it is."""
+
+
 class RefusedError(ExplainedError, ValueError):
     """The daemon refused a request; the message is its answer."""
 
@@ -115,13 +119,17 @@ def _refused(endpoints: Sequence[str]) -> bool:
 
 def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
     """What an attempt returns once it raises no UnreachableError, which is raised after `timeout_s`
-    [s]. None: it is tried until Ctrl-C, and that it waits is said once on standard error.
+    [s] in which it said the same. None: it is tried until Ctrl-C, and that it waits is said once on
+    standard error.
     """
-    begun_s, silent = time.monotonic(), timeout_s is not None
+    begun_s, silent, said = time.monotonic(), timeout_s is not None, ""
     while True:
         try:
             return attempt()
         except UnreachableError as error:
+            if said and str(error) != said:
+                begun_s = time.monotonic()
+            said = str(error)
             waited_s = time.monotonic() - begun_s
             if timeout_s is not None and waited_s >= timeout_s:
                 raise

@@ -15,6 +15,7 @@ from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
+STARTING = "starting: "  # how every answer of a daemon begins that is not ready yet
 NORM = 1e-3  # by which that of a quaternion may differ from 1
 TOLERANCE_M = 0.05  # a reference point nearer to a via-point gives way, unless said otherwise
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]

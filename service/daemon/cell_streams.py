@@ -13,19 +13,12 @@ from service.client import publisher
 from service.config import Settings
 from service.contract import channels, ros2
 from service.contract.messages import JointState, PoseStamped, WireError
-from service.contract.roles import access_control
 from service.core.frame import Event
 from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 ARM = "joints/state"
 MOST_ARRIVALS = 4  # of a hand in a tick, the newest: what a network held back comes at once; a flood costs no tick
-
-
-def access(settings: Settings) -> dict[str, Any]:
-    """Zenoh's settings by which the daemon of a cell keeps its roles apart."""
-    network = settings.network
-    return access_control(settings.cell, network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),))
 
 
 class Arrivals:

@@ -10,7 +10,7 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,6 @@ DRAW = 256  # time constant of following a smaller difference, in deadlines
 CREEP_NS = 1_000  # from stamp to stamp while time catches up
 _LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
 FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
-NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
 
 
 class Deadlines:
@@ -130,22 +129,6 @@ def run_beside_real_time() -> None:
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
-
-
-@contextlib.contextmanager
-def ahead_of_others() -> Iterator[None]:
-    """Threads started within it run before those of other processes, if that is granted.
-
-    It is for the network's threads, which else wait up to 100 ms on a busy machine. They get no
-    real-time scheduling, or a flood of messages could use up the real-time share.
-    """
-    before = os.getpriority(os.PRIO_PROCESS, 0)
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, min(before, NETWORK_NICE))
-    try:
-        yield
-    finally:
-        os.setpriority(os.PRIO_PROCESS, 0, before)
 
 
 class Window:

@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from service.client import endpoints, open_session
+from service.client import endpoints
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
@@ -29,14 +29,13 @@ from service.core.separation.clearance import FARTHEST
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
 from service.daemon.braking import brake
-from service.daemon.cell_streams import CellStreams, access
+from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
     Deadlines,
     Granted,
     Window,
-    ahead_of_others,
     ask_for_real_time,
     run_beside_real_time,
 )
@@ -44,9 +43,9 @@ from service.daemon.input_monitor import InputMonitor
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
-from service.daemon.saved_via_points import SavedViaPoints, state_folder
-from service.daemon.single_instance import BOUNDS, Lock, OccupiedError, allow_descriptors, occupy
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.saved_via_points import SavedViaPoints
+from service.daemon.skill_worker import SkillWorker, skill_of
+from service.daemon.start import Start
 from service.daemon.status import CellStatus, MeasuredArm
 from service.daemon.way_finder import WayFinder
 from service.learning.skill_file import SkillError, StoredSkill
@@ -56,8 +55,6 @@ from service.recording.scribe import Scribe
 log = logging.getLogger("thirdhand")
 STOP_TIMEOUT_S = 3.0
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-SLOWEST_START_S = 120.0  # of the skill worker, on a busy machine
-LONG_START_S = 3.0
 STAGE_NUMBERS = {stage: number for number, stage in enumerate(STAGES)}
 MOST_NOTES = 100  # a second
 MOMENT_TRIES = 10  # until a status tells of one moment
@@ -82,7 +79,7 @@ class Daemon:
         skill_worker: SkillWorker,
         skills: Path,
         scribe: Scribe,
-        lock: Lock,
+        start: Start,
     ) -> None:
         skill = stored.for_loop()
         # of the skill in force, and of one on its way into the loop
@@ -92,27 +89,8 @@ class Daemon:
         self._stop = threading.Event()
         self._ended = threading.Event()
         urdf = robot_description(settings)
-        allow_descriptors()
-        network = settings.network
-        with ahead_of_others():
-            self._session = open_session(
-                connect=network.connect,
-                listen=network.listen,
-                certificate=network.certificate,
-                zenoh_config=network.zenoh_config,
-                more=BOUNDS | (access(settings) if network.certificate else {}),
-            )
-        try:
-            self._token = occupy(self._session, settings.cell)
-        except OccupiedError:
-            self._session.close()  # type: ignore[no-untyped-call]
-            raise
-        slow = threading.Timer(LONG_START_S, log.info, ["compiling what the loop runs, once for so many joints"])
-        slow.start()
-        try:
-            warm_up(settings, skill, urdf=urdf)
-        finally:
-            slow.cancel()
+        self._session = start.session
+        warm_up(settings, skill, urdf=urdf)
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
@@ -134,11 +112,12 @@ class Daemon:
         self._laps: list[tuple[str, int]] = []
         self._outputs: Outputs = ()  # of the newest tick
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
-        lock.announce(self.endpoints)
+        start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = encode_json(self._status_now())
+        start.over()
         self._queryables = Queryables(
             self._session,
             settings,
@@ -358,9 +337,9 @@ class Daemon:
         )
 
 
-def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> StoredSkill:
+def load_skill(path: Path, settings: Settings) -> StoredSkill:
     """The skill in a file, with the via-points taught to it before. Raises SkillError."""
-    skill, saved = skill_worker.load(path, timeout_s=SLOWEST_START_S), SavedViaPoints(settings)
+    skill, saved = skill_of(path), SavedViaPoints(settings)
     try:
         found = saved.read(skill)
     except SkillError as error:
@@ -372,25 +351,31 @@ def load_skill(skill_worker: SkillWorker, path: Path, settings: Settings) -> Sto
         return skill
     if found is None or found[0] == skill.via_points:
         return skill
-    return skill_worker.adapt(skill, found[0], tolerance=found[1], timeout_s=SLOWEST_START_S)
+    return skill_of(skill.file, *found, settings.tool.max_gain)
 
 
 def serve(
-    settings: Settings, skill_path: Path, *, skills: Path, scribe: Scribe, announce: Callable[[Daemon], None]
+    settings: Settings,
+    skill_path: Path,
+    *,
+    skills: Path,
+    scribe: Scribe,
+    start: Start,
+    announce: Callable[[Daemon], None],
 ) -> str:
     """Runs a daemon from start to end; returns what the recordings lack, in words.
 
-    Once it is ready, SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError, OccupiedError
-    and UnreachableError before it starts, LoopError where it ends by itself.
+    Once it is ready, SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError before it starts,
+    LoopError where it ends by itself.
     """
-    lock = Lock(state_folder(settings), settings.cell)
     skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
     try:
-        skill = load_skill(skill_worker, skill_path, settings)
-        daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, lock=lock)
+        skill_worker.start()  # here, as to start a process would delay the loop
+        with start.counting():
+            skill = load_skill(skill_path, settings)
+            daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start)
         for number in STOPPING:
             signal.signal(number, daemon.stop)
         return daemon.serve(announce)
     finally:
         skill_worker.close()
-        lock.close()

@@ -14,13 +14,9 @@ import msgspec
 from service.config import Settings, robot_description
 from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.skill.skill import Skill
+from service.daemon.single_instance import state_folder
 from service.learning.skill_file import SkillError
 from service.urdf import Urdf
-
-
-def state_folder(settings: Settings) -> Path:
-    """The folder of what a cell keeps over a restart."""
-    return Path(settings.files.state).expanduser() / settings.cell
 
 
 def _checksum(saved: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ import zenoh
 
 from service.client import Client, RefusedError, UnreachableError
 from service.client.presence import living
+from service.config import Settings
 from service.contract import channels
 from service.contract.explain import ExplainedError
 
@@ -44,6 +45,11 @@ BOUNDS: dict[str, Any] = {
 }
 MOST_READ = 4096  # bytes of what a lock's holder wrote
 log = logging.getLogger("thirdhand")
+
+
+def state_folder(settings: Settings) -> Path:
+    """The folder of what a cell keeps over a restart."""
+    return Path(settings.files.state).expanduser() / settings.cell
 
 
 class OccupiedError(ExplainedError, RuntimeError):

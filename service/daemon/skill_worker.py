@@ -2,7 +2,8 @@
 control process need not.
 
 A skill is returned as a small pickle with its arrays in shared memory, so that the control process
-copies and solves nothing.
+copies and solves nothing. What it computes with it imports when it is first asked, so that a start
+costs nothing.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from service import one_blas_thread  # noqa: F401
 # isort: split
 import os
 import pickle
+import select
 import signal
 import socket
 import sys
@@ -21,6 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from service import child
+
+if __name__ == "__main__":
+    select.select([int(sys.argv[1])], [], [])
+
+# isort: split
 from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
@@ -28,7 +35,7 @@ from service.core.way_out import WayOut
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
 
-TIMEOUT_S = 8.0  # shorter than a client waits
+TIMEOUT_S, FIRST_S = 8.0, 25.0  # shorter than a client waits; the first answer comes after its imports
 
 
 class SkillWorker:
@@ -41,6 +48,13 @@ class SkillWorker:
         self._max_gain = max_gain
         self._busy = threading.Lock()
         self._child: child.Child | None = None
+        self._first_s = FIRST_S  # that an answer of this child is waited for at least
+
+    def start(self) -> None:
+        """Starts the process, where it is not there."""
+        if self._child is None or self._child.process.poll() is not None:
+            self._end()
+            self._child, self._first_s = child.start("service.daemon.skill_worker", socket.SOCK_STREAM), FIRST_S
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
@@ -78,13 +92,12 @@ class SkillWorker:
 
     def _ask(self, timeout_s: float, *request: Any) -> Any:
         with self._busy:
-            if self._child is None or self._child.process.poll() is not None:
-                self._end()
-                self._child = child.start("service.daemon.skill_worker", socket.SOCK_STREAM)
+            self.start()
+            assert self._child is not None
             try:
-                self._child.socket.settimeout(timeout_s)
+                self._child.socket.settimeout(max(timeout_s, self._first_s))
                 _send(self._child.socket, pickle.dumps(request))
-                answer = _receive(self._child.socket)
+                answer, self._first_s = _receive(self._child.socket), 0.0
             except TimeoutError:
                 self._end()
                 raise SkillError(
@@ -121,13 +134,16 @@ def _work(*request: Any) -> StoredSkill | list[Vector]:
     if isinstance(request[0], Settings):
         settings, *arguments = request
         return WayOut(settings, robot_description(settings)).find(*arguments)
-    return _skill(*request)
+    return skill_of(*request)
 
 
-def _skill(
+def skill_of(
     source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
-    """The skill in a file, or the one in force (the bytes of its file) through these via-points."""
+    """The skill in a file, or the one in force (the bytes of its file) through these via-points.
+
+    Raises SkillError.
+    """
     if isinstance(source, bytes):
         skill = adapted(
             decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from service.config import Settings
 from service.recording.mcap_reader import Messages
-from service.shipped import recordings
 
 MB = 1e6
 
@@ -95,8 +94,3 @@ class RecordingPaths:
             cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
             self._own[path.stem] = cell == self._settings.cell
         return self._own[path.stem]
-
-
-def skills_folder(settings: Settings) -> Path:
-    """The folder of a cell's skills and of the demonstrations that they were learned from."""
-    return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()

@@ -28,8 +28,8 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import SceneObject, WireError, in_order
 from service.core.frame import Record
 from service.learning.demonstration import Demonstration
-from service.recording.paths import skills_folder
 from service.recording.recording import OBJECTS
+from service.shipped import skills_folder
 from service.viewer import learned, scene_objects
 from service.viewer.blueprint import blueprint
 from service.viewer.dynamic import LOG_NS, DrawnFrame, DynamicScene

@@ -58,14 +58,14 @@ assert main(["replay", sys.argv[1]]) in (0, None)
 assert since(before) == {}, since(before)
 """
 FROM_THE_SKILL_WORKER = """
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.skill_worker import SkillWorker, skill_of
 from sim.experiments.rehearsal import rehearse as played
 from sim.scene import Scene
 from sim.script import HandScript
 
 worker = SkillWorker()
+before = compiled_by(skill_of(Path(sys.argv[1])))  # as a daemon loads it
 loaded = worker.load(Path(sys.argv[1]), timeout_s=60.0)
-before = compiled_by(loaded)
 adapted = worker.adapt(loaded, Scene().via_points(), tolerance=0.05, timeout_s=60.0)
 worker.close()
 for skill in (loaded.for_loop(), adapted.for_loop()):

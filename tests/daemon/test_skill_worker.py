@@ -130,3 +130,21 @@ def test_a_skill_outlives_the_workshop_that_made_it(skill: Skill) -> None:
     made = skill_worker.adapt(skill, PLACES, tolerance=0.05)
     skill_worker.close()
     assert_same_bits(made, adapted(skill, PLACES, tolerance=0.05))
+
+
+def test_a_slow_workshop_may_be_given_more_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for its first answer on a machine that is busy: its imports alone take seconds there."""
+    worker = SkillWorker()
+    try:
+        with pytest.raises(SkillError, match="cannot read skill"):
+            worker.load(tmp_path / "nothing.npz", timeout_s=0.01)  # its first
+        with pytest.raises(SkillError, match=r"did not answer within 0\.0001 s; nothing was changed"):
+            worker.load(SOLDERING, timeout_s=0.0001)
+        with pytest.raises(SkillError, match="cannot read skill"):
+            worker.load(tmp_path / "nothing.npz", timeout_s=0.01)  # the next one's first
+        worker.close()
+        monkeypatch.setattr("service.daemon.skill_worker.FIRST_S", 0.01)
+        with pytest.raises(SkillError, match=r"did not answer within 0\.01 s; nothing was changed"):
+            worker.load(tmp_path / "nothing.npz", timeout_s=0.01)
+    finally:
+        worker.close()

@@ -19,9 +19,7 @@ import pytest
 
 from service.client import RefusedError, UnreachableError
 from service.daemon.single_instance import Lock
-from service.daemon.skill_worker import SkillWorker
 from service.daemon.supervised_thread import supervised
-from service.learning.skill_file import SkillError
 from service.recording.replay import replay
 from support.cell import Daemon, Tracker, serving, thirdhand, told
 
@@ -292,15 +290,3 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     points = [{"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)]
     points_in_force: list[dict[str, Any]] = daemon.client.ask("via_points", {"op": "add", "points": points})["points"]
     return points_in_force
-
-
-def test_a_slow_workshop_may_be_given_more_time(tmp_path: Path) -> None:
-    """As at the start on a machine that is busy: its process alone takes seconds to begin there."""
-    skill_worker = SkillWorker()
-    try:
-        with pytest.raises(SkillError, match=r"did not answer within 0\.01 s; nothing was changed"):
-            skill_worker.load(tmp_path / "nothing.npz", timeout_s=0.01)
-        with pytest.raises(SkillError, match="cannot read skill"):
-            skill_worker.load(tmp_path / "nothing.npz", timeout_s=60.0)
-    finally:
-        skill_worker.close()

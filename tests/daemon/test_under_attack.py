@@ -21,9 +21,9 @@ import pytest
 
 from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
-from service.daemon.clock import NETWORK_NICE
 from service.daemon.daemon import MOST_NOTES
 from service.daemon.single_instance import MOST_SESSIONS
+from service.daemon.start import NETWORK_NICE
 from support.cell import Daemon, serving
 from support.paths import ROOT
 

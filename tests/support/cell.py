@@ -64,7 +64,12 @@ class Daemon:
 
 @contextlib.contextmanager
 def serving(
-    folder: Path, *arguments: str, before: str = "", drawn: bool = False, network: str = LISTENING
+    folder: Path,
+    *arguments: str,
+    before: str = "",
+    drawn: bool = False,
+    network: str = LISTENING,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
     process runs that Python. What it records is `drawn` only where that is looked at.
@@ -75,7 +80,7 @@ def serving(
         else ("-m", "service")
     )
     with (
-        launched(folder, *arguments, program=program, rerun=drawn, network=network) as service,
+        launched(folder, *arguments, program=program, rerun=drawn, network=network, say=say) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         yield Daemon(service, session)

@@ -7,19 +7,20 @@ from __future__ import annotations
 from service import one_blas_thread  # noqa: F401
 
 # isort: split
+import contextlib
 import os
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from service.config import ArmSettings, Files, Settings
 from service.daemon import daemon
 from service.daemon.daemon import Daemon
-from service.daemon.saved_via_points import state_folder
-from service.daemon.single_instance import Lock
 from service.daemon.skill_worker import SkillWorker
+from service.daemon.start import starting
 from service.network_settings import Network
 from service.recording.scribe import Scribe
 from service.shipped import recordings, shipped_skill
@@ -30,7 +31,7 @@ RATE_HZ, ROS2_DOMAIN = 50, 7
 def main(folder: Path, endpoint: str, *cells: str) -> None:
     """Serves the cells; each says its name once it is announced."""
     skill, skill_worker = shipped_skill(), SkillWorker()
-    daemons = []
+    daemons, held = [], contextlib.ExitStack()
     for cell in cells:
         settings = Settings(
             cell=cell,
@@ -39,11 +40,9 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
             network=Network(listen=(), connect=(endpoint,), ros2_domain=ROS2_DOMAIN),
             files=Files(state=str(folder)),
         )
-        lock = Lock(state_folder(settings), cell)
-        scribe = Scribe(settings)
-        daemons.append(
-            Daemon(settings, skill, skill_worker=skill_worker, skills=recordings(), scribe=scribe, lock=lock)
-        )
+        start = held.enter_context(starting(settings))
+        more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": start}
+        daemons.append(Daemon(settings, skill, skills=recordings(), **more))
         daemon.warm_up = lambda *_, **__: None  # once a process is enough
     for one, cell in zip(daemons, cells, strict=True):
         say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))

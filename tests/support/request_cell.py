@@ -16,7 +16,7 @@ from service.contract.records import Mode, Reason
 from service.core.frame import Event
 from service.core.skill.skill import Skill
 from service.daemon.queryables import Queryables
-from service.daemon.saved_via_points import state_folder
+from service.daemon.single_instance import state_folder
 from service.daemon.skill_worker import SkillWorker
 from sim.scene import Scene
 

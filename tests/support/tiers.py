@@ -31,6 +31,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
 SLOW = (  # the longest first: so they begin first
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
+    "daemon/test_start.py",
     "core/test_warm_up.py",
     "recording/test_scribe.py",
     "test_static.py",

@@ -1,0 +1,132 @@
+"""The start of a daemon: takes its cell, and says for it what it does and how far it is, before
+anything heavy is imported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import zenoh
+
+from service.client import open_session
+from service.config import Settings
+from service.contract import channels, ros2
+from service.contract.requests import STARTING
+from service.contract.roles import access_control
+from service.daemon.single_instance import BOUNDS, Lock, allow_descriptors, occupy, state_folder
+
+log = logging.getLogger("thirdhand")
+TELL_EVERY_S = 1.0
+NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
+LOOPED = ("kmp.", "service.core.")  # modules of what the loop runs
+
+
+class Start:
+    """Until it is `over` each request to a cell is refused with what is done and how far it is; the
+    log tells it as it changes.
+    """
+
+    def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
+        self.lock, self.session = lock, session
+        self._compiled: list[str] = []  # what is being compiled, callers first
+        self._functions: list[Any] = []  # all that the loop may call, once they are imported
+        self._is_over = threading.Event()
+        keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
+        self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
+        threading.Thread(target=self._tell, name="start", daemon=True).start()
+
+    @property
+    def told(self) -> str:
+        """What is done, and how far it is."""
+        if not self._functions:
+            return f"{STARTING}importing, {len(sys.modules)} modules so far"
+        doing = f"compiling {self._compiled[-1]}" if self._compiled else "loading what is compiled"
+        there = sum(bool(function.signatures) for function in self._functions)
+        return f"{STARTING}{doing}, {there} of {len(self._functions)} functions are there"
+
+    @contextlib.contextmanager
+    def counting(self) -> Iterator[None]:
+        """Within it functions that the loop may call, imported by now, are counted as they come."""
+        from numba.core import dispatcher, event  # heavy, which is why this has begun before
+
+        compiled = self._compiled
+
+        class Compiling(event.Listener):  # type: ignore[misc]
+            def on_start(self, event: event.Event) -> None:
+                function = event.data["dispatcher"].py_func
+                compiled.append(f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
+
+            def on_end(self, event: event.Event) -> None:
+                compiled.pop()
+
+        modules = [vars(module) for name, module in sys.modules.copy().items() if name.startswith(LOOPED)]
+        found = {id(one): one for names in modules for one in names.values() if isinstance(one, dispatcher.Dispatcher)}
+        self._functions = list(found.values())
+        with event.install_listener("numba:compile", Compiling()):
+            yield
+
+    def over(self) -> None:
+        """Ends the refusals, so that others can answer; may be repeated."""
+        self._is_over.set()
+        while self._queryables:
+            self._queryables.pop().undeclare()  # type: ignore[no-untyped-call]
+
+    def _refuse(self, query: zenoh.Query) -> None:
+        with query:  # its end tells the client that no more replies come
+            query.reply_err(self.told.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
+
+    def _tell(self) -> None:
+        said = ""
+        while not self._is_over.is_set():
+            if (told := self.told) != said:
+                log.info("%s", said := told)
+            self._is_over.wait(TELL_EVERY_S)
+
+
+@contextlib.contextmanager
+def starting(settings: Settings) -> Iterator[Start]:
+    """The start of the daemon of a cell, which is taken as long as the context lasts.
+
+    Raises OccupiedError, UnreachableError.
+    """
+    network = settings.network
+    roles = network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),)
+    with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:
+        allow_descriptors()
+        with _ahead_of_others():
+            session = open_session(
+                connect=network.connect,
+                listen=network.listen,
+                certificate=network.certificate,
+                zenoh_config=network.zenoh_config,
+                more=BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
+            )
+        with session:
+            token = occupy(session, settings.cell)  # noqa: F841  # the cell is free once it is gone
+            start = Start(lock, session, settings.cell)
+            try:
+                yield start
+            finally:
+                start.over()
+
+
+@contextlib.contextmanager
+def _ahead_of_others() -> Iterator[None]:
+    """Threads started within it run before those of other processes, if that is granted.
+
+    It is for the network's threads, which else wait up to 100 ms on a busy machine. They get no
+    real-time scheduling, or a flood of messages could use up the real-time share.
+    """
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, min(before, NETWORK_NICE))
+    try:
+        yield
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, before)

@@ -1,0 +1,151 @@
+"""The start of a daemon: it answers at once what it does and how far it is, by what is compiled,
+and is waited for as long as it gets further.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service import launch
+from service.cli.main import main
+from service.client import Client, StartingError, UnreachableError, cells, endpoints, open_session
+from service.config import Files, Settings
+from service.contract.channels import CHANNELS
+from service.daemon.start import Start, starting
+from service.launch import LaunchError, launched
+from service.network_settings import Network
+from support.cell import serving
+
+COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading what is compiled), (\d+) of (\d+) functions are there")
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[tuple[Start, str]]:
+    """A cell whose daemon has begun to start, and where it listens."""
+    network, files = Network(listen=("tcp/127.0.0.1:0",)), Files(state=str(tmp_path))
+    with starting(Settings(cell="lab/bench", network=network, files=files)) as start:
+        yield start, endpoints(start.session)[0]
+
+
+def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
+    started: tuple[Start, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    start, endpoint = started
+    with open_session(connect=[endpoint]) as session:
+        client = Client(session, "lab/bench")
+        for channel in CHANNELS:
+            if channel.queryable:
+                with pytest.raises(StartingError, match=r"cell lab/bench is starting: importing, \d+ modules so far"):
+                    client.ask(channel.key)
+        (cell,) = cells(session)
+        assert (cell.name, cell.status) == ("lab/bench", None)
+        reach = ("--connect", endpoint, "--cell", "lab/bench")
+        for command in ("status", "doctor", "hold"):
+            assert main([command, *reach]) == 1
+            out, errors = capsys.readouterr()
+            assert "starting: importing" in out + errors
+        assert main(["status", "--watch", *reach]) == 1
+        assert "starting: importing" in capsys.readouterr().err
+        start.over()
+        with pytest.raises(UnreachableError, match="begins or ends") as ended:
+            client.status()
+        assert not isinstance(ended.value, StartingError)
+
+
+def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(started: tuple[Start, str]) -> None:
+    sleeping = threading.Event()
+    with open_session(connect=[started[1]]) as session:
+        client = Client(session, "lab/bench")
+        said: list[str] = []
+        modules = [f"begun_{i}" for i in range(8)]
+
+        def go_on() -> None:
+            for name in modules:
+                sleeping.wait(0.25)
+                sys.modules[name] = sys  # one more that is imported
+            said.append("all")
+
+        thread = threading.Thread(target=go_on)
+        thread.start()
+        with pytest.raises(StartingError):
+            client.wait_until_ready(timeout_s=1.0)
+        assert said  # 2 s, of which each went on
+        thread.join()
+        for name in modules:
+            del sys.modules[name]
+
+
+def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "cell.toml").write_text(
+        f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path / "state"}"\n'
+    )
+    command = [sys.executable, "-m", "service", "serve", "--config", str(tmp_path / "cell.toml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as service:
+        assert service.stderr is not None
+        lines = [service.stderr.readline()]
+        assert "starting: importing" in lines[0]  # first of all
+        compiled: dict[str, int] = {}
+        while len(compiled) < 3 or max(compiled.values()) < 10:
+            lines.append(service.stderr.readline())
+            assert lines[-1], lines
+            found = COUNTED.search(lines[-1])
+            if found and found[1]:
+                compiled[found[1]] = int(found[2])
+        service.kill()
+        service.communicate()
+    counts = [found for line in lines if (found := COUNTED.search(line))]
+    there = [int(found[2]) for found in counts]
+    assert there == sorted(there)
+    assert len({found[3] for found in counts}) == 1
+    assert int(counts[0][3]) > 100  # of all that the loop may call
+
+
+def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "STUCK_S", 8.0)
+    before = "import time\nfrom service.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
+    said: list[str] = []
+    stuck = r"no further for 8 s.*last: loading what is compiled, \d+ of \d+ functions"
+    with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
+        raise AssertionError("it was ready")
+    assert said[0].startswith("  starting: importing")
+
+
+def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that takes as many seconds as it says, and says so in time."""
+    monkeypatch.setattr(launch, "STUCK_S", 3.0)
+    slow = (
+        "import sys, time\nfor i in range(8):\n    print('now starting:', i, file=sys.stderr, flush=True)\n"
+        "    time.sleep(0.5)\nprint('listening on tcp/127.0.0.1:1 as cell slow', flush=True)\ntime.sleep(600)"
+    )
+    said: list[str] = []
+    with launched(tmp_path, program=("-c", slow), say=said.append) as service:
+        assert service.endpoint == "tcp/127.0.0.1:1"
+    assert said == [f"  starting: {i}" for i in range(8)]
+
+
+@pytest.mark.parametrize("command", ["status", "doctor", "hold", "cells", "follow simulated", "via-points list"])
+def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
+    at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
+    code = f"import sys\nfrom service.cli.main import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}sys.exit(code)"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert re.search(r"nobody listens at|nothing listens on", done.stdout + done.stderr)
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", ["service.cli.serve", "service.cli.demo", "service.daemon.start", "service.launch"])
+def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
+    code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
