@@ -12,6 +12,7 @@ import queue
 import socket
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -38,7 +39,8 @@ from service.viewer.sentences import sentence
 from service.viewer.static import ArmModels, log_static
 
 FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
-LIVE_MEMORY = "64MiB"
+LIVE_MB = 24  # for viewers that connect later, the arm's meshes aside: the newest 20 s at 500 Hz, which curves show
+LIVE_WAITING = 10  # batches; where a viewer lags the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
 REPEAT_S = 10.0  # skill and objects are sent again to live viewers, for those that connect later
 
@@ -53,7 +55,7 @@ class _Destination:
     def __init__(
         self,
         name: str,
-        sink: Any,
+        sink: Callable[[ArmModels], Any],
         *,
         live: bool,
         batch_s: float,
@@ -61,12 +63,13 @@ class _Destination:
         settings: Settings,
         recording_id: str,
         skill: tuple[SkillContents, list[Demonstration]] | None,
+        start_ns: int | None = None,
     ) -> None:
         self._batch_ns = round(batch_s * 1e9)
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
         self._models = ArmModels(urdf, settings)
-        self._dynamic = DynamicScene(self._models, settings, live=live)
+        self._dynamic = DynamicScene(self._models, settings, live=live, start_ns=start_ns)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._skill = skill
         if skill is not None:
@@ -74,7 +77,7 @@ class _Destination:
         self._objects: tuple[SceneObject, ...] = ()
         self._repeated_ns = 0
         self._open = False
-        self.redirect(name, sink)
+        self.redirect(name, sink(self._models))
 
     def redirect(self, name: str, sink: Any) -> None:
         """Sends the scene to another sink from now on.
@@ -179,7 +182,8 @@ class _Destination:
 class _Live(_Destination):
     """A server for live viewers, fed on a thread of its own.
 
-    A viewer that stalls delays nobody: the oldest batches are dropped.
+    A viewer that stalls does not delay the drawing: the oldest batches are left out. Seconds count
+    from the time [ms] that ends the recording's id, by which a page tells how old a picture is.
     """
 
     def __init__(self, port: int, **common: Any) -> None:
@@ -191,15 +195,23 @@ class _Live(_Destination):
                 raise ViewerError(f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any") from None
             port = probe.getsockname()[1]
         self.url = f"rerun+http://127.0.0.1:{port}/proxy"
-        self._waiting: queue.Queue[list[rr.chunk.Chunk] | None] = queue.Queue(maxsize=100)
-        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=LIVE_MEMORY)
-        super().__init__(f"the live view at {self.url}", sink, live=True, batch_s=LIVE_BATCH_S, **common)
+        self._waiting: queue.Queue[list[rr.chunk.Chunk] | None] = queue.Queue(maxsize=LIVE_WAITING)
+        start_ms = time.time_ns() // 1_000_000
+        common |= {"recording_id": f"{common['settings'].cell}-{start_ms}", "start_ns": 1_000_000 * start_ms}
+        super().__init__(
+            f"the live view at {self.url}",
+            lambda models: rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=f"{LIVE_MB + models.mesh_mb}MiB"),
+            live=True,
+            batch_s=LIVE_BATCH_S,
+            **common,
+        )
         self._thread = threading.Thread(target=self._feed, name="live view", daemon=True)
         self._thread.start()
 
     def _feed(self) -> None:
         while (chunks := self._waiting.get()) is not None:
             self._stream.send_chunks(chunks)
+            self._stream.flush()  # until the server has them: else they wait in Rerun, where nothing limits them
 
     def put(self, chunks: list[rr.chunk.Chunk] | None) -> None:
         while True:
@@ -274,7 +286,9 @@ class Viewer:
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
             if drawn is None:
-                self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
+                self._file = _Destination(
+                    name, lambda _: rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common
+                )
                 self._destinations.append(self._file)
             else:
                 drawn.redirect(name, rr.FileSink(rrd))
