@@ -105,7 +105,8 @@ class DynamicScene:
             return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
         seen = frames["hand_ages"] >= 0
-        if self._shown is None and batch[0].measured is None:
+        is_repeated = self._live and times[-1] - self._mode_sent_ns > REPEAT_S * 1e9
+        if batch[0].measured is None and (self._shown is None or is_repeated):
             yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, times, columns)
