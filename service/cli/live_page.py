@@ -38,7 +38,7 @@ TIMEOUT_S = 10.0
 START_S = 15.0
 HTML = "text/html; charset=utf-8"
 FROZEN_S = 30.0  # of a browser that reads nothing, for which others would wait
-A_PICTURE = 100  # messages that are sent ahead of a picture: two batches of the live view
+A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which all comes that is repeated often
 BEHIND_MS, PATIENCE_S = 1000.0, 15.0  # of what is sent ahead, and without word of a picture
 HISTORY_S = 2.0  # in which what was drawn before comes, and is left out
 # of gRPC-Web, after its header of 5 bytes: rows of a recording, not static

@@ -38,9 +38,9 @@ from service.viewer.learned import SkillContents
 from service.viewer.sentences import sentence
 from service.viewer.static import ArmModels, log_static
 
-FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
+FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.2
 LIVE_MB = 24  # for viewers that connect later, the arm's meshes aside: the newest 20 s at 500 Hz, which curves show
-LIVE_WAITING = 10  # batches; where a viewer lags the oldest are left out
+LIVE_WAITING = 5  # batches; where a viewer lags the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
 REPEAT_S = 10.0  # skill and objects are sent again to live viewers, for those that connect later
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -121,6 +123,19 @@ def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere
     answer = connection.getresponse()
     assert answer.status == 200
     assert len(answer.read(200_000)) == 200_000  # what was drawn before this client came
+    connection.close()
+
+
+def test_the_page_follows_the_live_view_where_the_scribe_is_started_again(page: Page) -> None:
+    before = json.loads(page.ask("GET", "/status")[1])["live"]
+    os.kill(page.daemon.client.ask("status")["scribe"]["pid"], signal.SIGKILL)
+    until = time.monotonic() + TIMEOUT_S
+    while (now := json.loads(page.ask("GET", "/status")[1])["live"]) == before or now.startswith("127.0.0.1:0 "):
+        assert time.monotonic() < until
+        time.sleep(0.2)
+    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+    connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
+    assert len(connection.getresponse().read(200_000)) == 200_000
     connection.close()
 
 
