@@ -47,12 +47,12 @@ class DrawnFrame(NamedTuple):
 class DynamicScene:
     """Turns batches of frames into chunks; remembers what the next batch continues."""
 
-    def __init__(self, models: ArmModels, settings: Settings, *, live: bool, start_ns: int | None = None) -> None:
+    def __init__(self, models: ArmModels, settings: Settings, *, live: bool) -> None:
         rate_hz, names = settings.rate_hz, settings.joints.names
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
-        self._live, self._given_start_ns = live, start_ns  # seconds count from there, or from the first frame
+        self._live = live
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
@@ -73,7 +73,7 @@ class DynamicScene:
         self._shown: tuple[int, int] | None = None
         self._mode_sent_ns = 0
         self._last_tick = -1
-        self._start_ns = self._given_start_ns
+        self._start_ns: int | None = None
         self.end_s = 0.0
         self.peaks: dict[str, list[float]] = {}  # of each view of curves, one for each batch
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import queue
 import socket
 import sys
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ class _Destination:
     def __init__(
         self,
         name: str,
-        sink: Callable[[ArmModels], Any],
+        sink: Any,
         *,
         live: bool,
         batch_s: float,
@@ -63,13 +63,12 @@ class _Destination:
         settings: Settings,
         recording_id: str,
         skill: tuple[SkillContents, list[Demonstration]] | None,
-        start_ns: int | None = None,
     ) -> None:
         self._batch_ns = round(batch_s * 1e9)
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
         self._models = ArmModels(urdf, settings)
-        self._dynamic = DynamicScene(self._models, settings, live=live, start_ns=start_ns)
+        self._dynamic = DynamicScene(self._models, settings, live=live)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._skill = skill
         if skill is not None:
@@ -77,7 +76,7 @@ class _Destination:
         self._objects: tuple[SceneObject, ...] = ()
         self._repeated_ns = 0
         self._open = False
-        self.redirect(name, sink(self._models))
+        self.redirect(name, sink)
 
     def redirect(self, name: str, sink: Any) -> None:
         """Sends the scene to another sink from now on.
@@ -195,38 +194,34 @@ class _Live(_Destination):
                 raise ViewerError(f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any") from None
             port = probe.getsockname()[1]
         self.url = f"rerun+http://127.0.0.1:{port}/proxy"
-        self._waiting: queue.Queue[list[rr.chunk.Chunk] | None] = queue.Queue(maxsize=LIVE_WAITING)
-        start_ms = time.time_ns() // 1_000_000
-        common |= {"recording_id": f"{common['settings'].cell}-{start_ms}", "start_ns": 1_000_000 * start_ms}
-        super().__init__(
-            f"the live view at {self.url}",
-            lambda models: rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=f"{LIVE_MB + models.mesh_mb}MiB"),
-            live=True,
-            batch_s=LIVE_BATCH_S,
-            **common,
-        )
+        self._waiting: deque[list[rr.chunk.Chunk]] = deque(maxlen=LIVE_WAITING)
+        self._come, self._ended, start_ms = threading.Event(), False, time.time_ns() // 1_000_000
+        limit_mb = LIVE_MB + ArmModels(common["urdf"], common["settings"]).mesh_mb
+        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=f"{limit_mb}MiB")
+        common |= {"recording_id": f"{common['settings'].cell}-{start_ms}", "live": True, "batch_s": LIVE_BATCH_S}
+        super().__init__(f"the live view at {self.url}", sink, **common)
+        self._dynamic.index(np.array([1_000_000 * start_ms]))  # seconds count from there
         self._thread = threading.Thread(target=self._feed, name="live view", daemon=True)
         self._thread.start()
 
     def _feed(self) -> None:
-        while (chunks := self._waiting.get()) is not None:
-            self._stream.send_chunks(chunks)
-            self._stream.flush()  # until the server has them: else they wait in Rerun, where nothing limits them
+        while not self._ended and self._come.wait():
+            self._come.clear()
+            while self._waiting:
+                self._stream.send_chunks(self._waiting.popleft())
+                self._stream.flush()  # until the server has them: else they wait in Rerun, where nothing limits them
 
-    def put(self, chunks: list[rr.chunk.Chunk] | None) -> None:
-        while True:
-            try:
-                return self._waiting.put_nowait(chunks)
-            except queue.Full:
-                with contextlib.suppress(queue.Empty):
-                    self._waiting.get_nowait()
+    def put(self, chunks: list[rr.chunk.Chunk]) -> None:
+        self._waiting.append(chunks)
+        self._come.set()
 
     def flush(self) -> None:
         self.send()
 
     def close(self) -> None:
         self.send()
-        self.put(None)
+        self._ended = True
+        self._come.set()
         self._thread.join(FLUSH_TIMEOUT_S)
         if not self._thread.is_alive():
             self._stream.disconnect()
@@ -286,9 +281,7 @@ class Viewer:
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
             if drawn is None:
-                self._file = _Destination(
-                    name, lambda _: rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common
-                )
+                self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
                 self._destinations.append(self._file)
             else:
                 drawn.redirect(name, rr.FileSink(rrd))
