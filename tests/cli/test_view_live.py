@@ -185,7 +185,7 @@ def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scen
 
 @pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
 def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
-    with chromium.opened(page.url, tmp_path, timeout_s=TIMEOUT_S) as tab:
+    with chromium.opened(page.url, tmp_path, size=(1200, 600), timeout_s=TIMEOUT_S) as tab:
 
         def click(name: str, *, until: str) -> Any:
             tab.ask(f"document.getElementById('{name}').click()")
