@@ -17,7 +17,6 @@ import time as clock
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import rerun as rr
@@ -91,16 +90,14 @@ def check_usage(args: argparse.Namespace) -> None:
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serves the page until it is interrupted."""
     listen = _address(args.web)
-    stream = urlsplit(url.removeprefix("rerun+"))
     with (
         reached(args) as session,
         web_viewer(rerun_program(), url, free_port()) as viewer,
     ):
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.ask("status"))
-        to = Address(str(stream.hostname), int(stream.port or 0))
         try:
-            page = LivePage(listen, client=client, latest=latest, cell=args.cell, stream=to, viewer=viewer)
+            page = LivePage(listen, client=client, latest=latest, cell=args.cell, viewer=viewer)
         except OSError as error:
             raise UsageError(f"--web {listen}: {error.strerror or error}; another port, or 0 for any, needed") from None
         print(f"http://{page.address}/", flush=True)

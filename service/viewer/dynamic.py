@@ -31,7 +31,7 @@ NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
 SAME_M = 1e-5  # rounding: at most this much apart, a deviation and the target's are the same
 TINY = 1e-4  # scale of each link of an arm that is not to be seen: the viewer takes 0 for an error
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
-REPEAT_S = 1.0  # the mode is sent again to live viewers, for those that connect later
+REPEAT_S = 0.5  # the mode is sent again to live viewers, for those that connect later or leave frames out
 Columns = Callable[..., rr.chunk.Chunk]
 
 
@@ -105,7 +105,8 @@ class DynamicScene:
             return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
         seen = frames["hand_ages"] >= 0
-        if self._shown is None and batch[0].measured is None:
+        is_repeated = self._live and times[-1] - self._mode_sent_ns > REPEAT_S * 1e9
+        if batch[0].measured is None and (self._shown is None or is_repeated):
             yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, times, columns)

@@ -37,7 +37,8 @@ _DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 class ArmModels:
     """The arm as commanded and as measured: one URDF, loaded twice under different names.
 
-    `body` are its capsules, which are drawn where meshes are not found: shapes `unfound`.
+    `body` are its capsules, which are drawn where meshes are not found: shapes `unfound`. Those
+    found take `mesh_mb` at most [MB], for both.
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
@@ -47,11 +48,14 @@ class ArmModels:
             urdf, entity_path_prefix="measured", frame_prefix=GHOST, static_transform_entity_path="/measured/tf_static"
         )
         drawn: dict[str, bool] = {}
+        size = 0
         for chunk in self.commanded.stream(include_joint_transforms=False):
             _, visual, path = chunk.entity_path.partition(VISUAL)
             if visual:
-                names = chunk.to_record_batch().schema.names
+                rows = chunk.to_record_batch()
+                size, names = size + rows.nbytes, rows.schema.names
                 drawn[path] = drawn.get(path, False) or any(name.startswith(_DRAWN) for name in names)
+        self.mesh_mb = 2 * size // 1_000_000
         self.unfound = tuple(path for path, is_drawn in drawn.items() if not is_drawn)
 
     @property

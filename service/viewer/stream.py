@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import queue
 import socket
 import sys
 import threading
+import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,9 @@ from service.viewer.learned import SkillContents
 from service.viewer.sentences import sentence
 from service.viewer.static import ArmModels, log_static
 
-FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.1
-LIVE_MEMORY = "64MiB"
+FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.2
+LIVE_MB = 24  # for viewers that connect later, the arm's meshes aside: the newest 20 s at 500 Hz, which curves show
+LIVE_WAITING = 5  # batches; where a viewer lags the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
 REPEAT_S = 10.0  # skill and objects are sent again to live viewers, for those that connect later
 
@@ -179,7 +181,8 @@ class _Destination:
 class _Live(_Destination):
     """A server for live viewers, fed on a thread of its own.
 
-    A viewer that stalls delays nobody: the oldest batches are dropped.
+    A viewer that stalls does not delay the drawing: the oldest batches are left out. Seconds count
+    from the time [ms] that ends the recording's id, by which a page tells how old a picture is.
     """
 
     def __init__(self, port: int, **common: Any) -> None:
@@ -191,30 +194,34 @@ class _Live(_Destination):
                 raise ViewerError(f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any") from None
             port = probe.getsockname()[1]
         self.url = f"rerun+http://127.0.0.1:{port}/proxy"
-        self._waiting: queue.Queue[list[rr.chunk.Chunk] | None] = queue.Queue(maxsize=100)
-        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=LIVE_MEMORY)
-        super().__init__(f"the live view at {self.url}", sink, live=True, batch_s=LIVE_BATCH_S, **common)
+        self._waiting: deque[list[rr.chunk.Chunk]] = deque(maxlen=LIVE_WAITING)
+        self._come, self._ended, start_ms = threading.Event(), False, time.time_ns() // 1_000_000
+        limit_mb = LIVE_MB + ArmModels(common["urdf"], common["settings"]).mesh_mb
+        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=f"{limit_mb}MiB")
+        common |= {"recording_id": f"{common['settings'].cell}-{start_ms}", "live": True, "batch_s": LIVE_BATCH_S}
+        super().__init__(f"the live view at {self.url}", sink, **common)
+        self._dynamic.index(np.array([1_000_000 * start_ms]))  # seconds count from there
         self._thread = threading.Thread(target=self._feed, name="live view", daemon=True)
         self._thread.start()
 
     def _feed(self) -> None:
-        while (chunks := self._waiting.get()) is not None:
-            self._stream.send_chunks(chunks)
+        while not self._ended and self._come.wait():
+            self._come.clear()
+            while self._waiting:
+                self._stream.send_chunks(self._waiting.popleft())
+                self._stream.flush()  # until the server has them: else they wait in Rerun, where nothing limits them
 
-    def put(self, chunks: list[rr.chunk.Chunk] | None) -> None:
-        while True:
-            try:
-                return self._waiting.put_nowait(chunks)
-            except queue.Full:
-                with contextlib.suppress(queue.Empty):
-                    self._waiting.get_nowait()
+    def put(self, chunks: list[rr.chunk.Chunk]) -> None:
+        self._waiting.append(chunks)
+        self._come.set()
 
     def flush(self) -> None:
         self.send()
 
     def close(self) -> None:
         self.send()
-        self.put(None)
+        self._ended = True
+        self._come.set()
         self._thread.join(FLUSH_TIMEOUT_S)
         if not self._thread.is_alive():
             self._stream.disconnect()

@@ -4,11 +4,16 @@ drawn; and nobody but the page may ask.
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
+import os
+import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +23,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.cli.live_page import STREAM
+from service import palette
+from service.cli.live_page import A_PICTURE, PATIENCE_S, SAMPLES, STREAM
 from service.cli.view import FRESH_S, screenshot
+from service.launch import free_port
 from support import chromium
 from support.cell import Daemon, Tracker, serving
 from support.paths import ROOT
@@ -54,20 +61,29 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     arguments = ("--arm", "assumed", "--live", "0", "--rate", "100")
     with serving(tmp_path_factory.mktemp("cell"), *arguments) as daemon, Tracker(daemon.session):
         daemon.until(lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S)
-        command = [sys.executable, "-m", "service", "view", "live", "--web", "--connect", daemon.endpoint]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
-            clock = threading.Timer(TIMEOUT_S, server.kill)
-            clock.start()
-            try:
-                assert server.stdout is not None
-                assert server.stderr is not None
-                assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
-                yield Page(daemon, server.stdout.readline().strip())
-                server.terminate()
-                assert server.wait(TIMEOUT_S) == 0
-            finally:
-                clock.cancel()
-                server.kill()
+        with served(daemon) as url:
+            yield Page(daemon, url)
+
+
+@contextlib.contextmanager
+def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
+    """The URL of a page that `thirdhand view live --web` serves."""
+    command = [sys.executable, "-m", "service", "view", "live", "--web", address, "--connect", daemon.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
+        clock = threading.Timer(TIMEOUT_S, server.kill)
+        clock.start()
+        try:
+            assert server.stdout is not None
+            assert server.stderr is not None
+            assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
+            url = server.stdout.readline().strip()
+            clock.cancel()
+            yield url
+            server.terminate()
+            assert server.wait(TIMEOUT_S) == 0
+        finally:
+            clock.cancel()
+            server.kill()
 
 
 def token_in(text: str) -> str:
@@ -91,23 +107,65 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     held = page.daemon.until(lambda status: status["mode"] == "hold")
     assert (held["reason"], held["remedy"]) == ("operator", "thirdhand resume")
     told = json.loads(page.ask("GET", "/status")[1])
-    assert (told["because"], told["remedy"]) == (held["because"], held["remedy"])
+    assert (told["because"], told["remedy"]) == (held["because"], "press Resume")
     assert page.ask("POST", "/resume", X_Thirdhand_Token=token)[0] == 200
     page.daemon.until(lambda status: status["mode"] == "follow")
 
 
 def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere(page: Page) -> None:
-    code, text = page.ask("GET", "/viewer/?url=x")
+    code, text = page.ask("GET", "/viewer/?0.5")
     assert code == 200
     assert "re_viewer.js" in text
-    assert "<link" in text
-    assert "fonts.g" not in text
+    assert "https:" not in text
     assert page.ask("GET", "/viewer/re_viewer.js")[0] == 200
     connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
     connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
     answer = connection.getresponse()
     assert answer.status == 200
     assert len(answer.read(200_000)) == 200_000  # what was drawn before this client came
+    connection.close()
+
+
+def test_the_page_follows_the_live_view_where_the_scribe_is_started_again(page: Page) -> None:
+    before = json.loads(page.ask("GET", "/status")[1])["live"]
+    os.kill(page.daemon.client.ask("status")["scribe"]["pid"], signal.SIGKILL)
+    until = time.monotonic() + TIMEOUT_S
+    while (now := json.loads(page.ask("GET", "/status")[1])["live"]) == before or now.startswith("127.0.0.1:0 "):
+        assert time.monotonic() < until
+        time.sleep(0.2)
+    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+    connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
+    assert len(connection.getresponse().read(200_000)) == 200_000
+    connection.close()
+
+
+def test_a_viewer_is_sent_little_more_than_it_has_drawn(page: Page) -> None:
+    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+    known = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1", "Referer": f"{page.url}viewer/?0.5"}
+    connection.request("POST", STREAM, EMPTY_GRPC, known)
+    answer, came = connection.getresponse(), threading.Semaphore(0)
+
+    def read() -> None:
+        with contextlib.suppress(OSError, http.client.HTTPException, ValueError):  # it is closed
+            while len(header := answer.read(5)) == 5:
+                if SAMPLES.fullmatch(answer.read(int.from_bytes(header[1:], "big"))):
+                    came.release()
+
+    def tell_shown(at_s: float) -> None:
+        assert page.ask("POST", "/viewer/shown", str(1000 * at_s).encode(), Referer=known["Referer"])[0] == 200
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(A_PICTURE):
+        assert came.acquire(timeout=PATIENCE_S)
+    assert not came.acquire(timeout=PATIENCE_S / 3)  # what was drawn before, and since, is some thousands
+    tell_shown(time.time() - PATIENCE_S)
+    assert not came.acquire(timeout=1.0)  # it is far behind
+    tell_shown(time.time())
+    assert came.acquire(timeout=PATIENCE_S / 3)
+    assert connection.sock is not None
+    connection.sock.shutdown(socket.SHUT_RDWR)
+    reader.join(TIMEOUT_S)
     connection.close()
 
 
@@ -127,7 +185,7 @@ def test_a_picture_of_the_live_view_is_recent_or_says_its_age_and_shows_the_scen
 
 @pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
 def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
-    with chromium.opened(page.url, tmp_path, timeout_s=TIMEOUT_S) as tab:
+    with chromium.opened(page.url, tmp_path, size=(1200, 600), timeout_s=TIMEOUT_S) as tab:
 
         def click(name: str, *, until: str) -> Any:
             tab.ask(f"document.getElementById('{name}').click()")
@@ -136,9 +194,46 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         assert tab.until("document.getElementById('mode').className == 'follow'")
         click("hold", until="hold: operator")
         assert tab.until("document.getElementById('answer').textContent").startswith("hold in force since tick ")
-        assert "What to do: thirdhand resume" in tab.until("document.getElementById('why').textContent")
+        assert "What to do: press Resume" in tab.until("document.getElementById('why').textContent")
         click("resume", until="follow")
         assert "/viewer/" in tab.ask("document.querySelector('iframe').src")
+        tab.until("/^picture [0-9.]+ s old/.test(document.getElementById('picture').textContent)")
         tab.picture(tmp_path / "page.png")
     with Image.open(tmp_path / "page.png") as image:
         assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # beside the word
+
+
+@pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
+def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_served_anew(
+    page: Page, tmp_path: Path
+) -> None:
+    address = f"127.0.0.1:{free_port()}"
+
+    def shown(name: str) -> str:
+        return f"getComputedStyle(document.querySelector('{name}')).display != 'none'"
+
+    with contextlib.ExitStack() as first:
+        url = first.enter_context(served(page.daemon, address))
+        with chromium.opened(url, tmp_path, timeout_s=TIMEOUT_S) as tab:
+            tab.hold_as_phone(390, 844)
+            assert tab.until(f"document.getElementById('mode').className == 'follow' && {shown('svg')}")
+            assert tab.ask(shown("iframe")) is False
+            assert tab.until("document.querySelector('iframe').src") == "about:blank"
+            assert tab.until("document.querySelector('#left text').textContent") == "left hand, 6 cm up"
+            assert tab.ask("document.getElementById('left').getAttribute('transform')").startswith("translate(0.9")
+            assert tab.until("document.querySelector('#tool text').textContent").startswith("tool, ")
+            assert tab.ask("document.documentElement.scrollWidth") == 390
+            tab.picture(tmp_path / "phone.png")
+            first.close()
+            assert tab.until("document.getElementById('mode').textContent == \"this page's server has ended\"")
+            with served(page.daemon, address):
+                tab.until(f"token != '{tab.ask('token')}' && document.getElementById('mode').className == 'follow'")
+                tab.ask("document.getElementById('hold').click()")
+                assert tab.until("document.getElementById('mode').textContent == 'hold: operator'")
+                tab.ask("document.getElementById('resume').click()")
+                assert tab.until("document.getElementById('mode').textContent == 'follow'")
+    with Image.open(tmp_path / "phone.png") as image:
+        assert image.size == (780, 1688)
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
+    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, palette.ARM):
+        assert (np.abs(pixels - colour).max(axis=1) < 12).sum() > 100

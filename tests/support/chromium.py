@@ -62,6 +62,11 @@ class Tab:
             time.sleep(0.1)
         return value
 
+    def hold_as_phone(self, width: int, height: int) -> None:
+        """Shows the page as on a phone with a screen of this size."""
+        screen = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
+        self._call("Emulation.setDeviceMetricsOverride", screen, self._session)
+
     def picture(self, path: Path) -> None:
         """Saves what the page shows as PNG."""
         found = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
