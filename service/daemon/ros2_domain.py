@@ -15,7 +15,7 @@ import zenoh
 from zenoh import ext
 
 from service.client import ENCODINGS
-from service.config import Settings, robot_description
+from service.config import Settings, urdf_path
 from service.contract import cdr, ros2
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import in_order
@@ -23,6 +23,7 @@ from service.core.frame import Frame, Record
 from service.core.outputs import Frames
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
+from service.described_arm import description
 
 MOST_WAITING = 256  # messages: half a second of commands
 CLOSED_WITHIN_S = 2.0
@@ -89,7 +90,7 @@ class Ros2Domain:
         self._tokens = [session.liveliness().declare_token(token) for token in tokens.values()]
         self._waiting: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
         self._thread = supervised_thread.start("ROS 2 thread", self._serve, failed)
-        urdf, links = robot_description(settings), bool(settings.ros2.robot_description)
+        urdf, links = description(urdf_path(settings), cover=False), bool(settings.ros2.robot_description)
         self._frames = Frames(settings, urdf, links=links) if settings.ros2.tf else None
         self.publish("/robot_description", cdr.encode_string(urdf))
         if self._frames is not None:
