@@ -15,7 +15,7 @@ import msgspec
 
 from service.contract import ros2
 from service.contract.explain import InvalidError, validated
-from service.described_arm import SettingsError, UnreadableError, check, completed
+from service.described_arm import SettingsError, UnreadableError, check, completed, description
 from service.network_settings import Network, Ros2
 from service.urdf import Urdf, UrdfError
 
@@ -93,6 +93,9 @@ class ArmSettings(Section, frozen=True):
     """
 
     urdf: str = ""  # a file; empty: the shipped Barrett WAM
+    packages: tuple[
+        str, ...
+    ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
     source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
     posture: PerJoint = (
@@ -104,7 +107,7 @@ class ArmSettings(Section, frozen=True):
         -1.0823,
         0.0,
     )  # [rad] the null space's and the assumed one
-    link_radius: Positive = 0.07  # [m] of links whose shapes are meshes, which are not read
+    link_radius: Positive = 0.07  # [m] of links without a collision shape, from their joint to the next
     fault_error_rad: Positive = 0.1  # between a joint as measured and as commanded
     silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without joint states: a fault while it moves
 
@@ -241,7 +244,7 @@ class Settings(Section, frozen=True):
                 f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
                 "none of them with a digit first, joined by slashes needed"
             )
-        named = [topic.name for topic in ros2.controllers(self.ros2)]
+        named = [topic.name for topic in ros2.of_settings(self.ros2)]
         if named and self.network.ros2_domain is None:
             yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
         if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
@@ -311,12 +314,8 @@ def urdf_path(settings: Settings) -> Path:
 
 
 def robot_description(settings: Settings) -> str:
-    """The text of the arm's URDF. Raises SettingsError."""
-    path = urdf_path(settings)
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"$.arm.urdf: cannot read {path}: {error}") from None
+    """The arm's URDF, with a capsule around each collision mesh. Raises SettingsError."""
+    return description(urdf_path(settings), settings.arm.packages)
 
 
 def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
@@ -366,7 +365,7 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             try:
-                own = robot_description(Settings(arm=ArmSettings(urdf=arm["urdf"])))
+                own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
                 given = completed(given, Urdf(own, origin=arm["urdf"]))
             except (UrdfError, SettingsError) as error:  # all else that is wrong, but for what is the arm's
                 others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}

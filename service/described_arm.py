@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, Protocol
 
 from service.contract.explain import ExplainedError
-from service.urdf import Urdf
+from service.urdf import Urdf, UrdfError
 
 FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
 NEAREST_POINT = 0.4
@@ -18,6 +19,23 @@ class SettingsError(ExplainedError, ValueError):
 
 class UnreadableError(SettingsError):
     """A file of settings that cannot be read."""
+
+
+def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:
+    """An arm's URDF, with a capsule around each collision mesh, or as it is. Meshes are in
+    `packages`, or near it. Raises SettingsError.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        if not cover or "<mesh" not in text:
+            return text
+        from service.mesh_cover import covered  # heavy, and few arms need it
+
+        return covered(text, path, packages)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"$.arm.urdf: cannot read {path}: {error}") from None
+    except UrdfError as error:
+        raise SettingsError(f"$.arm.urdf: {error}") from None
 
 
 class Limits(Protocol):

@@ -76,11 +76,14 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The arm's controllers of ros2_control, which take commands as they are, in the domain
-    `network.ros2_domain`. Of each the full name of its topic; empty: none.
+    """The arm's controllers of ros2_control, which take commands as they are, and what RViz and rqt
+    show, in the domain `network.ros2_domain`. Of each the full name of its topic; empty: none.
     """
 
     position_commands: Topic = ""  # of a forward_command_controller for positions: /<its name>/commands
     trajectory: Topic = ""  # of a joint_trajectory_controller: /<its name>/joint_trajectory
     joint_states: Topic = ""  # of the joint_state_broadcaster: /joint_states, heard beside the cell's own
     joints: tuple[str, ...] = ()  # in the order of the controller's parameter `joints`; empty: that of `joints.names`
+    tf: Topic = ""  # /tf: setpoint, target and hands ten times a second; what is fixed on the name that ends in _static
+    robot_description: Topic = ""  # /robot_description: the URDF, latched; the links join `tf`. Not beside another's
+    diagnostics: Topic = ""  # /diagnostics: mode, reason and lateness each second

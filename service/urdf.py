@@ -37,7 +37,10 @@ class Shape(NamedTuple):
 
     link: str
     kind: str  # box, cylinder, sphere, capsule, mesh
-    size: tuple[float, ...]  # [m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: none
+    size: tuple[float, ...]
+    """[m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: the ends of
+    the axis (2, 3) and the radius of a capsule that covers it, or nothing.
+    """
     translation: Vector3
     rotation: Quaternion
 
@@ -124,6 +127,7 @@ def _joint(element: ElementTree.Element) -> Joint:
     )
 
 
+COVER = "covered_by"  # an attribute of a mesh, which is ours: others do not look at it
 SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
 
 
@@ -135,6 +139,8 @@ def _shape(link: str, element: ElementTree.Element) -> Shape:
     size = tuple(float(number) for name in SIZES.get(kind, ()) for number in given.get(name, "nan").split())
     if not all(0.0 < number < math.inf for number in size):
         raise ValueError(f"the {kind} of link {link!r} has no size")
+    if kind == "mesh":
+        size = tuple(float(number) for number in given.get(COVER, "").split())
     return Shape(link, kind, size, _three(origin, "xyz", "0 0 0"), _turn(origin))
 
 

@@ -171,7 +171,10 @@ class Playback:
             time_s = last.time_s + self._tick_s * _steps(last, position, velocity, ticks, self._tick_s)
         latest = self._now - time_s + MOST_DELAY_S
         if self._knots:  # a segment is of use from now on, and should have been when it began
-            needed = self._needed if self._paused else self._now - self._knots[-1].time_s
+            begins_s = self._knots[-1].time_s
+            if time_s - begins_s < 2.5 * self._tick_s:  # one that was lost alone is not waited for
+                begins_s = time_s - self._tick_s
+            needed = self._needed if self._paused else self._now - begins_s
             self._needed = min(max(self._needed, needed), latest)
             self._offset = min(self._offset, latest)
         else:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from service.contract.messages import (
@@ -147,6 +147,20 @@ def encode_trajectory(
     for values in (position, velocity, (), ()):
         out.doubles(values)
     out.pack(_STAMP, *_stamp(within_ns), align=4)
+    return bytes(out)
+
+
+def encode_diagnostics(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
+    """CDR bytes of a `diagnostic_msgs/msg/DiagnosticArray` of one status."""
+    out = Writer()
+    out.header(stamp_ns, "")
+    out.pack(_LENGTH, 1, align=4)
+    out.append(level)
+    for text in (name, message, name):  # the last one of them is the hardware
+        out.string(text)
+    out.pack(_LENGTH, len(values), align=4)
+    for text in (text for pair in values.items() for text in pair):
+        out.string(text)
     return bytes(out)
 
 

@@ -54,10 +54,11 @@ def access_control(
     cell: str,
     revoked: Collection[str] = (),
     ros2_domain: int | None = None,
-    controllers: Collection[ros2.Topic] = (),
+    more_topics: Collection[ros2.Topic] = (),
 ) -> dict[str, Any]:
     """Zenoh's settings by which a daemon of this cell keeps the roles apart, and lets certificates
-    of the `revoked` names do nothing. What a role may do it may do in a ROS 2 domain too.
+    of the `revoked` names do nothing. What a role may do it may do in a ROS 2 domain too, with
+    `more_topics` besides the cell's own.
     """
 
     def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
@@ -66,7 +67,7 @@ def access_control(
             known = (channels.BY_KEY[suffix] for suffix in suffixes)
             also = (ros2.of_channel(cell, channel) for channel in known if channel in TOPICS)
             found += [ros2.key(ros2_domain, topic) for topic in also]
-            found += [ros2.key(ros2_domain, topic) for topic in controllers if topic.channel in suffixes]
+            found += [ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes]
         return found
 
     heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)
@@ -81,12 +82,17 @@ def access_control(
     def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
         return [allow(name, "ingress", ingress, key_exprs), allow(name, "egress", egress, key_exprs)]
 
-    hear = both("hear", ["declare_subscriber"], ["put"], heard)
+    shown = {ros2.key(ros2_domain or 0, topic): topic for topic in more_topics if topic.channel.startswith("/")}
+    latched = [one for key, topic in shown.items() if topic.latched for one in (key, ros2.kept(key))]
+    hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *shown])
     record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL)))
     ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
     status, present = keys(("status",)), [channels.presence(cell)]
     tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
+    if latched:
+        asking = [*queries, "query", "declare_subscriber"]
+        hear += both("hear what is latched", asking, [*tokens, "declare_queryable", "reply", "put"], latched)
     see = both("see", ["query"], ["declare_queryable", "reply"], status)
     see.append(allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]))
     see.append(allow("see who lives", "egress", tokens, present))

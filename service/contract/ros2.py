@@ -15,44 +15,53 @@ from service.contract import channels
 LAST_DOMAIN = 232
 NODE = "thirdhand"
 TYPE_HASHES = {  # of the definitions, as REP 2011 has them; Humble has none
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
     "std_msgs/msg/Float64MultiArray": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
     "trajectory_msgs/msg/JointTrajectory": "179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e",
     "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
 HEARD = tuple(channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event)
 SAID = tuple(channel for channel in channels.CHANNELS if channel.direction == "out")
 _DEPTH = 10
 _RELIABLE, _BEST_EFFORT = f"::,{_DEPTH}:,:,:,,", f"2::,{_DEPTH}:,:,:,,"  # the rest as ROS 2 has it by default
+_LATCHED = ":1:,1:,:,:,,"  # reliable, transient local: who comes later is told the last one
 _ATTACHMENT = struct.Struct("<qqB16s")
 _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
 
 
 class Topic(NamedTuple):
     """A topic: its full name, its message type, the channel whose messages pass there, and whether
-    the cell hears it or else publishes on it.
+    the cell hears it or else publishes on it; `latched`: who comes later is told the last message.
     """
 
     name: str
     type: str
     channel: str
-    heard: bool
+    heard: bool = False
+    latched: bool = False
+    every: int = 1  # of so many messages of the channel one
 
 
-CONTROLLERS: tuple[tuple[str, str, str, bool], ...] = (  # of ros2_control: setting and topic
-    ("position_commands", "std_msgs/msg/Float64MultiArray", "joints/command", False),
-    ("trajectory", "trajectory_msgs/msg/JointTrajectory", "joints/command", False),
-    ("joint_states", "sensor_msgs/msg/JointState", "joints/state", True),
+SET = (  # the setting that begins a topic's name, and the topic, of that name's end
+    ("position_commands", Topic("", "std_msgs/msg/Float64MultiArray", "joints/command")),
+    ("trajectory", Topic("", "trajectory_msgs/msg/JointTrajectory", "joints/command")),
+    ("joint_states", Topic("", "sensor_msgs/msg/JointState", "joints/state", heard=True)),
+    ("tf", Topic("", "tf2_msgs/msg/TFMessage", "/tf")),
+    ("tf", Topic("_static", "tf2_msgs/msg/TFMessage", "/tf_static", latched=True)),
+    ("robot_description", Topic("", "std_msgs/msg/String", "/robot_description", latched=True)),
+    ("diagnostics", Topic("", "diagnostic_msgs/msg/DiagnosticArray", "status", every=10)),
 )
 
 
-def controllers(settings: Any) -> Iterator[Topic]:
-    """The topics of ros2_control that a cell's settings name."""
-    for setting, kind, channel, heard in CONTROLLERS:
+def of_settings(settings: Any) -> Iterator[Topic]:
+    """The topics that a cell's settings name: those of ros2_control, and what RViz and rqt show."""
+    for setting, topic in SET:
         if name := getattr(settings, setting):
-            yield Topic(name, kind, channel, heard)
+            yield topic._replace(name=name + topic.name)
 
 
 def of_channel(cell: str, channel: channels.Channel) -> Topic:
@@ -75,6 +84,11 @@ def key(domain: int, topic: Topic) -> str:
     return f"{domain}{topic.name}/{_typed(topic)}"
 
 
+def kept(key: str) -> str:
+    """The key expression under which what a publisher of this key latched is kept and found."""
+    return f"{key}/@adv/**"
+
+
 def all_tokens(domain: int) -> str:
     """The key expression of all liveliness tokens in a domain."""
     return f"@ros2_lv/{domain}/**"
@@ -87,7 +101,7 @@ def tokens(domain: int, cell: str, session: str, topics: Sequence[Topic]) -> dic
     node = f"%/{_mangled(f'/{cell}')}/{NODE}"
     found = {"": f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
     for number, topic in enumerate(topics, start=1):
-        kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _RELIABLE)
+        kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _LATCHED if topic.latched else _RELIABLE)
         what = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
         found[topic.name] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{what}"
     return found

@@ -13,7 +13,7 @@ from service.client import publisher
 from service.config import Settings
 from service.contract import channels, ros2
 from service.contract.messages import JointState, PoseStamped, WireError
-from service.core.frame import Event
+from service.core.frame import Event, Frame, Record
 from service.daemon.ros2_domain import Ros2Domain
 
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
@@ -66,7 +66,7 @@ class CellStreams:
         if domain is not None:
             topics = [ros2.of_channel(cell, channel) for channel in (*inputs, *ros2.SAID)]
             topics += [
-                one for one in ros2.controllers(settings.ros2) if not one.heard or settings.arm.source == "state"
+                one for one in ros2.of_settings(settings.ros2) if not one.heard or settings.arm.source == "state"
             ]
             keys += [(channels.BY_KEY[one.channel], ros2.key(domain, one)) for one in topics if one.heard]
         self._subscribers = [
@@ -111,6 +111,11 @@ class CellStreams:
         self._publishers[suffix].put(payload, attachment=attachment)
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
+
+    def show(self, frame: Frame, state: Record) -> None:
+        """Publishes, for RViz and the like, where everything is. Not for the loop."""
+        if self._ros2 is not None:
+            self._ros2.show(frame, state)
 
     @property
     def is_followed(self) -> bool:

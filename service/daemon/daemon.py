@@ -289,6 +289,7 @@ class Daemon:
             errors = list(status.scribe["errors"])
             payload = self._status = encode_json(status)
             self._streams.publish("status", payload)
+            self._streams.show(self._frame, self._controller.state)
             self._scribe.note("status", payload.decode(), time.time_ns())
             self._objects.poll()
             try:

@@ -10,30 +10,60 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+import msgspec
 import zenoh
+from zenoh import ext
 
 from service.client import ENCODINGS
-from service.config import Settings
-from service.contract import cdr, channels, ros2
-from service.contract.messages import JointState, in_order
+from service.config import Settings, urdf_path
+from service.contract import cdr, ros2
+from service.contract.incidents import in_brief, in_full
+from service.contract.messages import in_order
+from service.core.frame import Frame, Record
+from service.core.outputs import Frames
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
+from service.described_arm import description
 
 MOST_WAITING = 256  # messages: half a second of commands
 CLOSED_WITHIN_S = 2.0
+HEARTBEAT_S = 0.5  # as rmw_zenoh has it, after which who missed something latched notices
+LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # of diagnostic_msgs: OK, WARN, ERROR
+DIAGNOSED = (
+    *("mode", "reason", "flags", "tick", "rate_hz", "missed", "realtime", "lateness_us", "work_us", "latency_ms"),
+    *("hand_age_ms", "hand_distance_m", "rejected", "received", "skill", "stage", "version"),
+)
 
 
-def _as_numbers(message: JointState, names: tuple[str, ...], period_ns: int) -> bytes:
-    return cdr.encode_numbers(in_order(message, names)[0])
+def _as_numbers(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
+    return cdr.encode_numbers(in_order(cdr.decode_joints(payload), names)[0])
 
 
-def _as_trajectory(message: JointState, names: tuple[str, ...], period_ns: int) -> bytes:
-    return cdr.encode_trajectory(names, *in_order(message, names), within_ns=period_ns)
+def _as_trajectory(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
+    return cdr.encode_trajectory(names, *in_order(cdr.decode_joints(payload), names), within_ns=period_ns)
 
 
-_CONTROLLERS = {  # how a controller's commands are made of the cell's own, by message type
-    "std_msgs/msg/Float64MultiArray": _as_numbers,
-    "trajectory_msgs/msg/JointTrajectory": _as_trajectory,
+def _as_string(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
+    return cdr.encode_string(payload.decode())
+
+
+def _as_diagnostics(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
+    status, values = msgspec.json.decode(payload), {}
+    for name in DIAGNOSED:
+        inner = status[name] if isinstance(status[name], dict) else {"": status[name]}
+        for part, value in inner.items():
+            text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+            values[f"{name}.{part}".rstrip(".")] = text
+    what = in_brief(status["mode"], status["reason"]) + in_full(status["because"], status["remedy"])
+    name = f"{status['cell']}: {ros2.NODE}"
+    return cdr.encode_diagnostics(status["time_ns"], LEVELS[status["mode"]], name, what, values)
+
+
+_MADE = {  # how a topic's message is made of the channel's, by channel and the topic's type; others are it as it is
+    ("joints/command", "std_msgs/msg/Float64MultiArray"): _as_numbers,
+    ("joints/command", "trajectory_msgs/msg/JointTrajectory"): _as_trajectory,
+    ("status", "std_msgs/msg/String"): _as_string,
+    ("status", "diagnostic_msgs/msg/DiagnosticArray"): _as_diagnostics,
 }
 
 
@@ -54,23 +84,27 @@ class Ros2Domain:
         self._names = settings.ros2.joints or settings.joints.names
         self._period_ns = round(1e9 * settings.period_s)
         self._topics = [topic for topic in topics if not topic.heard]
-        self._publishers = {
-            topic.name: session.declare_publisher(
-                ros2.key(domain, topic),
-                encoding=ENCODINGS["cdr"],
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=True,
-            )
-            for topic in self._topics
-        }
+        self._publishers = {topic.name: _publisher(session, ros2.key(domain, topic), topic) for topic in self._topics}
         self._gids = {topic.name: ros2.gid(tokens[topic.name]) for topic in self._topics}
-        self._sent: Counter[str] = Counter()
+        self._sent, self._come = Counter[str](), Counter[str]()
         self._tokens = [session.liveliness().declare_token(token) for token in tokens.values()]
         self._waiting: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
         self._thread = supervised_thread.start("ROS 2 thread", self._serve, failed)
+        urdf, links = description(urdf_path(settings), cover=False), bool(settings.ros2.robot_description)
+        self._frames = Frames(settings, urdf, links=links) if settings.ros2.tf else None
+        self.publish("/robot_description", cdr.encode_string(urdf))
+        if self._frames is not None:
+            self.publish("/tf_static", cdr.encode_transforms(time.time_ns(), self._frames.fixed))
+
+    def show(self, frame: Frame, state: Record) -> None:
+        """Publishes where everything is: the joints as measured, as commanded without an arm."""
+        if self._frames is not None:
+            joints = state["measured"] if state["arm_tick"] >= 0 else frame["joints"]
+            frames = self._frames.moving(frame, joints.tolist())
+            self.publish("/tf", cdr.encode_transforms(time.time_ns(), frames))
 
     def publish(self, suffix: str, payload: bytes) -> None:
-        """Publishes an output of a channel on its ROS 2 topics."""
+        """Publishes a message of a channel on its ROS 2 topics."""
         if self._waiting.qsize() < MOST_WAITING:
             self._waiting.put((suffix, payload))
 
@@ -85,17 +119,27 @@ class Ros2Domain:
         run_beside_real_time()
         while (item := self._waiting.get()) is not None:
             suffix, payload = item
-            for topic in self._topics:
-                if topic.channel != suffix:
+            for topic in (one for one in self._topics if one.channel == suffix):
+                self._come[topic.name] += 1
+                if self._come[topic.name] % topic.every:
                     continue
                 self._sent[topic.name] += 1
                 attachment = ros2.encode_attachment(self._sent[topic.name], time.time_ns(), self._gids[topic.name])
-                self._publishers[topic.name].put(self._message(topic, payload), attachment=attachment)
+                made = _MADE.get((suffix, topic.type))
+                message = made(payload, self._names, self._period_ns) if made else payload
+                self._publishers[topic.name].put(message, attachment=attachment)
 
-    def _message(self, topic: ros2.Topic, payload: bytes) -> bytes:
-        """What a topic carries of a channel's message."""
-        if topic.type in _CONTROLLERS:
-            return _CONTROLLERS[topic.type](cdr.decode_joints(payload), self._names, self._period_ns)
-        if channels.BY_KEY[topic.channel].codec.encoding == "json":
-            return cdr.encode_string(payload.decode())
-        return payload
+
+def _publisher(session: zenoh.Session, key: str, topic: ros2.Topic) -> zenoh.Publisher | ext.AdvancedPublisher:
+    """One that keeps its last message for those who come later, where the topic is latched."""
+    drop = zenoh.CongestionControl.DROP
+    if not topic.latched:
+        return session.declare_publisher(key, encoding=ENCODINGS["cdr"], congestion_control=drop, express=True)
+    return ext.declare_advanced_publisher(
+        session,
+        key,
+        encoding=ENCODINGS["cdr"],
+        cache=ext.CacheConfig(1),
+        sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
+        publisher_detection=True,
+    )

@@ -96,7 +96,7 @@ def starting(settings: Settings) -> Iterator[Start]:
     Raises OccupiedError, UnreachableError.
     """
     network = settings.network
-    roles = network.revoked, network.ros2_domain, (*ros2.controllers(settings.ros2),)
+    roles = network.revoked, network.ros2_domain, (*ros2.of_settings(settings.ros2),)
     with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:
         allow_descriptors()
         with _ahead_of_others():

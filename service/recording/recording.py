@@ -22,15 +22,13 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.messages import BASE, SceneObject, Transform
-from service.contract.records import SIDES
+from service.contract.messages import SceneObject
 from service.core.frame import Record, Tick, encode
-from service.core.outputs import Outputs
+from service.core.outputs import Frames, Outputs
 from service.demonstrations.pose_streams import ENDINGS
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recording.mcap_reader import FileFault, Messages
 from service.recording.steps import REPLAYED, Gap, Step, steps
-from service.urdf import Urdf
 from service.viewer.urdf_markers import with_markers
 
 OBJECTS = "objects"
@@ -40,7 +38,6 @@ _LATCHED = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
     "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
 )
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Recorder(McapFile):
@@ -65,7 +62,7 @@ class Recorder(McapFile):
         self._urdf = robot_description(settings) if urdf is None else urdf
         self._settings, self.skill, self._state = settings, skill, state  # the skill in force, a file
         self._begun, self._sequence = False, 0
-        self._links = Urdf(self._urdf)
+        self._frames = Frames(settings, self._urdf)
         self._topics = {
             channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
         }
@@ -135,26 +132,9 @@ class Recorder(McapFile):
         for key, payload in outputs:
             put(key, payload, time_ns)
         if frame is not None and tick.index % channels.BY_KEY["/tf"].every == 0:
-            put("/tf", cdr.encode_transforms(time_ns, self._transforms(frame)), time_ns)
+            frames = [*self._frames.fixed, *self._frames.moving(frame, frame["joints"].tolist())]
+            put("/tf", cdr.encode_transforms(time_ns, frames), time_ns)
         self.part_ends()
-
-    def _transforms(self, frame: Record) -> list[Transform]:
-        """Transforms for viewers: the arm's links, tool, setpoint, target and hands."""
-        settings = self._settings
-        joints = dict(zip(settings.joints.names, frame["joints"].tolist(), strict=True))
-        found = self._links.transforms(joints)
-        offset = settings.tool.plate_from_tool
-        found.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
-        setpoint, turn, target, target_turn = (
-            tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
-        )
-        found.append(Transform(BASE, "setpoint", setpoint, turn))
-        for side, name in enumerate(SIDES):
-            if frame["hand_ages"][side] >= 0:
-                found.append(Transform(BASE, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
-        if frame["covariance"].any():  # without both hands nothing is predicted
-            found.append(Transform(BASE, "target", target, target_turn))
-        return found
 
     def note(self, key: str, text: str, time_ns: int) -> None:
         """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects given

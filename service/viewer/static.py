@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service import palette
-from service.config import Reach, Settings
+from service.config import Reach, Settings, robot_description, urdf_path
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
-from service.core.separation.body import Body, body_of
+from service.core.separation.body import body_of
+from service.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
 
@@ -37,12 +38,14 @@ _DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 class ArmModels:
     """The arm as commanded and as measured: one URDF, loaded twice under different names.
 
-    `body` are its capsules, which are drawn where meshes are not found: shapes `unfound`. Those
-    found take `mesh_mb` at most [MB], for both.
+    `body` are its capsules, which are drawn where meshes are not found, shapes `unfound`, and
+    around meshes that they cover. Those found take `mesh_mb` at most [MB], for both.
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
-        self.body = body_of(settings, urdf.read_text(encoding="utf-8"))
+        live = urdf == urdf_path(settings)  # else it is a recording's, which has its meshes covered
+        text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
+        self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
         self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
         self.measured = rr.urdf.UrdfTree.from_file_path(
             urdf, entity_path_prefix="measured", frame_prefix=GHOST, static_transform_entity_path="/measured/tf_static"
@@ -74,8 +77,8 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
 
     for tree, path, ghost in ((models.commanded, "/arm", False), (models.measured, "/measured", True)):
         _log_arm(stream, tree, path, models.unfound, ghost=ghost)
-        if models.unfound:
-            _log_capsules(fix, tree, path, models.body, settings, ghost=ghost)
+        if models.unfound or (models.covered and not ghost):
+            _log_capsules(fix, tree, path, models, settings, ghost=ghost)
     fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name))
     fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + models.measured.root_link().name))
@@ -123,21 +126,23 @@ def _log_arm(
             stream.log(f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True)
 
 
-def _log_capsules(fix: Any, tree: rr.urdf.UrdfTree, path: str, body: Body, settings: Settings, *, ghost: bool) -> None:
+def _log_capsules(
+    fix: Any, tree: rr.urdf.UrdfTree, path: str, models: ArmModels, settings: Settings, *, ghost: bool
+) -> None:
     """Logs the capsules of the arm, those of each joint in the frame of the link that it moves."""
     moved = [joint.child_link for name in settings.joints.names if (joint := tree.get_joint_by_name(name)) is not None]
-    root = tree.root_link().name
+    root, body, faint = tree.root_link().name, models.body, ghost or not models.unfound
     for link in np.unique(body.capsules["link"]):
         capsules = body.capsules[body.capsules["link"] == link]
         along = capsules["ends"][:, 1] - capsules["ends"][:, 0]
         turns = [Rotation.align_vectors([one], [UP])[0].as_quat() if one.any() else UPRIGHT for one in along]
-        fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
+        fill = rr.components.FillMode.TransparentFillMajorWireframe if faint else rr.components.FillMode.Solid
         shapes = rr.Capsules3D(
             lengths=np.linalg.norm(along, axis=1),
             radii=capsules["radius"],
             translations=capsules["ends"][:, 0],
             quaternions=np.array(turns),
-            colors=[palette.faint(palette.MEASURED, 0.35) if ghost else palette.ARM],
+            colors=[palette.faint(palette.MEASURED, 0.35) if faint else palette.ARM],
             line_radii=[0.0005],
             fill_mode=fill,
         )

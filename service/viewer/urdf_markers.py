@@ -7,7 +7,7 @@ too. So they show these without a plug-in or a setting.
 from __future__ import annotations
 
 from service import palette
-from service.contract.messages import BASE
+from service.urdf import Urdf
 
 MARKERS = (
     ("left_hand", palette.LEFT, 0.03),
@@ -25,12 +25,12 @@ def with_markers(urdf: str) -> str:
     head, end, tail = urdf.rpartition("</robot>")
     if not end or any(f'name="{frame}"' in urdf for frame, _, _ in MARKERS):
         return urdf
-    links = []
+    links, root = [], Urdf(urdf).root
     for frame, colour, radius in MARKERS:
         red, green, blue = (value / 255 for value in colour)
         links.append(
             f'  <link name="{frame}"><visual><geometry><sphere radius="{radius}"/></geometry>'
             f'<material name="{frame}"><color rgba="{red:.3f} {green:.3f} {blue:.3f} 1"/></material></visual></link>\n'
-            f'  <joint name="{frame}_at" type="floating"><parent link="{BASE}"/><child link="{frame}"/></joint>\n'
+            f'  <joint name="{frame}_at" type="floating"><parent link="{root}"/><child link="{frame}"/></joint>\n'
         )
     return f"{head}{''.join(links)}{end}{tail}"

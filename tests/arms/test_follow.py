@@ -5,6 +5,7 @@ which follows again once there is another.
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import signal
 import subprocess
@@ -21,11 +22,12 @@ from zenoh.handlers import RingChannel
 
 from service.arms.drive import follow
 from service.arms.simulated import SimulatedArm
-from service.client import UnreachableError, endpoints, open_session
+from service.client import Client, UnreachableError, endpoints, open_session
 from service.config import Settings
 from service.contract import cdr
+from sim.scene import Scene
 from support.arms import MODELS, toml_of
-from support.cell import LEFT, Tracker, serving, told
+from support.cell import LEFT, Tracker, serving, thirdhand, told
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 
@@ -155,6 +157,25 @@ def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path
         )
     assert there.new.mean() > 0.99
     assert_allowed(there.velocity[there.new], there.joints[there.new])
+
+
+@pytest.mark.timed
+def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "arm.toml").write_text(PATIENT)
+    with serving(tmp_path, network=PATIENT) as daemon:
+        at = ("--connect", daemon.endpoint)
+        with following("simulated", *at, "--config", str(tmp_path / "arm.toml")) as running:
+            running.until("is driven")
+            Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
+            done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
+            assert done.returncode == 0, done.stderr
+            running.until("commands come")
+            assert running.ended() == 0
+    report = json.loads(done.stdout)
+    for name in ("handover", "grasp", "carry"):
+        assert report["events"][name]["reached"]
+        assert report["events"][name]["error_mm"] < 10.0  # as late as this machine is; in step it is below 1
+    assert "ended at rest" in running.said[-1]
 
 
 # --- bad input -----------------------------------------------------------------------------------

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
 from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_keyexpr, topic_keyexpr
-from zenoh_ros2_sdk.qos import QosProfile, QosReliability
+from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
 from service.config import SettingsError, parse
@@ -20,7 +21,11 @@ from service.network_settings import Ros2
 
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
 COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"
-CONTROLLED = Ros2(position_commands=COMMANDS, trajectory=TRAJECTORY, joint_states=STATES)
+VIEWED = {"tf": "/arm/tf", "robot_description": "/robot_description", "diagnostics": "/diagnostics"}
+NAMED = msgspec.convert(
+    VIEWED | {"position_commands": COMMANDS, "trajectory": TRAJECTORY, "joint_states": STATES}, Ros2
+)
+LATCHED = ("/arm/tf_static", "/robot_description")
 
 
 @pytest.mark.parametrize("store", [Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
@@ -33,17 +38,19 @@ def test_the_hashes_of_the_types_are_those_of_ros2(store: Stores) -> None:
 
 def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -> None:
     topics = [ros2.of_channel(CELL, channel) for channel in (*ros2.HEARD, *ros2.SAID)]
-    topics += ros2.controllers(CONTROLLED)
+    topics += ros2.of_settings(NAMED)
     tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
     node = NodeEntity(DOMAIN, SESSION, 0, ros2.NODE, f"/{CELL}")
     assert tokens.pop("") == node_liveliness_keyexpr(node)
     streams = [c.key for c in channels.CHANNELS if c.direction == "out" or (c.direction == "in" and c.event)]
     own = [f"/{CELL}/{suffix}" for suffix in streams]
-    assert set(tokens) == {*own, COMMANDS, TRAJECTORY, STATES}
+    assert set(tokens) == {*own, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED}
     for number, ((name, token), topic) in enumerate(zip(tokens.items(), topics, strict=True), start=1):
         named = (name, ros2_to_dds_type(topic.type), f"RIHS01_{ros2.TYPE_HASHES[topic.type]}")
         is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name == STATES
         quality = QosProfile(reliability=QosReliability.BEST_EFFORT if is_in else QosReliability.RELIABLE)
+        if name in LATCHED:
+            quality = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
         entity = EntityKind.SUBSCRIPTION if is_in else EntityKind.PUBLISHER
         assert token == endpoint_liveliness_keyexpr(EndpointEntity(node, number, entity, *named, quality.encode()))
         assert ros2.key(DOMAIN, topic) == topic_keyexpr(DOMAIN, *named)
@@ -64,11 +71,25 @@ def test_what_controllers_are_told_is_read_by_others() -> None:
         assert bytes(types.serialize_cdr(way, "trajectory_msgs/msg/JointTrajectory")) == raw
 
 
+def test_diagnostics_are_read_by_others() -> None:
+    types, kind = get_typestore(Stores.ROS2_JAZZY), "diagnostic_msgs/msg/DiagnosticArray"
+    for values in ({}, {"mode": "hold"}, {"lateness_us.p99": "12.5", "why": "eine Hand fehlt, ü"}):
+        raw = cdr.encode_diagnostics(3_000_000_007, 2, "lab/bench2: thirdhand", "fault", values)
+        told: Any = types.deserialize_cdr(raw, kind)
+        [one] = told.status
+        assert (told.header.stamp.sec, told.header.stamp.nanosec) == (3, 7)
+        assert (one.level, one.name, one.hardware_id) == (2, "lab/bench2: thirdhand", "lab/bench2: thirdhand")
+        assert {pair.key: pair.value for pair in one.values} == values
+        assert bytes(types.serialize_cdr(told, kind)) == raw
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [
         ('ros2.trajectory = "/a/b"', r"\$\.network\.ros2_domain: none given; for /a/b one from 0 to 232 needed"),
         ('ros2.trajectory = "a/b"', r"\$\.ros2\.trajectory: 'a/b' given; a topic's full name, /like/this, accepted"),
+        ('ros2.tf = "tf"', r"\$\.ros2\.tf: 'tf' given; a topic's full name, /like/this, accepted"),
+        ('ros2.tf = "/tf"', r"\$\.network\.ros2_domain: none given; for /tf, /tf_static one from 0 to 232 needed"),
         ('ros2.joints = ["elbow"]', r"\$\.ros2\.joints: \['elbow'\] given; those of \$\.joints\.names needed, in any"),
     ],
 )

@@ -96,6 +96,7 @@ def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str,
 
 
 def test_a_description_is_looked_for_beside_the_settings(tmp_path: Path) -> None:
+    meshes = f'packages = ["{urdf_of(MODELS["ur5"]).parents[4]}"]'
     (tmp_path / "arm.urdf").write_bytes(urdf_of(MODELS["ur5"]).read_bytes())
-    (tmp_path / "cell.toml").write_text(toml_of(MODELS["ur5"], urdf='[arm]\nurdf = "arm.urdf"'))
+    (tmp_path / "cell.toml").write_text(toml_of(MODELS["ur5"], urdf=f'[arm]\nurdf = "arm.urdf"\n{meshes}'))
     assert load(tmp_path / "cell.toml").joints.names[0] == "shoulder_pan_joint"

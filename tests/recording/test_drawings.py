@@ -89,6 +89,19 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         assert len(said) == is_drawn
 
 
+def test_capsules_around_collision_meshes_are_drawn_with_the_arm(tmp_path: Path) -> None:
+    shape = re.compile("(<collision>.*?<geometry>).*?(</geometry>)", re.DOTALL)
+    mesh = r'\1<mesh filename="link.stl" covered_by="0 0 0 0 0 0.1 0.05"/>\2'
+    (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    paths = [path for path in drawn(tmp_path / "a.rrd") if "/capsules/" in path]
+    assert len(paths) == len(Settings().joints.names) + 1
+    assert all(path.startswith("/arm/") for path in paths)
+
+
 def test_the_name_of_a_thing_that_a_place_has_too_is_shown_once(tmp_path: Path, skill: Skill) -> None:
     at, size = (0.5, 0.38, 0.16), (0.1, 0.1, 0.006)
     found = [SceneObject(name, "cylinder", "base", at, (0, 0, 0, 1), size, (1, 1, 1, 1)) for name in ("glass", "iron")]

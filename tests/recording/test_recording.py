@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from service.config import Settings, robot_description
+from service.config import robot_description
 from service.contract import cdr, channels
 from service.contract.channels import EVENT_NUMBERS
 from service.contract.ros2msg import schema
@@ -27,6 +27,7 @@ from service.demonstrations.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError
 from service.recording.recording import Recorder, Recording
+from service.shipped import cell_of
 from service.urdf import Urdf
 from service.viewer.urdf_markers import with_markers
 from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
@@ -232,7 +233,8 @@ def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
     text = '<robot name="a"><link name="base"/><link name="target"/></robot>'
     assert with_markers(text) == text
     assert with_markers("no robot") == "no robot"
-    assert Urdf(with_markers(robot_description(Settings()))).chain("left_hand")[0].parent == "base"
+    for arm, root in (("wam", "base"), ("ur5", "base_link")):
+        assert Urdf(with_markers(robot_description(cell_of(arm)))).chain("left_hand")[0].parent == root
 
 
 def test_recordings_with_topics_as_earlier_versions_wrote_them_are_read(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The arm's body: capsules around the collision shapes of its links, and which of them could meet.
 
-A capsule covers its shape: box and cylinder with the least volume that does. Meshes are not read;
-a link that has no other shape is a capsule from its joint to the next, of a configured radius.
+A capsule covers its shape: box and cylinder with the least volume that does, a mesh as it says. A
+link without a shape is a capsule from its joint to the next, of a configured radius.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from service.urdf import Joint, Shape, Urdf
 LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
 UNMOVED = 1e-9  # [m]
 OWN_M = 0.01  # that parts keep from each other at most: where they are is known, and more keeps them from folding
+OVER_M = 0.01  # that capsules around meshes stand out: so much nearer seem links with one link between them
 FITS = 101  # lengths tried for a capsule
 
 
@@ -48,14 +49,14 @@ def body_of(settings: Settings, description: str) -> Body:
 
     Kept apart are capsules of links that do not follow each other, but for those that cannot move
     against each other, and those that belong together: they are nearer than their own clearance in
-    the configured posture.
+    the configured posture, or about that near around meshes with one link between them.
     """
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
     frames = np.array([_in_joint(urdf, names, joint.parent, _origin(joint))[1] for joint in chain])
     found: list[tuple[int, Vector, float]] = []
     for shape in urdf.shapes:
-        if shape.kind != "mesh":
+        if shape.size:
             ends, radius = _capsule(shape)
             link, placed = _in_joint(urdf, names, shape.link, np.eye(3, 4))
             found.append((link, ends @ placed[:, :3].T + placed[:, 3], radius))
@@ -77,12 +78,13 @@ def body_of(settings: Settings, description: str) -> Body:
     placed, near = np.empty((len(postures), len(capsules), 2, 3)), np.empty(9)
     for q, ends in zip(postures, placed, strict=True):
         place(q, body.frames, body.axes, capsules, ends)
-    pairs = []
+    pairs, meshes = [], any(shape.kind == "mesh" for shape in urdf.shapes)
     links, radii = capsules["link"], capsules["radius"]
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
-            if apart[0] > own_clearance(settings) and np.ptp(apart) > UNMOVED:
+            over = OVER_M if meshes and links[j] - links[i] == 2 else 0.0
+            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > UNMOVED:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 
@@ -116,6 +118,9 @@ def _in_joint(urdf: Urdf, names: tuple[str, ...], link: str, placed: Vector) -> 
 
 def _capsule(shape: Shape) -> tuple[Vector, float]:
     """Ends (2, 3) in the link's frame and radius [m] of the capsule that covers a shape."""
+    if shape.kind == "mesh":
+        ends = np.reshape(shape.size[:6], (2, 3))
+        return ends @ rotation(shape.rotation).T + shape.translation, shape.size[6]
     axis, half, radius = 2, 0.0, shape.size[0]
     if shape.kind == "box":
         axis = int(np.argmax(shape.size))

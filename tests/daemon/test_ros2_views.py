@@ -1,0 +1,219 @@
+"""What RViz and rqt show of a cell: its description and fixed frames, latched, its frames and its
+diagnostics, on the topics that the settings name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+from zenoh import ext
+from zenoh_ros2_sdk import ROS2Subscriber
+from zenoh_ros2_sdk.qos import QosDurability, QosProfile
+from zenoh_ros2_sdk.session import ZenohSession
+
+from service.client import endpoints, open_session
+from service.config import Settings, parse, robot_description
+from service.contract import cdr, ros2
+from service.contract.messages import JointState, Transform
+from service.contract.roles import access_control
+from service.core.frame import blank, frame_layout
+from service.core.outputs import Frames
+from service.daemon.ros2_domain import Ros2Domain
+from service.daemon.single_instance import BOUNDS
+from service.shipped import cell_of
+from support.cell import Tracker, serving, told
+from support.wam import JOINT_NAMES
+
+DOMAIN, SECONDS = 12, 20.0
+VIEWED = """
+[ros2]
+tf = "/tf"
+robot_description = "/robot_description"
+diagnostics = "/diagnostics"
+"""
+CONFIGURATION = f"""
+rate_hz = 250
+[network]
+listen = ["tcp/127.0.0.1:0"]
+connect = ["{{router}}"]
+ros2_domain = {DOMAIN}
+{VIEWED}
+[files]
+state = "{{state}}"
+"""
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+POSTURE = np.array(Settings().arm.posture) + 0.05
+
+
+def until(happens: Callable[[], Any], what: str) -> None:
+    end = time.monotonic() + SECONDS
+    while not happens():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+def key(topic: str) -> str:
+    """The Zenoh key of a topic that the settings name."""
+    settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml").ros2
+    return ros2.key(DOMAIN, next(one for one in ros2.of_settings(settings) if one.name == topic))
+
+
+class LikeRmw:
+    """A subscriber of a latched topic as rmw_zenoh declares it; what it was told."""
+
+    def __init__(self, session: zenoh.Session, topic: str) -> None:
+        self.told: list[bytes] = []
+        self._declared = ext.declare_advanced_subscriber(
+            session,
+            key(topic),
+            lambda sample: self.told.append(sample.payload.to_bytes()),
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            subscriber_detection=True,
+        )
+
+
+@pytest.fixture
+def router() -> Iterator[zenoh.Session]:
+    with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as session:
+        yield session
+        ZenohSession.get_instance().close()
+
+
+def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path, router: zenoh.Session) -> None:
+    (at,) = endpoints(router)
+    (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=at, state=tmp_path))
+    port = {"domain_id": DOMAIN, "router_ip": "127.0.0.1", "router_port": int(at.rpartition(":")[2])}
+    latched = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
+    heard: dict[str, list[Any]] = {}
+
+    def listen(topic: str, kind: str, **more: Any) -> ROS2Subscriber:
+        text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+        known = {"msg_type": kind, "msg_definition": text, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
+        return ROS2Subscriber(topic, callback=heard.setdefault(topic, []).append, **known, **port, **more)
+
+    with open_session(connect=[at]) as node:
+        early = {topic: LikeRmw(node, topic) for topic in ("/robot_description", "/tf_static")}
+        arguments = ("--config", str(tmp_path / "viewed.toml"))
+        with serving(tmp_path, *arguments) as daemon:
+            joints = daemon.session.declare_publisher("thirdhand/joints/state")
+
+            def as_the_arm() -> bool:
+                joints.put(cdr.encode_joints(JointState(time.time_ns(), JOINT_NAMES, tuple(POSTURE), (0.0,) * 7)))
+                return True
+
+            until(lambda: as_the_arm() and daemon.client.ask("status")["reason"] == "no_hands", "no arm")
+            listening = [  # after all that is latched was published
+                listen("/robot_description", "std_msgs/msg/String", qos=latched),
+                listen("/tf_static", "tf2_msgs/msg/TFMessage", qos=latched),
+                listen("/tf", "tf2_msgs/msg/TFMessage"),
+                listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
+            ]
+            late = {topic: LikeRmw(node, topic) for topic in early}
+            until(lambda: as_the_arm() and heard["/diagnostics"] and len(heard["/tf"]) > 5, "nothing was said")
+            until(lambda: all(one.told for one in (*early.values(), *late.values())), "what is latched was not told")
+            began, count = time.monotonic(), len(heard["/tf"])
+            until(lambda: as_the_arm() and len(heard["/tf"]) >= count + 10, "frames ended")
+            assert time.monotonic() - began > 0.5  # ten a second: the loop shares the interpreter
+            held, frames = heard["/diagnostics"][-1].status[0], heard["/tf"][-1].transforms
+            with Tracker(daemon.session) as hands:
+
+                def is_at_fault() -> bool:  # as the arm does not follow
+                    away = 0.06 * np.sin(3.0 * time.monotonic())
+                    hands.left, hands.right = (0.92 + away, -0.3, 0.08), (0.92 + away, 0.3, 0.08)
+                    return bool(as_the_arm() and heard["/diagnostics"][-1].status[0].level == 2)
+
+                until(is_at_fault, "no fault was told")
+            assert heard["/robot_description"][0].data == robot_description(Settings())
+            assert [
+                TYPES.deserialize_cdr(raw, "std_msgs/msg/String").data for raw in late["/robot_description"].told
+            ] == [robot_description(Settings())]
+            assert all(one.told == late[topic].told for topic, one in early.items())
+            for one in listening:
+                one.close()
+    assert (held.level, held.name, held.message[:15]) == (1, "thirdhand: thirdhand", "hold (no_hands)")
+    assert heard["/diagnostics"][-1].status[0].message.startswith("fault (arm_")
+    values = {pair.key: pair.value for pair in held.values}
+    assert (values["mode"], values["reason"]) == ("hold", "no_hands")
+    assert float(values["lateness_us.p99"]) >= 0
+    assert int(values["missed"]) >= 0
+    transforms = [*heard["/tf_static"][0].transforms, *frames]
+    assert len({one.child_frame_id for one in transforms}) == len(transforms)
+    tool = placed([as_told(one) for one in transforms], "tool")
+    np.testing.assert_allclose(tool, kinematics(Settings(), POSTURE), atol=1e-9)
+
+
+def as_told(one: Any) -> Transform:
+    """A `TransformStamped`."""
+    at, q = one.transform.translation, one.transform.rotation
+    return Transform(one.header.frame_id, one.child_frame_id, (at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
+
+
+def placed(transforms: list[Transform], frame: str, root: str = "base") -> np.ndarray:
+    """Where a frame is in frame `base`, as a 4 x 4 matrix, along the parents."""
+    at, above = pin.SE3.Identity(), {one.child: one for one in transforms}
+    while frame != root:
+        one = above[frame]
+        at, frame = pin.SE3(pin.Quaternion(np.array(one.rotation)).matrix(), np.array(one.translation)) * at, one.parent
+    return np.array(at.homogeneous)
+
+
+def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
+    """Where Pinocchio has the tool, likewise."""
+    model = pin.buildModelFromXML(robot_description(settings))
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, joints)
+    offset = settings.tool.plate_from_tool
+    tool = pin.SE3(pin.Quaternion(np.array(offset[3:])).matrix(), np.array(offset[:3]))
+    return np.array((data.oMf[model.getFrameId(settings.arm.plate)] * tool).homogeneous)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("arm", ["wam", "franka", "ur5"])
+def test_frames_of_every_shipped_arm_are_one_tree_from_base(arm: str) -> None:
+    """Whatever its root is called; the links only where the cell describes them."""
+    settings = cell_of(arm)
+    frame, joints = blank(frame_layout(len(settings.joints.names))), np.array(settings.arm.posture)
+    frame["covariance"][:] = np.eye(3)
+    frames = Frames(settings, robot_description(settings))
+    told = [*frames.fixed, *frames.moving(frame, joints.tolist())]
+    assert len({one.child for one in told}) == len(told)
+    for name in ("setpoint", "target", "left_hand", "right_hand"):
+        np.testing.assert_allclose(placed(told, name)[:3, 3], 0.0)
+    np.testing.assert_allclose(placed(told, "tool"), kinematics(settings, joints), atol=1e-9)
+    without = Frames(settings, robot_description(settings), links=False)
+    left = {one.child for one in (*without.fixed, *without.moving(frame, joints.tolist()))}
+    assert left - {"base_link"} == {"tool", "setpoint", "target", "left_hand", "right_hand"}
+
+
+def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:
+    """An observer, and not a tracker."""
+    assert told("certificates", str(tmp_path / "secrets")).returncode == 0
+    settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
+    topics = list(ros2.of_settings(settings.ros2))
+    guarded = {**BOUNDS, **access_control(settings.cell, (), DOMAIN, topics)}
+    listen, secrets = ["tls/127.0.0.1:0"], tmp_path / "secrets"
+    with open_session(listen=listen, certificate=secrets / "daemon", more=guarded) as session:
+        failures: list[str] = []
+        domain = Ros2Domain(session, settings, topics, failed=failures.append)
+        at = endpoints(session)
+        try:
+            with (
+                open_session(connect=at, certificate=secrets / "observer") as observer,
+                open_session(connect=at, certificate=secrets / "tracker") as tracker,
+            ):
+                seen, unseen = ([LikeRmw(one, topic) for topic in ("/robot_description", "/tf_static")]
+                                for one in (observer, tracker))  # fmt: skip
+                until(lambda: all(one.told for one in seen), "an observer was not told")
+                assert not any(one.told for one in unseen)
+        finally:
+            domain.close()
+        assert failures == []

@@ -1,0 +1,172 @@
+"""Collision meshes are covered by capsules: what is inside, where files are looked for, and what
+is said of those that are not found.
+"""
+
+from __future__ import annotations
+
+import struct
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from service.config import Settings, SettingsError, parse, robot_description, urdf_path
+from service.core.geometry import rotation
+from service.core.separation.body import body_of
+from service.described_arm import description
+from service.mesh_cover import capsule_around, covered
+from service.urdf import Urdf, UrdfError
+from support import arms
+from support.paths import ROOT
+
+WAM = (ROOT / "service" / "arms" / "wam.urdf").read_text(encoding="utf-8")
+Points = NDArray[np.float64]
+
+
+def outside(points: Points, ends: Points, radius: float) -> float:
+    """How far the farthest of points (N, 3) is out of a capsule [m]."""
+    start, way = ends[0], ends[1] - ends[0]
+    share = np.clip((points - start) @ way / max(way @ way, 1e-18), 0.0, 1.0)
+    return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max() - radius)
+
+
+def volume(ends: Points, radius: float) -> float:
+    return float(np.pi * radius**2 * (np.linalg.norm(ends[1] - ends[0]) + 4.0 / 3.0 * radius))
+
+
+def stl(points: Points) -> bytes:
+    """A binary STL file of the triangles around points."""
+    triangles = np.asarray(points, "<f4")[ConvexHull(points).simplices]
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *one.ravel(), 0) for one in triangles)
+    return bytes(80) + struct.pack("<I", len(triangles)) + body
+
+
+def box(x: float, y: float, z: float) -> Points:
+    return np.array([(a * x, b * y, c * z) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+
+
+@settings(deadline=None, max_examples=40)
+@given(arrays(float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)))
+def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(points: Points) -> None:
+    """Flat ones, and one alone, too."""
+    found = np.array(capsule_around(points))
+    ends, radius = found[:6].reshape(2, 3), float(found[6])
+    assert outside(points, ends, radius) <= 1e-9
+    widest = np.linalg.norm(points - points.mean(axis=0), axis=1).max() + 0.001
+    assert volume(ends, radius) <= 1.05 * volume(np.zeros((2, 3)), widest)
+
+
+def plain(points: Points) -> float:
+    """The volume of the capsule of the box around points, along its longest edge."""
+    *short, longest = sorted(np.ptp(points, axis=0))
+    return volume(np.array(((0, 0, 0), (0, 0, longest))), float(np.hypot(*short)) / 2)
+
+
+@pytest.mark.parametrize("edges", [(0.1, 0.1, 0.5), (0.2, 0.2, 0.2), (0.4, 0.3, 0.02)])
+def test_a_capsule_is_about_as_small_as_the_plain_one_however_a_mesh_lies(edges: tuple[float, float, float]) -> None:
+    points = box(*edges)
+    for turn in ((0.0, 0.0, 0.0, 1.0), (0.2, -0.4, 0.4, 0.8)):
+        found = np.array(capsule_around(points @ rotation(turn).T + np.array((0.3, -0.2, 0.1))))
+        assert volume(found[:6].reshape(2, 3), found[6]) < 1.05 * plain(points)
+
+
+def described(name: str, scale: str = "") -> str:
+    """The WAM, whose forearm has this mesh alone as its collision shape, turned and moved."""
+    begin = WAM.index('<link name="forearm">')
+    end = WAM.index("</link>", begin)
+    shape = f'<collision><origin xyz="0.01 0 0.1" rpy="0 0.5 0"/><geometry><mesh filename="{name}"{scale}/></geometry>'
+    return f'{WAM[:begin]}<link name="forearm">{shape}</collision>{WAM[end:]}'
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "packages"),
+    [
+        ("meshes/arm.stl", "cell/meshes/arm.stl", ""),
+        ("file://{folder}/arm.stl", "arm.stl", ""),
+        ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),  # the folder above the URDF is the package
+        ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
+        ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
+    ],
+)
+def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: str, packages: str) -> None:
+    folder = tmp_path / "my_arm"
+    (folder / "cell").mkdir(parents=True)
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    points = box(60.0, 50.0, 300.0) + np.array((0.0, 0.0, 40.0))  # in millimetres
+    (folder / file).write_bytes(stl(points))
+    (folder / "cell" / "arm.urdf").write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
+    own = Settings()
+    lines = f"""
+        [arm]
+        urdf = "arm.urdf"
+        plate = "{own.arm.plate}"
+        posture = {list(own.arm.posture)}
+        link_radius = 1.0
+        packages = ["/nowhere", "{folder / packages}"]
+        [joints]
+        acceleration = {list(own.joints.acceleration)}
+        jerk = {list(own.joints.jerk)}
+    """
+    cell = parse(lines, origin="cell.toml", folder=folder / "cell")
+    text = robot_description(cell)
+    assert "covered_by" not in description(urdf_path(cell), cover=False)
+    (folder / file).unlink()
+    assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording has all that it needs
+    shape = next(one for one in Urdf(text).shapes if one.link == "forearm")
+    at = points * 0.001 @ rotation(shape.rotation).T + shape.translation
+    capsules = body_of(cell, text).capsules
+    mine = [one for one in capsules if outside(at, one["ends"], one["radius"]) <= 1e-9]
+    assert [round(float(one["radius"]), 2) for one in mine] == [0.04]
+    assert capsules["radius"].max() < 0.2  # none by `link_radius`
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        (
+            "package://no_arm/link.stl",
+            "'no_arm' is in no folder above the URDF, and in none of $.arm.packages: name its folder's there",
+        ),
+        ("meshes/link.stl", "there is no {folder}/meshes/link.stl: put it there, or give the link a box, cylinder"),
+        ("broken.stl", "cannot be read"),
+    ],
+)
+def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / "broken.stl").write_bytes(b"no mesh")
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(described(name))
+    with pytest.raises(UrdfError) as error:
+        covered(urdf.read_text(), urdf)
+    assert f"{urdf}: the collision mesh {name} of link 'forearm'" in str(error.value)
+    assert told.format(folder=tmp_path) in str(error.value)
+    with pytest.raises(SettingsError, match=r"\$\.arm\.urdf: .*the collision mesh"):
+        robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_meshes_that_others_publish_are_inside_capsules_that_are_not_much_larger(name: str) -> None:
+    try:
+        files("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data, whose meshes these are, is not installed")
+    import coal
+
+    cell = arms.cell_of(name)
+    text, folder = robot_description(cell), arms.urdf_of(arms.MODELS[name]).parents[2]
+    meshes = [shape for shape in Urdf(text).shapes if shape.kind == "mesh"]
+    names = [one.split('"')[0] for one in text.split('filename="package://example-robot-data/robots/')[1:]]
+    stls = [one for one in names if one.endswith(".stl") and "/collision/" in one]
+    assert len(stls) == len(meshes) >= 7
+    for shape, file in zip(meshes, stls, strict=True):
+        points = np.array(coal.MeshLoader().load(str(folder / file), np.ones(3)).vertices())
+        ends, radius = np.reshape(shape.size[:6], (2, 3)), shape.size[6]
+        assert outside(points, ends, radius) <= 0.0, shape.link
+        assert volume(ends, radius) < plain(points), shape.link
+    known = {int(one) for one in body_of(cell, text).capsules["link"]}
+    assert known == set(range(len(cell.joints.names) + 1))
