@@ -17,8 +17,9 @@ from service.core.frame import Records, Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
-# Of what a tool that may turn saves in speeds, accelerations, jerks: with more it falls behind its setpoint.
-TURNS_AWAY = np.array([0.6, 0.25, 0.25])
+# Of what a tool that may turn saves in speeds, accelerations and jerks: with more it falls behind
+# its setpoint.
+TURNS_AWAY = np.array([0.6, 0.1, 0.1])
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
@@ -49,8 +50,8 @@ def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[
 @compiled
 def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
-    limit, by damped least squares that spare the joints with less of it; by order of the derivative,
-    then by axis. The tool turns a little where that spares joints.
+    limit, by damped least squares that spare the joints with less of it; by order of the
+    derivative, then by axis. The tool turns a little where that spares joints.
     """
     arm, here = arms[0], heres[0]
     count, joints = here.tasks.shape

@@ -187,31 +187,30 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     used = min(BARRIER_RATE * dt, BARRIER_TIME / dt)
     left = way - stop_distance(speed, a, brake, change)
     limit = way + min(coming, speed) * dt - (1.0 - used) * left
-    # at least the jerk with which it can still end its braking by the time it rests: else it swings back
-    a_u, a_d = a + u * dt, a - change * dt
-    most = a_u * abs(a_u) / (2.0 * change) + speed + dt * (a + 0.5 * dt * u)
-    least = a_d * abs(a_d) / (2.0 * change) + speed + dt * (a - 0.5 * dt * change)
-    lowest = -change
-    if least < 0.0:
-        lowest = u if most <= 0.0 else -change + (u + change) * -least / (most - least)
-    a_d = a + lowest * dt
+    # with less jerk than the lowest it would brake on after it rests, and swing back
+    now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
+    lowest = _between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
     v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a + 0.5 * dt * lowest), 0.0)
     most = stop_distance(v_u, a + u * dt, brake, change) + speed * dt
-    least = stop_distance(v_d, a_d, brake, change) + speed * dt
+    least = stop_distance(v_d, a + lowest * dt, brake, change) + speed * dt
     chosen = _between(u, lowest, most, least, limit)
-    # so does what is left to the greatest speed, as it is when the acceleration has come to 0
-    left = top - (speed + a * abs(a) / (2.0 * change))
-    limit = top - (1.0 - used) * left
-    a_u, a_d = a + chosen * dt, a - change * dt
-    most = speed + dt * (a + 0.5 * dt * chosen) + a_u * abs(a_u) / (2.0 * change)
-    least = speed + dt * (a - 0.5 * dt * change) + a_d * abs(a_d) / (2.0 * change)
-    chosen = _between(chosen, -change, most, least, limit)
+    # so does what is left to the greatest speed
+    limit = top - (1.0 - used) * (top - now)
+    most = _coasting(speed, a, chosen, change, dt)
+    chosen = _between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
     if chosen >= u:
         return 0
     for i in range(3):
         jerk[i] += (chosen - u) * along[i]
     _limit_jerk(jerk, setpoint[2], parameters, costs)
     return PLANNED
+
+
+@compiled
+def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
+    """The speed [m/s] at which the acceleration, after dt of a jerk, comes to 0 by `change`."""
+    then = a + dt * jerk
+    return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
 
 
 @compiled
