@@ -31,6 +31,7 @@ from sim.experiments.workers import shared_out
 
 PEOPLE, SECONDS, STOPS, REACHES = 3, 15.0, 24, 1
 SETTLED_MM = 5.0
+BEGUN_S = 1.0  # a recording may begin in full motion, with the tool at rest: that is not following
 WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
@@ -134,17 +135,19 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
 
 
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
-    """Figures of a path against the truth's target (N, 3) [m]."""
-    off_mm = 1000 * np.linalg.norm(seen.tool - target, axis=1)
-    wanted_acceleration, acceleration = (_derived(x, 2) for x in (target, seen.tool))
+    """Figures of a path against the truth's target (N, 3) [m], from BEGUN_S on."""
+    tool, begun = seen.tool, round(BEGUN_S / PERIOD_S)
     overshoot = settled = math.nan
     if not math.isnan(hands.stop_s):
         begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
         way = _derived(target, 1)[begin]
-        past = (seen.tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
+        past = (tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
         overshoot = max(0.0, 1000 * float(past.max()))
-        late = np.flatnonzero(1000 * np.linalg.norm(seen.tool[end:] - target[-1], axis=1) > SETTLED_MM)
+        late = np.flatnonzero(1000 * np.linalg.norm(tool[end:] - target[-1], axis=1) > SETTLED_MM)
         settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
+    tool, target = tool[begun:], target[begun:]
+    off_mm = 1000 * np.linalg.norm(tool - target, axis=1)
+    wanted_acceleration, acceleration = (_derived(x, 2) for x in (target, tool))
     return Figures(
         name,
         hands.group,
@@ -152,7 +155,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         hands.person,
         error_rms_mm=float(np.sqrt(np.mean(off_mm**2))),
         error_p95_mm=float(np.percentile(off_mm, 95)),
-        lag_ms=_lag_ms(target, seen.tool),
+        lag_ms=_lag_ms(target, tool),
         acceleration_ratio=_rms(acceleration) / _rms(wanted_acceleration),
         jerk_ratio=_rms(_derived(acceleration, 1)) / _rms(_derived(wanted_acceleration, 1)),
         limited=seen.limited,

@@ -267,6 +267,26 @@ def test_a_target_that_stops_at_once_is_overshot_by_millimetres() -> None:
     assert np.linalg.norm(states[300:, 0] - MIDDLE, axis=1).max() < 0.02
 
 
+@pytest.mark.parametrize("speed", [0.2, 0.4, 0.6])
+@pytest.mark.parametrize(("acceleration", "jerk"), [(5.0, 120.0), (7.5, 170.0), (10.0, 231.0)])
+def test_after_a_hard_stop_it_does_not_swing_back(speed: float, acceleration: float, jerk: float) -> None:
+    costs, way = FREE.copy(), np.array([0.6, -0.8, 0.0])
+    for joint in range(3):
+        costs[1, joint, joint], costs[2, joint, joint] = 1 / acceleration, 1 / jerk
+    time_s = np.arange(-500, 400) * PERIOD_S
+    velocity = speed * np.clip(1.0 - time_s / 0.02, 0.0, 1.0)
+    position = np.cumsum(velocity[::-1])[::-1] * -PERIOD_S
+    braking = np.where((time_s > 0.0) & (time_s < 0.02), -speed / 0.02, 0.0)
+    targets = [
+        np.array([MIDDLE + way * x, way * v, way * a]) for x, v, a in zip(position, velocity, braking, strict=True)
+    ]
+    states, _ = driven(targets, costs=costs, start=np.array([targets[0][0], targets[0][1], (0.0,) * 3]))
+    past = ((states[:, 0] - MIDDLE) @ way)[500:]
+    after = past[past.argmax() :]
+    assert after.min() > -0.002
+    assert np.abs(after[100:]).max() < 0.001
+
+
 # --- quiet motion ------------------------------------------------------------
 
 

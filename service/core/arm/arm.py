@@ -28,7 +28,7 @@ CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
 HORIZON_S = 0.02  # for reaching the joint velocities that an orientation step needs; else it is scaled down
-SPARING = 0.3  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
+SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
 PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
@@ -122,8 +122,11 @@ class Arm:
             CLOSING_BRAKES * settings.tool.stop_acceleration, min(top, CLOSING_SPEED), FAR_DAMPING
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
-        scale = (acceleration / acceleration.max()) ** SPARING
+        scale = acceleration**SPARING
+        scale /= np.exp(np.log(scale).mean())
         self._jerk = np.array(limits.jerk)
+        spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
+        spared /= spared.mean(axis=1, keepdims=True)
         rate = acceleration_rate(limits)
         self.parameters = parameters(
             period_s=settings.period_s,
@@ -146,9 +149,10 @@ class Arm:
             acceleration=acceleration,
             posture=np.array(settings.arm.posture, np.float64),
             scale=scale,
+            spared=spared,
             planned_limits=PLANNED_SHARE[:, None]
             * np.array([limits.velocity, limits.acceleration, limits.jerk])
-            / scale,
+            / spared,
         )
         tasks = 6 if settings.tool.orientation == "full" else 5
         self._kinematics = np.dtype(

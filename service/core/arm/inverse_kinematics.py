@@ -17,7 +17,9 @@ from service.core.frame import Records, Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
-TURNS_AWAY = 0.35  # of what a tool that may turn saves in accelerations: with more it falls behind its setpoint
+# Of what a tool that may turn saves in speeds, accelerations and jerks: with more it falls behind
+# its setpoint.
+TURNS_AWAY = np.array([0.6, 0.1, 0.1])
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
@@ -48,31 +50,31 @@ def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[
 @compiled
 def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
-    limit, by damped least squares; by order of the derivative, then by axis. At that velocity the
-    tool does not turn, with the others it turns a little where that spares joints.
+    limit, by damped least squares that spare the joints with less of it; by order of the
+    derivative, then by axis. The tool turns a little where that spares joints.
     """
     arm, here = arms[0], heres[0]
     count, joints = here.tasks.shape
     scaled, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
     free = np.empty(3)
-    for i in range(count):
-        for joint in range(joints):
-            scaled[i, joint] = here.tasks[i, joint] * arm.scale[joint]
-    factorise(scaled, here.damping, root)
-    for axis in range(3):
-        right[:], free[:] = 0.0, 0.0
-        right[axis] = free[axis] = 1.0
-        substitute(root, right)
-        substitute(root, free)  # the factor of the first tasks is the first of the factor
-        for joint in range(joints):
-            still = turning = 0.0
-            for i in range(count):
-                still += scaled[i, joint] * right[i]
-            for i in range(3):
-                turning += scaled[i, joint] * free[i]
-            turning = still + TURNS_AWAY * (turning - still)
-            for order in range(3):
-                out[order, axis, joint] = (turning if order else still) / arm.planned_limits[order, joint]
+    for order in range(3):
+        for i in range(count):
+            for joint in range(joints):
+                scaled[i, joint] = here.tasks[i, joint] * arm.spared[order, joint]
+        factorise(scaled, here.damping, root)
+        for axis in range(3):
+            right[:], free[:] = 0.0, 0.0
+            right[axis] = free[axis] = 1.0
+            substitute(root, right)
+            substitute(root, free)  # the factor of the first tasks is the first of the factor
+            for joint in range(joints):
+                still = turning = 0.0
+                for i in range(count):
+                    still += scaled[i, joint] * right[i]
+                for i in range(3):
+                    turning += scaled[i, joint] * free[i]
+                away = still + TURNS_AWAY[order] * (turning - still)
+                out[order, axis, joint] = away / arm.planned_limits[order, joint]
 
 
 @compiled

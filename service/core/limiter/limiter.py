@@ -236,7 +236,7 @@ def _frozen(moved: Vector, *, limited: bool) -> Limited:
 
 
 NEAR_SPEED = 0.8  # of the tool's greatest; what the joints turn in a stop changes it by less than the rest
-STOP_SHARE = 0.997  # of that speed, from which it stops: a little more comes of what is left out in finding it
+STOP_SHARE = 0.99  # of that speed, from which it stops: what is left out in finding it adds to that in long ticks
 
 
 class Moved(NamedTuple):

@@ -47,7 +47,7 @@ FORESEEN = 0.12  # [s] a target that brakes is taken to be slower by its deceler
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
 BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
-SHARE = 0.91  # of acceleration and jerk that is planned with
+SHARE = 0.85  # of acceleration and jerk that is planned with
 SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
 GAP_FREE = 0.003  # [m] a tool so far behind its setpoint slows it ...
@@ -176,7 +176,7 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
         way += along[i] * (target[0, i] - setpoint[0, i])
         v_target += along[i] * feasible * target[1, i]
         a_target += along[i] * target[2, i]
-    brake = SHARE * min(given.stop_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    brake = SHARE * min(given.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
     change = SHARE * min(given.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
     change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
@@ -187,23 +187,30 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     used = min(BARRIER_RATE * dt, BARRIER_TIME / dt)
     left = way - stop_distance(speed, a, brake, change)
     limit = way + min(coming, speed) * dt - (1.0 - used) * left
-    v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a - 0.5 * dt * change), 0.0)
+    # with less jerk than the lowest it would brake on after it rests, and swing back
+    now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
+    lowest = _between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
+    v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a + 0.5 * dt * lowest), 0.0)
     most = stop_distance(v_u, a + u * dt, brake, change) + speed * dt
-    least = stop_distance(v_d, a - change * dt, brake, change) + speed * dt
-    chosen = _between(u, -change, most, least, limit)
-    # so does what is left to the greatest speed, as it is when the acceleration has come to 0
-    left = top - (speed + a * abs(a) / (2.0 * change))
-    limit = top - (1.0 - used) * left
-    a_u, a_d = a + chosen * dt, a - change * dt
-    most = speed + dt * (a + 0.5 * dt * chosen) + a_u * abs(a_u) / (2.0 * change)
-    least = speed + dt * (a - 0.5 * dt * change) + a_d * abs(a_d) / (2.0 * change)
-    chosen = _between(chosen, -change, most, least, limit)
+    least = stop_distance(v_d, a + lowest * dt, brake, change) + speed * dt
+    chosen = _between(u, lowest, most, least, limit)
+    # so does what is left to the greatest speed
+    limit = top - (1.0 - used) * (top - now)
+    most = _coasting(speed, a, chosen, change, dt)
+    chosen = _between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
     if chosen >= u:
         return 0
     for i in range(3):
         jerk[i] += (chosen - u) * along[i]
     _limit_jerk(jerk, setpoint[2], parameters, costs)
     return PLANNED
+
+
+@compiled
+def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
+    """The speed [m/s] at which the acceleration, after dt of a jerk, comes to 0 by `change`."""
+    then = a + dt * jerk
+    return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
 
 
 @compiled
