@@ -19,8 +19,8 @@ from service.core.intake import MODES, STATES
 
 REST, REACH, CHANGE = range(MODES)  # the modes
 INTENSITY = np.array([1e-6, 1.0, 30.0])  # [m²/s⁵] of the modes
-REVERT_A = np.array([10.0, 15.0, 15.0])  # [1/s] of the acceleration
-REVERT_V = np.array([0.3, 100.0, 100.0])  # [1/s²] of the velocity: slow hands go on, reaches end
+REVERT_A = np.array([10.0, 14.0, 14.0])  # [1/s] of the acceleration
+REVERT_V = np.array([0.3, 95.0, 95.0])  # [1/s²] of the velocity: slow hands go on, reaches end
 TREMOR = 3e-4  # [m] standard deviation, each axis: most people's; more is told from motion by its rhythm
 TREMOR_RATE = 2.0 * math.pi * 10.0  # [1/s] people's is of 8 to 12 Hz ...
 TREMOR_DAMPING = 0.25  # ... each of its own
