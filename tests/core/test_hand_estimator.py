@@ -124,7 +124,7 @@ def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [100, 334, 500])
-def test_the_hardest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None:
+def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None:
     """There and back at 1.5 m/s, in a third of a second each way: none of the modes moves so."""
 
     def hand(t: float) -> Vector:

@@ -4,7 +4,7 @@ started, moved on, and given a sample.
 A hand rests, reaches, or changes its way. Each mode is a Kalman filter of position, velocity and
 acceleration (`motion_model`). One that rests is slow, and trembles about where it is: an
 oscillation that its samples show and that is no part of its motion. Its speed and tremor are
-bounded: without that a mode that expects most to happen within one sample would win in the hardest
+bounded: without that a mode that expects most to happen within one sample would win in the quickest
 motion, which none explains. Only who has become slow comes to rest, with what was known of its
 motion and that it is slow; who leaves rest begins with all that the samples showed.
 
