@@ -9,9 +9,9 @@ import pytest
 
 from service.config import HandSettings
 from service.core.frame import Vector
-from service.core.intake import hand_estimator
-from service.core.intake.hand_estimator import LEAST_NOISE, MODES, MOST_NOISE
-from service.core.intake.motion_model import model
+from service.core.intake import MODES, STATES, mode_filter
+from service.core.intake.hand_estimator import LEAST_NOISE, MOST_NOISE
+from service.core.intake.motion_model import REST, model
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 
@@ -79,7 +79,8 @@ def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() 
             at = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
             hands.hand(tick + 1, tuple(at.tolist()))
     state = hands.state
-    for covariance in state["mode_covariances"][LEFT]:
+    for mode, whole in enumerate(state["mode_covariances"][LEFT]):
+        covariance = whole if mode == REST else whole[:3, :3]
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
         assert np.linalg.eigvalsh(covariance).min() > 0
     assert state["mode_probabilities"][LEFT].sum() == pytest.approx(1.0)
@@ -88,11 +89,59 @@ def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() 
     assert np.isfinite(state["hands"]).all()
 
 
+def trembling(seconds: float, size_m: float, random: np.random.Generator) -> Vector:
+    """A tremor (N, 3) [m] of 8 to 12 Hz and a tracker's noise, at 100 Hz."""
+    rates = np.interp(
+        np.arange(0.0, seconds, 0.01), np.arange(seconds + 1.0), random.uniform(8.0, 12.0, int(seconds) + 1)
+    )
+    way = random.normal(size=3)
+    tremor = size_m * np.sin(0.02 * np.pi * np.cumsum(rates))[:, None] * way / np.linalg.norm(way)
+    return np.asarray(tremor + random.normal(0.0, 0.0005, (len(rates), 3)))
+
+
+@pytest.mark.parametrize("size_m", [0.0003, 0.001, 0.002])
+def test_a_tremor_is_no_part_of_the_motion_of_a_hand_at_rest(size_m: float) -> None:
+    noise = trembling(8.0, size_m, np.random.default_rng(5))
+    found = follow(Hands(), lambda t: np.zeros(3), until_s=8.0, noise=noise)[1000:]
+    assert np.sqrt(np.mean(np.sum(found[:, 0] ** 2, axis=1))) < 0.0003
+    assert np.sqrt(np.mean(np.sum(found[:, 1] ** 2, axis=1))) < 0.003
+
+
+def test_a_hand_that_trembles_is_known_at_once_where_it_goes() -> None:
+    noise = trembling(3.0, 0.001, np.random.default_rng(6))
+    found = follow(Hands(), lambda t: reach(t - 0.5), until_s=3.0, noise=noise)
+    wanted = np.array([reach(PERIOD_S * tick - 0.5) for tick in range(len(found))])
+    assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < 0.004
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.002, 0.005, 0.02])
+@pytest.mark.parametrize("rate_hz", [30, 100, 240])
+def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
+    noise = np.random.default_rng(7).normal(0.0, 0.0005, (8 * rate_hz, 3))
+    found = follow(Hands(), lambda t: np.array([speed * t, 0.0, 0.0]), until_s=8.0, rate_hz=rate_hz, noise=noise)[1500:]
+    assert found[:, 1, 0].std() < 0.001
+    assert found[:, 1, 0].mean() == pytest.approx(speed, abs=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [100, 334, 500])
+def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None:
+    """There and back at 1.5 m/s, in a third of a second each way: none of the modes moves so."""
+
+    def hand(t: float) -> Vector:
+        turns, u = divmod(t / 0.32, 1.0)
+        there = u**3 * (10 - 15 * u + 6 * u * u)
+        return np.array([0.257 * (1.0 - there if turns % 2 else there), 0.0, 0.0])
+
+    found = follow(Hands(), hand, until_s=2.0, rate_hz=rate_hz)
+    wanted = np.array([hand(PERIOD_S * tick) for tick in range(len(found))])
+    assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < (0.02 if rate_hz == 100 else 0.014)
+
+
 def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
     once, noise = model(0.002)
-    transition, total = np.eye(3), np.zeros((3, 3))
+    transition, total = np.eye(STATES), np.zeros((STATES, STATES))
     for _ in range(25):
-        transition, total = once @ transition, once @ total @ once.T + noise
+        transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
     found, found_noise = model(0.05)
     np.testing.assert_allclose(found, transition, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found_noise, total, rtol=1e-9, atol=1e-15)
@@ -100,15 +149,18 @@ def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
 
 def test_compiled_and_plain_functions_agree() -> None:
     random = np.random.default_rng(4)
-    root = random.normal(size=(MODES, 3, 3))
-    means, covariances = random.normal(size=(MODES, 3, 3)), root @ root.transpose(0, 2, 1)
+    root = random.normal(size=(MODES, STATES, STATES))
+    means, covariances = random.normal(size=(MODES, STATES, 3)), root @ root.transpose(0, 2, 1)
+    for mode in range(MODES):
+        if mode != REST:
+            means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
     modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
     transition, noise = model(0.002)
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
-        for name, more in (("advance", (transition, noise)), ("_update", (0.01, position, 0.03))):
-            function = getattr(hand_estimator, name)
+        for name, more in (("advance", (transition, noise)), ("update", (0.01, position, 0.03))):
+            function = getattr(mode_filter, name)
             arrays = parts[:2] if name == "advance" else parts
             (function.py_func if plain else function)(*arrays, *more)
         results.append(parts)

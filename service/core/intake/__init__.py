@@ -5,6 +5,7 @@ from __future__ import annotations
 from service.contract.records import PER_JOINT, SOURCES, Cause, Field
 
 MODES = 3  # of the hand estimator's motion models
+STATES = 5  # of each, by axis: position, velocity, acceleration, tremor and its velocity
 KEPT = 49  # samples of each hand, among which late ones are filtered in: 0.1 s of the fastest tracker
 STATE = (
     Field("hand_stamps_ns", "int64", (2,)),
@@ -31,15 +32,15 @@ STATE = (
     Field("hand_turns", "float64", (2, 9)),  # of the newest samples: rotation matrices in frame base, row by row
     Field("hand_velocity_lowpass", "float64", (2, 3)),  # without tremor [m/s]
     Field("hand_stillness", "float64", (2,)),  # 0: on its way, 1: still
-    Field("mode_means", "float64", (2, MODES, 3, 3)),
-    Field("mode_covariances", "float64", (2, MODES, 3, 3)),
+    Field("mode_means", "float64", (2, MODES, STATES, 3)),
+    Field("mode_covariances", "float64", (2, MODES, STATES, STATES)),
     Field("mode_probabilities", "float64", (2, MODES)),
     Field("noise_variance", "float64", (2,)),  # of each hand's samples, each axis [m²]
     Field("sample_interval_s", "float64", (2,)),
     Field("past_samples", "float64", (2, 3, 3)),  # newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),
-    Field("kept_means", "float64", (2, KEPT, MODES, 3, 3)),  # the filter when each was taken, in all its parts
-    Field("kept_covariances", "float64", (2, KEPT, MODES, 3, 3)),
+    Field("kept_means", "float64", (2, KEPT, MODES, STATES, 3)),  # the filter when each was taken, in all its parts
+    Field("kept_covariances", "float64", (2, KEPT, MODES, STATES, STATES)),
     Field("kept_probabilities", "float64", (2, KEPT, MODES)),
     Field("kept_past", "float64", (2, KEPT, 3, 3)),
     Field("kept_noise", "float64", (2, KEPT, 4)),  # variance, samples averaged in it, evenly spaced ones, interval

@@ -1,17 +1,9 @@
 """A hand's position, velocity and acceleration from its tracker's samples, whatever the tracker's
 noise.
 
-An interacting-multiple-model filter (Blom and Bar-Shalom, IEEE TAC 33(8), 1988) of three modes that
-differ only in how much the motion changes: rest, reach, change. Each is a Kalman filter of
-position, velocity and acceleration, with acceleration and velocity that revert to 0,
-
-    dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
-
-and all share one noise variance, estimated from the third differences of the samples: smooth motion
-leaves nothing in them, white noise of variance r leaves 20 r an axis.
-
-Arrays of one hand: means (3, 3, 3) by mode, then position, velocity and acceleration [m, m/s,
-m/s²], by axis; covariances (3, 3, 3) by mode, alike for the axes; probabilities (3,) of the modes.
+An interacting-multiple-model filter (`mode_filter`) of three modes: rest, reach, change. They share
+one noise variance, estimated from the third differences of the samples: smooth motion leaves
+nothing in them, white noise of variance r leaves 20 r an axis.
 
 Stillness, 0 to 1, tells a hand that waits at a via-point from one on its way: it comes slowly and
 goes at once, and neither a tremor nor a turn on the way is still.
@@ -27,7 +19,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
-from service.core.intake import KEPT, MODES
+from service.core.intake import KEPT
+from service.core.intake.mode_filter import advance, combine, start, update
 from service.core.intake.motion_model import model
 
 LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
@@ -68,25 +61,17 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
     return out
 
 
-INTENSITY = np.array([0.03, 3.0, 30.0])  # [m²/s⁵] of the modes
-PRIOR = np.array([0.4, 0.4, 0.2])  # their probabilities, when nothing is known
-SWITCH_RATE = 3.0  # [1/s] at which a mode is left
 LEAST_NOISE = 7e-4  # [m] of a tracker's standard deviation: below it, hands tremble
 MOST_NOISE = 5e-2  # [m]
 AVERAGED = 60  # samples over which the noise is averaged
 OUTLIER = 9.0  # times the noise variance: as much as one difference may count
-START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
-START_ACCELERATION = 1.0  # [m/s²] likewise
 LATE_S = 0.1  # that a sample may be older than the newest one, and later than the quickest: a network's worst delay
 SECOND_S = 1.0  # in which a tracker's quickest sample is as quick as ever: of 30 its delays, 2 ms of 60
 STEADY_S = 0.01  # that it may differ by all the same: clocks that are 1 % apart are not gone by
 EXACT_NS = 2.0**62  # of differences of two stamps that do not overflow
 ROUNDED = 1e-6  # of a tick, that a lateness may lack: sums of periods are not exact
 LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # clocks: in their first second, not steady, steady
-LEAST_PROBABILITY = 1e-4  # of a mode
 ALONE_S = 1.0  # since the sample before one that has none: longer than samples are compared over
-MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
-ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
 
 
 class HandEstimator:
@@ -111,42 +96,6 @@ class HandEstimator:
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Moves both hands on by some ticks; one that is not seen stands still."""
         _advance_both(as_array(state), stale_ticks, self._model(ticks))
-
-
-@compiled
-def _start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
-    """A hand of which one sample is known."""
-    means[:] = 0.0
-    covariances[:] = 0.0
-    for mode in range(MODES):
-        for axis in range(3):
-            means[mode, 0, axis] = position[axis]
-        covariances[mode, 0, 0] = noise
-        covariances[mode, 1, 1] = START_SPEED**2
-        covariances[mode, 2, 2] = START_ACCELERATION**2
-        modes[mode] = PRIOR[mode]
-
-
-@compiled
-def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
-    """All modes moved on: m = F m, P = F P F' + q Q."""
-    moved, product = np.empty((3, 3)), np.empty((3, 3))
-    for mode in range(MODES):
-        mean, covariance = means[mode], covariances[mode]
-        for row in range(3):
-            for column in range(3):
-                m = p = 0.0
-                for k in range(3):
-                    m += transition[row, k] * mean[k, column]
-                    p += transition[row, k] * covariance[k, column]
-                moved[row, column], product[row, column] = m, p
-        mean[:] = moved
-        for row in range(3):
-            for column in range(row, 3):
-                p = INTENSITY[mode] * noise[row, column]
-                for k in range(3):
-                    p += product[row, k] * transition[column, k]
-                covariance[row, column] = covariance[column, row] = p
 
 
 @compiled
@@ -175,79 +124,6 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
         past[1, axis] = past[0, axis]
         past[0, axis] = position[axis]
     state.even_samples[side] = min(count + 1, 3)
-
-
-@compiled
-def _normalise(modes: Vector) -> None:
-    total = 0.0
-    for i in range(MODES):
-        total += modes[i]
-    for i in range(MODES):
-        modes[i] /= total
-
-
-@compiled
-def _update(
-    means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, interval_s: float
-) -> None:
-    """One sample filtered in: modes mixed over the interval, each updated, weighed by its
-    likelihood.
-    """
-    stay = math.exp(-SWITCH_RATE * interval_s)
-    expected, likelihood = np.empty(MODES), np.empty(MODES)
-    mixed, spread = np.zeros((MODES, 3, 3)), np.zeros((MODES, 3, 3))
-    for j in range(MODES):
-        expected[j] = stay * modes[j]
-        for i in range(MODES):
-            expected[j] += (1.0 - stay) * PRIOR[j] * modes[i]
-        for i in range(MODES):
-            share = ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0)) * modes[i] / expected[j]
-            for a in range(3):
-                for b in range(3):
-                    mixed[j, a, b] += share * means[i, a, b]
-        for i in range(MODES):
-            share = ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0)) * modes[i] / expected[j]
-            for a in range(3):
-                for b in range(a, 3):
-                    between = 0.0
-                    for k in range(3):
-                        between += (means[i, a, k] - mixed[j, a, k]) * (means[i, b, k] - mixed[j, b, k])
-                    spread[j, a, b] += share * (covariances[i, a, b] + between / 3.0)
-    best = -1e300
-    for i in range(MODES):
-        p, mean = spread[i], mixed[i]
-        variance = p[0, 0] + noise
-        square = 0.0
-        for axis in range(3):
-            innovation = position[axis] - mean[0, axis]
-            square += innovation * innovation
-            for row in range(3):
-                means[i, row, axis] = mean[row, axis] + p[0, row] / variance * innovation
-        for row in range(3):
-            for column in range(row, 3):
-                left = p[row, column] - p[0, row] * p[0, column] / variance
-                covariances[i, row, column] = covariances[i, column, row] = left
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MOST_INNOVATION)
-        best = max(best, likelihood[i])
-    for i in range(MODES):
-        modes[i] = expected[i] * math.exp(likelihood[i] - best)
-    _normalise(modes)
-    for i in range(MODES):
-        modes[i] = max(modes[i], LEAST_PROBABILITY)
-    _normalise(modes)
-    for i in range(MODES):
-        modes[i] = np.rint(modes[i] * ROUND_PROBABILITY_TO) / ROUND_PROBABILITY_TO
-
-
-@compiled
-def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
-    """The estimate (3, 3): position, velocity and acceleration, by axis."""
-    for row in range(3):
-        for axis in range(3):
-            total = 0.0
-            for mode in range(MODES):
-                total += modes[mode] * means[mode, row, axis]
-            estimate[row, axis] = total
 
 
 @compiled
@@ -381,9 +257,9 @@ def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool
     _update_noise(states, side, position, interval_s)
     variance, modes = state.noise_variance[side], state.mode_probabilities[side]
     if anew:
-        _start(means, covariances, modes, variance, position)
+        start(means, covariances, modes, variance, position)
     else:
-        _update(means, covariances, modes, variance, position, interval_s)
+        update(means, covariances, modes, variance, position, interval_s)
     _remember(states, side, at)
 
 

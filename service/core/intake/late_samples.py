@@ -20,13 +20,12 @@ from service.core.intake.hand_estimator import (
     ALONE_S,
     BELIEVED,
     ROUNDED,
-    advance,
-    combine,
     filter_in,
     order_of,
     seconds_after,
     slot,
 )
+from service.core.intake.mode_filter import advance, combine
 
 
 @compiled
@@ -65,7 +64,7 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
             total = 0.0
             for mode in range(len(modes)):
                 for row in range(3):
-                    total += modes[mode] * over[0, row] * means[mode, row, axis]
+                    total += modes[mode] * over[mode, 0, row] * means[mode, row, axis]
             out[axis] = total
 
 

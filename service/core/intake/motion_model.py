@@ -1,37 +1,64 @@
-"""How a hand moves on over an interval: transition and process noise of the estimator's modes."""
+"""How a hand moves on over an interval: transition and process noise of the estimator's modes.
+
+Acceleration and velocity revert to 0, and the tremor of one that rests is a damped oscillation:
+
+    dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
+    dy = w dt    dw = -TREMOR_RATE² y dt - 2 TREMOR_DAMPING TREMOR_RATE w dt + ... dW
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 from scipy.linalg import expm
 
 from service.core.frame import Records, Vector, structured
+from service.core.intake import MODES, STATES
 
-REVERT_A = 15.0  # [1/s] of the acceleration
-REVERT_V = 100.0  # [1/s²] of the velocity
+REST, REACH, CHANGE = range(MODES)  # the modes
+INTENSITY = np.array([1e-6, 1.0, 30.0])  # [m²/s⁵] of the modes
+REVERT_A = np.array([10.0, 14.0, 14.0])  # [1/s] of the acceleration
+REVERT_V = np.array([0.3, 95.0, 95.0])  # [1/s²] of the velocity: slow hands go on, reaches end
+TREMOR = 3e-4  # [m] standard deviation, each axis: most people's; more is told from motion by its rhythm
+TREMOR_RATE = 2.0 * math.pi * 10.0  # [1/s] people's is of 8 to 12 Hz ...
+TREMOR_DAMPING = 0.25  # ... each of its own
 
 
 @functools.cache
 def models(period_s: float, count: int) -> Records:
-    """A `transition` and a process `noise` (3, 3) each, over 0 to count - 1 periods."""
-    out = structured(count, [("transition", np.float64, (3, 3)), ("noise", np.float64, (3, 3))])
+    """A `transition` and a process `noise` each, of all modes, over 0 to count - 1 periods."""
+    out = structured(count, [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")])
     for ticks, one in enumerate(out):
         one["transition"], one["noise"] = model(ticks * period_s)
     return out
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
-    """Transition (3, 3), and process noise (3, 3) of unit intensity, over an interval (Van Loan,
-    1978).
+    """Transitions and process noise (MODES, STATES, STATES) of the modes over an interval."""
+    transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
+    for mode in (REST, REACH):
+        dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -REVERT_V[mode], -REVERT_A[mode]]])
+        transition[mode, motion, motion], noise[mode, motion, motion] = _over(dynamics, interval_s)
+    transition[CHANGE], noise[CHANGE] = transition[REACH], noise[REACH]
+    noise *= INTENSITY[:, None, None]
+    dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE]])
+    transition[REST, tremor, tremor], driven = _over(dynamics, interval_s)
+    noise[REST, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE**3 * TREMOR**2 * driven
+    return transition, noise
+
+
+def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:
+    """The transition (N, N), and the noise (N, N) when the last state is driven by unit intensity
+    (Van Loan, 1978).
     """
-    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -REVERT_V, -REVERT_A]])
-    whole = np.zeros((6, 6))
-    whole[:3, :3], whole[2, 5], whole[3:, 3:] = -dynamics, 1.0, dynamics.T
+    n = len(dynamics)
+    whole = np.zeros((2 * n, 2 * n))
+    whole[:n, :n], whole[n - 1, 2 * n - 1], whole[n:, n:] = -dynamics, 1.0, dynamics.T
     grown = expm(whole * interval_s)
-    transition = np.ascontiguousarray(grown[3:, 3:].T)
-    return _to_digits(transition), _to_digits(transition @ grown[:3, 3:])
+    transition = grown[n:, n:].T
+    return _to_digits(transition), _to_digits(transition @ grown[:n, n:])
 
 
 def _to_digits(matrix: Vector) -> Vector:

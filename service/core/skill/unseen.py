@@ -9,12 +9,13 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
-from service.core.intake.hand_estimator import PRIOR, SWITCH_RATE
+from service.core.intake.mode_filter import PRIOR, SWITCH_RATES
 from service.core.skill.model import REGION_95
 
 if TYPE_CHECKING:
     from service.core.skill.skill import Skill
 
+CHANGES_RATE = float(SWITCH_RATES.max())  # [1/s] at which one moves otherwise than it did: nobody sees it
 STANDS = np.zeros((2, 3))  # both hands: how they move makes no difference to where the tool should be
 
 
@@ -24,7 +25,7 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     to rest, since it was seen.
     """
     state, variance = states[0], 0.0
-    stay = math.exp(-SWITCH_RATE * (state.tick - state.hand_ticks[side]) * period_s)
+    stay = math.exp(-CHANGES_RATE * (state.tick - state.hand_ticks[side]) * period_s)
     for mode in range(len(PRIOR)):
         share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * PRIOR[mode]
         variance += share * state.mode_covariances[side, mode, 0, 0]

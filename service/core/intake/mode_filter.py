@@ -1,0 +1,236 @@
+"""The interacting-multiple-model filter of a hand (Blom and Bar-Shalom, IEEE TAC 33(8), 1988):
+started, moved on, and given a sample.
+
+A hand rests, reaches, or changes its way. Each mode is a Kalman filter of position, velocity and
+acceleration (`motion_model`). One that rests is slow, and trembles about where it is: an
+oscillation that its samples show and that is no part of its motion. Its speed and tremor are
+bounded: without that a mode that expects most to happen within one sample would win in the quickest
+motion, which none explains. Only who has become slow comes to rest, with what was known of its
+motion and that it is slow; who leaves rest begins with all that the samples showed.
+
+Arrays of one hand: means (MODES, STATES, 3), by mode, then position, velocity, acceleration, tremor
+and its velocity, by axis [m, m/s, m/s²]; covariances (MODES, STATES, STATES), alike for the axes;
+probabilities (MODES,). Only who rests trembles: of the other modes the last two states are 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.core.frame import Vector
+from service.core.intake import MODES, STATES
+from service.core.intake.motion_model import REST, TREMOR, TREMOR_RATE
+
+PRIOR = np.array([0.3, 0.5, 0.2])  # their probabilities, when nothing is known
+SWITCH_RATES = np.array([0.03, 3.0, 3.0])  # [1/s] at which they are left: rest for what is seen, not for noise
+START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
+START_ACCELERATION = 1.0  # [m/s²] likewise
+SLOW = 0.01  # [m/s] standard deviation of one that rests, each axis: hands that hold something drift
+SLOW_CHANGE = 0.01  # [m/s²] likewise: it comes to that speed within a second
+MOST_SLOW = 0.03  # [m/s] it is no faster: reaches begin and end at once, and are to be followed so
+MOST_TREMOR = 3e-3  # [m] of amplitude, which only the ill have more of
+LEAST_PROBABILITY = 1e-4  # of a mode
+MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
+ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
+TO_REST, TO_MOVE = 0, 1  # what a mode is for one that is taken up: who rests, or moves
+
+
+@compiled
+def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
+    """A hand of which one sample (3,) [m] is known."""
+    means[:] = 0.0
+    covariances[:] = 0.0
+    for mode in range(MODES):
+        for axis in range(3):
+            means[mode, 0, axis] = position[axis]
+        covariances[mode, 0, 0] = noise
+        covariances[mode, 1, 1] = START_SPEED**2
+        covariances[mode, 2, 2] = START_ACCELERATION**2
+        modes[mode] = PRIOR[mode]
+    covariances[REST, 3, 3], covariances[REST, 4, 4] = TREMOR**2, (TREMOR * TREMOR_RATE) ** 2
+
+
+@compiled
+def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
+    """All modes moved on: m = F m, P = F P F' + Q, each by its own F and Q."""
+    moved, product = np.empty((STATES, 3)), np.empty((STATES, STATES))
+    for mode in range(MODES):
+        mean, covariance, over = means[mode], covariances[mode], transition[mode]
+        size = STATES if mode == REST else 3
+        for row in range(size):
+            first, end = (0, 3) if row < 3 else (3, STATES)  # motion and tremor do not drive each other
+            for column in range(size):
+                p = 0.0
+                for k in range(first, end):
+                    p += over[row, k] * covariance[k, column]
+                product[row, column] = p
+            for axis in range(3):
+                m = 0.0
+                for k in range(first, end):
+                    m += over[row, k] * mean[k, axis]
+                moved[row, axis] = m
+        mean[:size] = moved[:size]
+        for row in range(size):
+            for column in range(row, size):
+                p = noise[mode, row, column]
+                first, end = (0, 3) if column < 3 else (3, STATES)
+                for k in range(first, end):
+                    p += product[row, k] * over[column, k]
+                covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def _come_to_rest(mean: Vector, covariance: Vector) -> None:
+    """A mode of motion, known to be slow: so are its velocity and its acceleration."""
+    for known in range(1, 3):
+        spread = SLOW if known == 1 else SLOW_CHANGE
+        row_of = covariance[known, :3].copy()
+        variance = row_of[known] + spread * spread
+        for axis in range(3):
+            off = mean[known, axis]
+            for row in range(3):
+                mean[row, axis] -= row_of[row] / variance * off
+        for row in range(3):
+            for column in range(3):
+                covariance[row, column] -= row_of[row] * row_of[column] / variance
+    covariance[3, 3], covariance[4, 4] = TREMOR * TREMOR, (TREMOR * TREMOR_RATE) ** 2
+
+
+@compiled
+def _leave_rest(mean: Vector, covariance: Vector) -> None:
+    """The mode of rest as one of motion: all that was seen is."""
+    for row in range(2):
+        for axis in range(3):
+            mean[row, axis] += mean[row + 3, axis]
+            mean[row + 3, axis] = 0.0
+        for column in range(STATES):
+            covariance[row, column] += covariance[row + 3, column]
+    for column in range(2):
+        for row in range(3):
+            covariance[row, column] += covariance[row, column + 3]
+
+
+@compiled
+def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector) -> None:
+    """The probabilities (MODES, MODES) that a hand was of the first mode and is of the second an
+    interval later; it comes to rest when it is slow.
+    """
+    for i in range(MODES):
+        stay = math.exp(-SWITCH_RATES[i] * interval_s)
+        for j in range(MODES):
+            shares[i, j] = modes[i] * ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0))
+        if i != REST:
+            square = 0.0
+            for axis in range(3):
+                square += means[i, 1, axis] ** 2
+            slow = math.exp(-0.5 * min(square / (covariances[i, 1, 1] + SLOW * SLOW), MOST_INNOVATION))
+            shares[i, i] += (1.0 - slow) * shares[i, REST]
+            shares[i, REST] *= slow
+
+
+@compiled
+def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -> None:
+    """Each mode mixed of all, by those shares: the modes' probabilities (MODES,) are `expected`."""
+    of_means, of_covariances = np.empty((2, MODES, STATES, 3)), np.empty((2, MODES, STATES, STATES))
+    for i in range(MODES):
+        for to in range(2):
+            of_means[to, i], of_covariances[to, i] = means[i], covariances[i]
+        if i == REST:
+            _leave_rest(of_means[TO_MOVE, i], of_covariances[TO_MOVE, i])
+        else:
+            _come_to_rest(of_means[TO_REST, i], of_covariances[TO_REST, i])
+    for j in range(MODES):
+        to, size = (TO_REST, STATES) if j == REST else (TO_MOVE, 3)
+        expected[j], mixed, spread = 0.0, means[j], covariances[j]
+        for i in range(MODES):
+            expected[j] += shares[i, j]
+        mixed[:], spread[:] = 0.0, 0.0
+        for i in range(MODES):
+            share = shares[i, j] / expected[j]
+            for a in range(size):
+                for b in range(3):
+                    mixed[a, b] += share * of_means[to, i, a, b]
+        for i in range(MODES):
+            share, mean = shares[i, j] / expected[j], of_means[to, i]
+            for a in range(size):
+                for b in range(a, size):
+                    between = 0.0
+                    for k in range(3):
+                        between += (mean[a, k] - mixed[a, k]) * (mean[b, k] - mixed[b, k])
+                    spread[a, b] += share * (of_covariances[to, i, a, b] + between / 3.0)
+
+
+@compiled
+def _beyond_rest(mean: Vector) -> float:
+    """By how much a hand is faster, and trembles more, than one that rests: squared, normalised."""
+    speed = tremor = 0.0
+    for axis in range(3):
+        speed += mean[1, axis] ** 2
+        tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE) ** 2
+    return max(speed - MOST_SLOW**2, 0.0) / SLOW**2 + max(tremor - MOST_TREMOR**2, 0.0) / TREMOR**2
+
+
+@compiled
+def update(
+    means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, interval_s: float
+) -> None:
+    """One sample (3,) [m] of a noise variance [m²] filtered in: modes mixed over the interval, each
+    updated, weighed by its likelihood.
+    """
+    shares, expected, likelihood, seen = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES), np.empty(STATES)
+    _switched(means, covariances, modes, interval_s, shares)
+    _mix(means, covariances, shares, expected)
+    best = -1e300
+    for i in range(MODES):
+        mean, p, size = means[i], covariances[i], STATES if i == REST else 3
+        for row in range(size):
+            for column in range(row):
+                p[row, column] = p[column, row]
+            seen[row] = p[row, 0] + p[row, 3]  # a sample shows position and tremor
+        variance, square = seen[0] + noise, 0.0
+        if i == REST:
+            variance += seen[3]
+        for axis in range(3):
+            innovation = position[axis] - mean[0, axis] - mean[3, axis]
+            square += innovation * innovation
+            for row in range(size):
+                mean[row, axis] += seen[row] / variance * innovation
+        for row in range(size):
+            for column in range(row, size):
+                p[row, column] -= seen[row] * seen[column] / variance
+                p[column, row] = p[row, column]
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MOST_INNOVATION)
+        if i == REST:
+            likelihood[i] -= 0.5 * _beyond_rest(mean)
+        best = max(best, likelihood[i])
+    for i in range(MODES):
+        modes[i] = expected[i] * math.exp(likelihood[i] - best)
+    _normalise(modes)
+    for i in range(MODES):
+        modes[i] = max(modes[i], LEAST_PROBABILITY)
+    _normalise(modes)
+    for i in range(MODES):
+        modes[i] = np.rint(modes[i] * ROUND_PROBABILITY_TO) / ROUND_PROBABILITY_TO
+
+
+@compiled
+def _normalise(modes: Vector) -> None:
+    total = 0.0
+    for i in range(MODES):
+        total += modes[i]
+    for i in range(MODES):
+        modes[i] /= total
+
+
+@compiled
+def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
+    """The estimate (3, 3): position, velocity and acceleration, by axis."""
+    for row in range(3):
+        for axis in range(3):
+            total = 0.0
+            for mode in range(MODES):
+                total += modes[mode] * means[mode, row, axis]
+            estimate[row, axis] = total
