@@ -57,6 +57,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
     """
     limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
     still = np.zeros(len(posture))
+    limiter.together(posture, still, still, still)
     limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
     Separation(settings, urdf).share(still)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))

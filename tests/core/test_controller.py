@@ -139,7 +139,7 @@ def test_the_tool_goes_on_while_one_hand_is_out_of_sight_for_a_moment(
     taught: Skill, moving: tuple[list[Tick], np.ndarray], side: str, most: float
 ) -> None:
     ticks, whole = moving
-    away = range(3300, 3540)
+    away = range(3300, 3500)
     ticks = unseen(ticks[: away.stop + 500], away, f"hands/{side}")
     going, held = (frames(Controller(without(ms), taught, urdf=URDF), ticks) for ms in (500.0, 0.0))
     limits_hold(going)
@@ -177,7 +177,7 @@ def test_a_hand_that_the_skill_does_not_need_makes_no_difference_while_it_is_not
 
 
 def test_who_is_not_seen_keeps_the_arm_farther_away(taught: Skill, moving: tuple[list[Tick], np.ndarray]) -> None:
-    away = range(3300, 3540)
+    away = range(3300, 3500)
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), unseen(moving[0][: away.stop], away, "hands/left"))
     limit = seen["hand_limit"][away.start :]
     assert limit[-1] < limit[55] - 0.2

@@ -154,6 +154,26 @@ def test_a_stop_takes_the_shortest_time_that_the_limits_allow_and_all_joints_end
     assert (np.abs(stopped - shortest.max()) <= 1.001 * PERIOD).all()
 
 
+def test_joints_that_go_together_stay_on_the_way_between_their_velocities_and_those_wanted() -> None:
+    limiter, wanted = Limiter(LIMITS, PERIOD), np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
+    start = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])
+    there = np.isclose(drive(LIMITS, start, np.tile(wanted, (300, 1))).velocity, wanted, rtol=1e-6, atol=0.0)
+    alone = int(np.argmax(there.all(axis=1)))
+    state: tuple[Vector, Vector, Vector] = (start, REST, REST)
+    for ticks in range(2 * alone):
+        step = limiter.together(*state, wanted)
+        assert step is not None
+        assert np.ptp(step.velocity / wanted) < 1e-6
+        assert (step.velocity / wanted).max() < 1.001  # of what is left of a tick
+        assert (np.abs(step.acceleration - state[2]) <= np.array(LIMITS.jerk) * PERIOD * (1 + 1e-9)).all()
+        assert (np.abs(step.acceleration) <= np.array(LIMITS.acceleration) * (1 + 1e-9)).all()
+        state = step[:3]
+        if np.allclose(step.velocity, wanted, rtol=1e-6, atol=0.0):
+            break
+    assert ticks < 1.5 * alone
+    assert limiter.together(start, wanted, 50 * np.sign(wanted), -wanted) is None
+
+
 def test_a_stop_ends_at_rest_and_stays_there() -> None:
     limiter, state = Limiter(LIMITS, PERIOD), moving()
     limited = True

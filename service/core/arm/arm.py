@@ -17,7 +17,7 @@ from service.core.frame import Record, Records, Vector, as_array, parameters, st
 from service.core.separation.separation import Separation
 
 REACH_M = 0.88  # of the WAM, on which the next four were chosen; they are scaled by the arm's own
-TURN_LEVER = 0.03  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
+TURN_LEVER = 0.0115  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
 DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
 SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
 SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the WAM's table

@@ -32,6 +32,8 @@ CHASED = 2  # some joint cannot have it in a tick
 UNSAFE = 4  # some joint could not have stopped after it
 MOMENTS = 12  # of a stop, at which the tool's speed is asked for ...
 MOMENT_SHARE = 0.2  # ... so many times as far apart as a joint takes to come to its greatest acceleration
+LEAST_CHANGE = 1e-12  # [rad/s] of a velocity: what is less is rounding
+INSIDE = 1.0 - 1e-9  # of limits, that rounding leaves them kept
 UNUSABLE = -1  # the state cannot be calculated with
 
 
@@ -91,6 +93,13 @@ class Limiter:
             self._chase(state, wanted, moved)
             _make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=met > 0)
+
+    def together(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited | None:
+        """As `step`, by velocities between those now and those wanted: an inequality that both keep
+        is kept on the way. None where the joints' accelerations do not allow for that.
+        """
+        share = _common_share(np.stack((q, dq, ddq)), velocity, self._parameters)
+        return self.step(q, dq, ddq, dq + share * (velocity - dq)) if share >= 0.0 else None
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
         """The joints one period later on the way to rest, at which all come at once and as soon as
@@ -170,6 +179,24 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
             met |= CHASED
     return met
+
+
+@compiled
+def _common_share(state: Vector, velocity: Vector, parameters: Records) -> float:
+    """The greatest share of the way to the wanted velocities (J,) that all joints can go in a tick
+    without passing these, as their acceleration comes to 0; -1 where there is none.
+    """
+    given, least, most = parameters[0], 0.0, 1.0
+    dt = given.period_s
+    for i in range(len(velocity)):
+        way, change = velocity[i] - state[1, i], INSIDE * dt * given.max_jerk[i]
+        a = state[2, i] if way >= 0.0 else -state[2, i]
+        way = max(abs(way), LEAST_CHANGE)
+        least = max(least, (a - change) * dt / way)
+        most = min(most, min(a + change, INSIDE * given.max_acceleration[i]) * dt / way)
+        bend, left = way / (2.0 * change * dt), max(1.0 - 0.5 * dt * a / way, 0.0)
+        most = min(most, (math.sqrt(0.25 + 4.0 * bend * left) - 0.5) / (2.0 * bend))
+    return max(least, most) if most >= INSIDE * least else -1.0
 
 
 @compiled
@@ -268,16 +295,19 @@ class LimiterStage:
         """Moves the joints on toward wanted velocities (J,) [rad/s].
 
         They brake where the tool would pass its greatest speed, and one that does all the same is
-        too fast; and where they would approach something too fast, unless that brakes less.
+        too fast. Where they would approach something too fast on the way, which each goes as fast
+        as it can, they go it together, or brake, unless that brakes less.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted)
         limited, excess = moved.limited, separation.excess(*moved[1:3])
         separated = excess > 0.0
         if separated:
-            stop = self._limiter.stop(q, dq, ddq)
-            separated = separation.excess(*stop[1:3]) < excess
-            moved, limited = (stop, True) if separated else (moved, limited)
+            other = self._limiter.together(q, dq, ddq, wanted)
+            if other is None or separation.excess(*other[1:3]) > 0.0:
+                other = self._limiter.stop(q, dq, ddq)
+            separated = separation.excess(*other[1:3]) < excess
+            moved, limited = (other, True) if separated else (moved, limited)
         here, too_fast = self._arm.at(moved.position), 0.0
         if self._comes_to(moved, here) > STOP_SHARE * self._max_speed:
             moved, limited = self._limiter.stop(q, dq, ddq), True

@@ -38,7 +38,8 @@ PLAN_REACTION_S = 0.02  # ... nor with less reaction time: joints that are let n
 CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
 RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
 RETREAT_MIN_AUTHORITY = 0.1  # [m/s] only what the joints can move so fast is moved back
-SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all
+SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all ...
+SLIP_DEPTH = 0.0005  # [m] ... less the farther a thing is inside its clearance, a tenth from here on
 NEAR_VIA_POINT = 0.02  # [m] beside a via-point's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
 CHANGE_S = 0.07  # over which a hand's acceleration fades
@@ -250,7 +251,8 @@ def _step(
                 twice = where > 0 and share == inner
                 if not twice and planned < part.max_speed:
                     constraint = constraints[count]
-                    constraint.allowed = _allowed(parameters, THINGS, distance, 0.0) + SLIP
+                    slip = min(max(1.0 + (distance - given.clearance[THINGS]) / SLIP_DEPTH, 0.1), 1.0) * SLIP
+                    constraint.allowed = _allowed(parameters, THINGS, distance, 0.0) + slip
                     back = max(CLEARANCE_GAIN * (distance - given.clearance[THINGS]), -RETREAT_SPEED)
                     planned = min(planned, back)
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
