@@ -22,9 +22,8 @@ import numpy as np
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.requests import TOLERANCE_M
-from service.core.controller import Controller, Tap, run
+from service.core.controller import Controller, Tap, outgoing, run
 from service.core.frame import Event, Frame, Tick, differences, order
-from service.core.outputs import outgoing
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
 from service.recording.mcap_file import RecordingError

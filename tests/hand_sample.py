@@ -28,9 +28,8 @@ from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, Attachment, JointState, PoseStamped
 from service.contract.records import SIDES, SOURCES, Mode
-from service.core.controller import Controller, run
+from service.core.controller import Controller, outgoing, run
 from service.core.frame import Event, Frame, Tick, Vector
-from service.core.outputs import outgoing
 from service.daemon import daemon
 from service.daemon.cell_streams import Arrivals, CellStreams
 from service.daemon.input_monitor import KEYS

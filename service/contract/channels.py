@@ -3,8 +3,8 @@ loop, or is recorded.
 
 Subscribers, publishers, queryables, the kinds of events, the topics of a recording and of ROS 2,
 staleness and the table in docs/wire.md are all derived from it. A new channel is one more line here
-and, if it enters the loop, a case in `core.controller`; if the loop sends on it, a function in
-`core.outputs`; if its message is new, a codec in `cdr`, a definition in `ros2msg` and, unless it is
+and, if it enters the loop, a case in `core.controller`; if the loop sends on it, a function of its
+`outgoing`; if its message is new, a codec in `cdr`, a definition in `ros2msg` and, unless it is
 only recorded, a hash in `ros2`.
 """
 

@@ -1,4 +1,5 @@
-"""The core: each tick's inbox in, a frame out.
+"""The core: each tick's inbox in, a frame out; and what is published of it, under which keys, which
+bytes, made once and recorded as published.
 
 Deterministic: no clock, no input or output, and all it remembers is one flat state and
 the skill in force.
@@ -14,6 +15,8 @@ import numpy as np
 
 from service.config import Settings
 from service.contract import cdr
+from service.contract.channels import STREAMS
+from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.contract.records import GONE_S, Flag, Reason
 from service.core.arm.arm import Arm, Kinematics
 from service.core.decision.decision import (
@@ -31,6 +34,7 @@ from service.core.frame import (
     Event,
     Frame,
     Lap,
+    Outputs,
     Record,
     Tick,
     as_array,
@@ -44,7 +48,7 @@ from service.core.limiter.limiter import LimiterStage
 from service.core.separation.separation import Separation
 from service.core.setpoint.setpoint import WRONG, SetpointStage
 from service.core.skill.model import Wanted
-from service.core.skill.pose import NO_GRIPPER
+from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
 from service.core.skill.skill import NEVER, Skill, SkillStage
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
@@ -242,3 +246,53 @@ def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap:
         frame = controller.step(tick, lap)
         for tap in taps:
             tap(tick, frame)
+
+
+def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
+    """What is published of a frame; `joints` are the names of the commanded ones.
+
+    Nothing is commanded before the arm is ready, and no target is there without both hands.
+    """
+    tick = int(frame["tick"])
+    made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in STREAMS if tick % one.every == 0)
+    return [(key, payload) for key, payload in made if payload is not None]
+
+
+def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    if not frame["commanded"]:
+        return None
+    return cdr.encode_command(stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist())
+
+
+def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    if not frame["covariance"].any():
+        return None
+    covariance = [0.0] * 36
+    for i, row in enumerate(frame["covariance"].tolist()):
+        covariance[6 * i : 6 * i + 3] = row
+    for i, row in enumerate(frame["orientation_covariance"].tolist()):
+        covariance[6 * i + 21 : 6 * i + 24] = row
+    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
+    message = PoseWithCovarianceStamped(stamp_ns, BASE, position, orientation, tuple(covariance))
+    return cdr.encode_pose_with_covariance(message)
+
+
+def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    message = PoseStamped(
+        stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["setpoint_orientation"].tolist())
+    )
+    return cdr.encode_pose(message)
+
+
+def _gripper(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    if frame["gripper"] == UNKNOWN:
+        return None
+    return cdr.encode_command(stamp_ns, (GRIPPER,), [float(frame["gripper"] == CLOSED)], [0.0])
+
+
+_OUTPUTS: dict[str, Callable[[Frame, int, tuple[str, ...]], bytes | None]] = {
+    "joints/command": _command,
+    "tool/target": _target,
+    "tool/setpoint": _setpoint,
+    "gripper/command": _gripper,
+}

@@ -25,6 +25,8 @@ Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
 Records: TypeAlias = NDArray[np.void]
 DType: TypeAlias = np.dtype[np.void]
+Outputs: TypeAlias = Sequence[tuple[str, bytes]]
+"""Keys below the cell, and what is published there."""
 
 
 @functools.cache

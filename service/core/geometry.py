@@ -97,10 +97,12 @@ def axis_of(quaternion: Vector, out: Vector) -> None:
 
 
 @compiled
-def swing(start: Vector, end: Vector, out: Vector) -> None:
-    """Into out (3,) [rad] the shortest turn from one direction (3,) to another, both of norm 1; 0
-    where one has no length, or where they are opposite and no way is nearer.
+def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
+    """Into out (3,) [rad] the shortest turn from a direction (3,) of norm 1 to where a quaternion
+    (4,) turns +z; 0 where one has no length, or where they are opposite and no way is nearer.
     """
+    end = np.empty(3)
+    axis_of(quaternion, end)
     x = start[1] * end[2] - start[2] * end[1]
     y = start[2] * end[0] - start[0] * end[2]
     z = start[0] * end[1] - start[1] * end[0]

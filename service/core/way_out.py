@@ -106,7 +106,7 @@ class WayOut:
             return turn
         axis_of(orientation, wanted)
         now = np.ascontiguousarray(here.rotation[:, 2])
-        swing(now, wanted, turn)
+        swing(now, orientation, turn)
         return math.pi * here.rotation[:, 0] if now @ wanted < OPPOSITE else turn
 
     def _is_free(self, a: Vector, b: Vector, hands: Vector, least: float) -> bool:

@@ -22,9 +22,8 @@ from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
 from service.contract.records import Reason
 from service.contract.requests import Status, encode_json
-from service.core.controller import Controller, run
-from service.core.frame import STAGES, Event, Frame, Tick, blank, frame_layout, order, timed
-from service.core.outputs import Outputs, outgoing
+from service.core.controller import Controller, outgoing, run
+from service.core.frame import STAGES, Event, Frame, Outputs, Tick, blank, frame_layout, order, timed
 from service.core.separation.clearance import FARTHEST
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread

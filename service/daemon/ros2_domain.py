@@ -20,7 +20,7 @@ from service.contract import cdr, ros2
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import in_order
 from service.core.frame import Frame, Record
-from service.core.outputs import Frames
+from service.core.transforms import Frames
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.described_arm import description

@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 
 from service.config import Settings
-from service.core.frame import TIMING, Event, Record, Tick, frame_layout, state_layout
-from service.core.outputs import Outputs
+from service.core.frame import TIMING, Event, Outputs, Record, Tick, frame_layout, state_layout
 
 LONGEST_NOTE = 16_384  # characters
 LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead

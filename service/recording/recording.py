@@ -23,8 +23,8 @@ from mcap.reader import make_reader
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import SceneObject
-from service.core.frame import Record, Tick, encode
-from service.core.outputs import Frames, Outputs
+from service.core.frame import Outputs, Record, Tick, encode
+from service.core.transforms import Frames
 from service.demonstrations.pose_streams import ENDINGS
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.recording.mcap_reader import FileFault, Messages

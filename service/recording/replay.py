@@ -14,9 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from service.contract import channels
 from service.contract.messages import WireError
-from service.core.controller import Controller, run
+from service.core.controller import Controller, outgoing, run
 from service.core.frame import Event, Frame, Tick, differences, encode
-from service.core.outputs import outgoing
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.recording.mcap_file import RecordingError, machine
 from service.recording.recording import Recorder, Recording

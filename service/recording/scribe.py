@@ -24,8 +24,7 @@ import msgspec
 
 from service import child
 from service.config import Settings
-from service.core.frame import Record, Tick
-from service.core.outputs import Outputs
+from service.core.frame import Outputs, Record, Tick
 from service.recording.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, pack, pack_note
 
 BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 from service.config import Settings
 from service.contract import cdr, channels
 from service.contract.messages import WireError
-from service.core.frame import TIMING, Frame, Record, decode, encode, frame_layout, state_layout
-from service.core.outputs import Outputs
+from service.core.frame import TIMING, Frame, Outputs, Record, decode, encode, frame_layout, state_layout
 from service.recording.mcap_file import RecordingError
 from service.recording.mcap_reader import Messages
 

@@ -14,9 +14,8 @@ import pytest
 from service.config import Settings
 from service.contract import channels
 from service.contract.records import Flag, Mode, Reason
-from service.core.controller import Controller
+from service.core.controller import Controller, outgoing
 from service.core.frame import Event, Tick, definitions, order
-from service.core.outputs import outgoing
 from service.core.skill.model import Regions
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded

@@ -15,11 +15,10 @@ from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.config import Settings
 from service.contract import cdr
 from service.core.arm.arm import Arm
-from service.core.controller import Controller
+from service.core.controller import Controller, outgoing
 from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.limiter import Limiter
-from service.core.outputs import outgoing
 from service.core.setpoint.setpoint import TURN_SPEED_SHARE, OrientationSetpoint
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation
 from service.core.skill.skill import MOVES_S, Skill, decided
@@ -51,7 +50,7 @@ def test_rotations_are_those_of_scipy() -> None:
         axis_of(a, axis)
         np.testing.assert_allclose(axis, one.as_matrix()[:, 2], atol=1e-8)
         to = other.as_matrix()[:, 2].copy()
-        swing(axis, to, turn)
+        swing(axis, b, turn)
         np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(axis), to, atol=1e-7)
         turn_on(a, turn)
         assert abs(a @ (Rotation.from_rotvec(turn) * one).as_quat()) == pytest.approx(1.0, abs=1e-8)

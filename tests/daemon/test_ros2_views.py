@@ -25,7 +25,7 @@ from service.contract import cdr, ros2
 from service.contract.messages import JointState, Transform
 from service.contract.roles import access_control
 from service.core.frame import blank, frame_layout
-from service.core.outputs import Frames
+from service.core.transforms import Frames
 from service.daemon.ros2_domain import Ros2Domain
 from service.daemon.single_instance import BOUNDS
 from service.shipped import cell_of

@@ -11,8 +11,8 @@ import rerun as rr
 
 from service.config import Settings
 from service.contract import cdr, messages
+from service.core.controller import outgoing
 from service.core.frame import TIMING, Event, Record, Tick, blank
-from service.core.outputs import outgoing
 from service.recording.recording import Recorder
 from service.recording.scribe import Scribe
 from support.wam import FRAME, JOINT_NAMES, STATE

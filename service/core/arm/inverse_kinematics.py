@@ -14,7 +14,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.arm.least_squares import factorise, solve, substitute
 from service.core.frame import Records, Vector
-from service.core.geometry import axis_of, quaternion_of, swing, turn_between
+from service.core.geometry import quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
 # Of what a tool that may turn saves in speeds, accelerations and jerks: with more it falls behind
@@ -255,13 +255,12 @@ def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector,
     """Into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,) that
     turns itself (3,) [rad/s]: all of it, also `about` its +z, or that the shortest way.
     """
-    here, axis, max_speed = np.empty(4), np.empty(3), arms[0].max_turn_speed
+    here, max_speed = np.empty(4), arms[0].max_turn_speed
     if about:
         quaternion_of(rotation, here)
         turn_between(here, orientation, out)
     else:
-        axis_of(orientation, axis)
-        swing(rotation[:, 2].copy(), axis, out)
+        swing(rotation[:, 2].copy(), orientation, out)
     square = 0.0
     for i in range(3):
         out[i] = arms[0].turn_gain * out[i] + turning[i]

@@ -19,8 +19,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
-from service.core.intake import KEPT
-from service.core.intake.mode_filter import advance, combine, start, update
+from service.core.intake import KEPT, MODES
+from service.core.intake.mode_filter import advance, start, update
 from service.core.intake.motion_model import model
 
 LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
@@ -139,6 +139,17 @@ def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
             hand[1:] = 0.0
         lowpass, stillness = state.hand_velocity_lowpass[side], state.hand_stillness[side]
         state.hand_stillness[side] = stillness_after(hand[1], over.smoothing, over.still_speed, lowpass, stillness)
+
+
+@compiled
+def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
+    """The estimate (3, 3): position, velocity and acceleration, by axis."""
+    for row in range(3):
+        for axis in range(3):
+            total = 0.0
+            for mode in range(MODES):
+                total += modes[mode] * means[mode, row, axis]
+            estimate[row, axis] = total
 
 
 @compiled

@@ -20,12 +20,13 @@ from service.core.intake.hand_estimator import (
     ALONE_S,
     BELIEVED,
     ROUNDED,
+    combine,
     filter_in,
     order_of,
     seconds_after,
     slot,
 )
-from service.core.intake.mode_filter import advance, combine
+from service.core.intake.mode_filter import advance
 
 
 @compiled

@@ -223,14 +223,3 @@ def _normalise(modes: Vector) -> None:
         total += modes[i]
     for i in range(MODES):
         modes[i] /= total
-
-
-@compiled
-def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
-    """The estimate (3, 3): position, velocity and acceleration, by axis."""
-    for row in range(3):
-        for axis in range(3):
-            total = 0.0
-            for mode in range(MODES):
-                total += modes[mode] * means[mode, row, axis]
-            estimate[row, axis] = total

@@ -301,14 +301,13 @@ def _turn(
 ) -> None:
     """One period, in place."""
     given, dt = parameters[0], parameters[0].period_s
-    error, wanted, axis, target_axis = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
     axis_of(quaternion, axis)
     along = 0.0
     if given.about:
         turn_between(quaternion, target, error)
     else:
-        axis_of(target, target_axis)
-        swing(axis, target_axis, error)
+        swing(axis, target, error)
         for i in range(3):
             along += target_turning[i] * axis[i]
     angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])

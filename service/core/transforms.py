@@ -1,0 +1,46 @@
+"""The frames by which viewers draw a cell: where arm, tool, setpoint, target and hands are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from service.config import Settings
+from service.contract.messages import BASE, Transform
+from service.contract.records import SIDES
+from service.core.frame import Frame
+from service.urdf import Urdf
+
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # not turned at all
+
+
+class Frames:
+    """Where viewers find the arm's links, its tool, setpoint, target and hands: each in a parent,
+    all of them one tree. `fixed` are those that never move; `links`: whether the arm's are told.
+    """
+
+    def __init__(self, settings: Settings, description: str, *, links: bool = True) -> None:
+        urdf, offset = Urdf(description), settings.tool.plate_from_tool
+        self._root, self._names, self._urdf = urdf.root, settings.joints.names, urdf
+        self._still = {joint.child for joint in urdf.joints if joint.kind == "fixed"}
+        self._links = links
+        self.fixed = [one for one in self._at(()) if one.child in self._still]
+        self.fixed.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
+        if all(BASE not in (joint.parent, joint.child) for joint in urdf.joints):
+            self.fixed.append(Transform(BASE, urdf.root, (0.0, 0.0, 0.0), _UPRIGHT))
+
+    def _at(self, joints: Sequence[float]) -> list[Transform]:
+        return self._urdf.transforms(dict(zip(self._names, joints, strict=False))) if self._links else []
+
+    def moving(self, frame: Frame, joints: Sequence[float]) -> list[Transform]:
+        """Of a frame, with the joints [rad] in chain order; what is not known is left out."""
+        found = [one for one in self._at(joints) if one.child not in self._still]
+        setpoint, turn, target, target_turn = (
+            tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
+        )
+        found.append(Transform(self._root, "setpoint", setpoint, turn))
+        for side, name in enumerate(SIDES):
+            if frame["hand_ages"][side] >= 0:
+                found.append(Transform(self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
+        if frame["covariance"].any():  # without both hands nothing is predicted
+            found.append(Transform(self._root, "target", target, target_turn))
+        return found
