@@ -8,7 +8,7 @@ import threading
 
 from service.cli.progress import say
 from service.cli.usage import reaching
-from service.client import Client
+from service.client import Client, UnreachableError
 from service.config import Settings
 from service.described_arm import UnreadableError
 from service.shipped import cell_of
@@ -34,7 +34,12 @@ def follow(args: argparse.Namespace) -> int:
         from service.arms.simulated import SimulatedArm
         from service.daemon.clock import ask_for_real_time
 
-        status = Client(session, cell).wait_until_ready(timeout_s=args.wait)
+        client = Client(session, cell)
+        try:
+            status = client.status()
+        except UnreachableError as error:
+            say(f"waiting: {error}")
+            status = client.wait_until_ready(timeout_s=args.wait)
         if status.joints != settings.joints.names:
             raise DriveError(
                 f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; here "

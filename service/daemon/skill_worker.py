@@ -94,8 +94,9 @@ class SkillWorker:
         with self._busy:
             self.start()
             assert self._child is not None
+            timeout_s = max(timeout_s, self._first_s)
             try:
-                self._child.socket.settimeout(max(timeout_s, self._first_s))
+                self._child.socket.settimeout(timeout_s)
                 _send(self._child.socket, pickle.dumps(request))
                 answer, self._first_s = _receive(self._child.socket), 0.0
             except TimeoutError:
