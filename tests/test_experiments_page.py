@@ -283,6 +283,21 @@ SOURCES: dict[str, list[Source]] = {
         *follows("error_rms_mm", "recorded"),
         follows("jerk_ratio", "recorded")[1],
     ],
+    "`--hands DIR`": [sum(result("motion-of-others")["takes"].values())],
+    **{
+        f"| `{one}` |": [
+            *one.split()[1:],
+            *(
+                of(f"motion-of-others/by_person/{group}/{one}/{who}")
+                for group in ("clean", "recorded")
+                for who in ("ours", "chase")
+            ),
+        ]
+        for one in result("motion-of-others")["takes"]
+    },
+    "All together, ours errs": [
+        of(f"motion-of-others/all/{group}/{what}") for group in ("clean", "recorded") for what in ("ours", "ratio")
+    ],
     "After a sudden stop": [
         *(of(f"motion/by_follower/ours/sudden stops/overshoot_{key}_mm") for key in ("mean", "worst")),
         "30",
@@ -307,7 +322,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/scenes"),
         of("separation/random/closest_of_shapes_mm/least"),
     ],
-    "In 85 of these": [
+    "In 92 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
         of("separation/thrust/above_after_reaction"),
         of("separation/thrust/excess_after_reaction"),

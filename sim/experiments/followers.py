@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
+import msgspec
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
@@ -19,6 +20,7 @@ from service.contract.records import SIDES, Flag
 from service.core.arm.arm import Arm, Closing
 from service.core.frame import Tick, Vector
 from service.core.limiter.limiter import Limiter
+from service.core.separation.clearance import FARTHEST
 from service.core.skill.skill import Skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.moving_hands import PERIOD_S, Moving
@@ -45,8 +47,15 @@ Follower: TypeAlias = Callable[[Moving], Followed]
 
 
 def ours(skill: Skill, settings: Settings) -> Follower:
-    """The service's core, tick by tick; it never holds for being far from the demonstrations."""
+    """The service's core, tick by tick; it never holds for being far from the demonstrations, and
+    keeps no distance from people and things, as no rival does.
+    """
     skill = replace(skill, threshold=math.inf)
+    settings = msgspec.structs.replace(
+        settings,
+        people=msgspec.structs.replace(settings.people, clearance=-FARTHEST),
+        obstacles=msgspec.structs.replace(settings.obstacles, clearance=-FARTHEST),
+    )
 
     def follow(hands: Moving) -> Followed:
         seen = frames(skill, _ticks(hands), settings)[SETTLE_TICKS:]
