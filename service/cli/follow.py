@@ -8,21 +8,21 @@ import threading
 
 from service.cli.progress import say
 from service.cli.usage import reaching
-from service.client import Client, UnreachableError
+from service.client import Client, StartingError, UnreachableError
 from service.config import Settings
 from service.described_arm import UnreadableError
 from service.shipped import cell_of
 
-ARMS = ("franka", "simulated")
+DRIVES = ("franka", "simulated")
 MOST_RATE_OFF = 0.3  # share of it: deadlines that a busy machine misses ...
 MEASURED_TICKS = 200  # ... once so many tell it
 
 
 def follow(args: argparse.Namespace) -> int:
     """Exit code 0 once it was ended, with the arm at rest. Raises DriveError, UnreachableError."""
-    if args.arm not in ARMS:
+    if args.arm not in DRIVES:
         raise UnreadableError(
-            f"no arm {args.arm!r}; {' and '.join(ARMS)} are shipped, and examples/own_arm.py is where one's own begins"
+            f"no arm {args.arm!r}; {' and '.join(DRIVES)} are shipped, and examples/own_arm.py is where one's own begins"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
@@ -38,7 +38,8 @@ def follow(args: argparse.Namespace) -> int:
         try:
             status = client.status()
         except UnreachableError as error:
-            say(f"waiting: {error}")
+            if isinstance(error, StartingError):
+                say(f"waiting: {error}")
             status = client.wait_until_ready(timeout_s=args.wait)
         if status.joints != settings.joints.names:
             raise DriveError(
