@@ -22,7 +22,7 @@ def follow(args: argparse.Namespace) -> int:
     """Exit code 0 once it was ended, with the arm at rest. Raises DriveError, UnreachableError."""
     if args.arm not in DRIVES:
         raise UnreadableError(
-            f"no arm {args.arm!r}; {' and '.join(DRIVES)} are shipped, and examples/own_arm.py is where one's own begins"
+            f"no arm {args.arm!r}; {' and '.join(DRIVES)} are shipped; examples/own_arm.py is where one's own begins"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
