@@ -245,7 +245,9 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
             teach(daemon, 5)
         killing.join()
         assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
-        assert len(teach(daemon, 5, attempts=3)) == 5  # a process that starts beside others may be late
+        with contextlib.suppress(RefusedError):  # a process that starts beside others may be late
+            teach(daemon, 5)
+        assert len(teach(daemon, 5)) == 5
 
         busy, started = skill_worker(), children(daemon.process.pid)
         assert busy != first
@@ -284,12 +286,8 @@ def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     assert gone([busy], 5)
 
 
-def teach(daemon: Daemon, count: int, *, attempts: int = 1) -> list[dict[str, Any]]:
+def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     """The via-points in force once these are taught."""
-    if attempts > 1:
-        with contextlib.suppress(RefusedError):
-            return teach(daemon, count)
-        return teach(daemon, count, attempts=attempts - 1)
     place = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
     points = [{"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)]
     points_in_force: list[dict[str, Any]] = daemon.client.ask("via_points", {"op": "add", "points": points})["points"]

@@ -251,10 +251,10 @@ def _step(
                 twice = where > 0 and share == inner
                 if not twice and planned < part.max_speed:
                     constraint = constraints[count]
-                    slip = min(max(1.0 + (distance - given.clearance[THINGS]) / SLIP_DEPTH, 0.1), 1.0) * SLIP
+                    left = distance - given.clearance[THINGS]
+                    slip = min(max(1.0 + left / SLIP_DEPTH, 0.1), 1.0) * SLIP
                     constraint.allowed = _allowed(parameters, THINGS, distance, 0.0) + slip
-                    back = max(CLEARANCE_GAIN * (distance - given.clearance[THINGS]), -RETREAT_SPEED)
-                    planned = min(planned, back)
+                    planned = min(planned, max(CLEARANCE_GAIN * left, -RETREAT_SPEED))
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
                     if planned < 0.0 and not _may_pass(constraints, count, RETREAT_MIN_AUTHORITY, given.max_velocity):
                         planned = 0.0
