@@ -201,7 +201,7 @@ class Controller:
         lap("setpoint")
         solution = self._arm.follow(state, here, separation)
         lap("arm")
-        moved = self._limiter.step(state, frame, solution.velocity, separation)
+        moved = self._limiter.step(state, frame, solution.velocity, separation, solution.acceleration)
         self._here = moved.here
         if moved.too_fast:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)

@@ -27,7 +27,7 @@ POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_ra
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-HORIZON_S = 0.02  # for reaching the joint velocities that an orientation step needs; else it is scaled down
+HORIZON_S = 0.01  # for reaching the joint velocities that an orientation step needs; else it is scaled down
 SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
@@ -37,13 +37,15 @@ MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a s
 
 
 class Solution(NamedTuple):
-    """Joint velocities (J,) [rad/s].
+    """Joint velocities (J,) [rad/s], and the accelerations (J,) [rad/s²] with which they change as
+    the tool's does.
 
     Whether they were scaled down to the speed limits; whether a joint is within 0.1 rad of a
     position limit; whether something is so near that they are others for it.
     """
 
     velocity: Vector
+    acceleration: Vector
     speed_limited: bool
     near_limit: bool
     separated: bool
@@ -169,6 +171,7 @@ class Arm:
         self._goal = parameters(
             position=np.zeros(3),
             velocity=np.zeros(3),
+            acceleration=np.zeros(3),
             orientation=np.zeros(4),
             turning=np.zeros(3),
             moving=np.zeros(joints),
@@ -190,7 +193,7 @@ class Arm:
     def costs(self, here: Kinematics) -> Vector:
         """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
 
-        (3, 3, J): by order of the derivative, then by axis. The tool does not turn.
+        (3, 3, J): by order of the derivative, then by axis. The tool turns where that spares joints.
         """
         out = np.empty((3, 3, len(self._jerk)))
         joint_costs(self.parameters, here.record, out)
@@ -205,7 +208,7 @@ class Arm:
 
     def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
         """Joint velocities that bring the tool to the state's setpoint, as `step` says."""
-        out = np.empty(len(self._jerk))
+        out = np.empty((2, len(self._jerk)))
         constraints, count = separation.constraints, separation.count
         return _solution(
             out, follow(self.parameters, here.record, as_array(state), self._goal, constraints, count, out)
@@ -231,9 +234,9 @@ class Arm:
         once, it turns later. `separation` was updated there and goes before all. Never raises nor
         returns NaN for finite arguments.
         """
-        goal, out = self._goal[0], np.empty(len(self._jerk))
+        goal, out = self._goal[0], np.empty((2, len(self._jerk)))
         goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation
-        goal["turning"] = 0.0 if turning is None else turning
+        goal["turning"], goal["acceleration"] = 0.0 if turning is None else turning, 0.0
         goal["moving"] = 0.0 if moving is None else moving
         goal["horizon_s"] = math.inf if moving is None else HORIZON_S
         constraints, count = (
@@ -242,9 +245,9 @@ class Arm:
         return _solution(out, joint_step(self.parameters, self.at(q).record, self._goal, constraints, count, out))
 
 
-def _solution(velocity: Vector, flags: int) -> Solution:
-    velocity.setflags(write=False)
-    return Solution(velocity, bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
+def _solution(found: Vector, flags: int) -> Solution:
+    found.setflags(write=False)
+    return Solution(found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
 
 
 def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:

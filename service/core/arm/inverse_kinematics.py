@@ -12,20 +12,17 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.least_squares import factorise, solve, substitute
+from service.core.arm.least_squares import factorise, least_squares, solve, substitute
 from service.core.frame import Records, Vector
 from service.core.geometry import quaternion_of, swing, turn_between
 
 NEAR_LIMIT = 0.1  # [rad]
-# Of what a tool that may turn saves in speeds, accelerations and jerks: with more it falls behind
-# its setpoint.
-TURNS_AWAY = np.array([0.6, 0.1, 0.1])
 POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
 ROUNDING = 1e-12  # of a speed
-ROUND_TO = 1e9  # [s/rad] of the result: machines that differ in the last bits agree
+ROUND_TO = 1e9  # [s/rad], [s²/rad] of the result: machines that differ in the last bits agree
 SPEED = 1  # flag of a step: a joint's speed limit was met
 NEAR = 2  # a joint is near its position limit
 SEPARATED = 4  # separation asked for other velocities
@@ -51,30 +48,25 @@ def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[
 def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
     limit, by damped least squares that spare the joints with less of it; by order of the
-    derivative, then by axis. The tool turns a little where that spares joints.
+    derivative, then by axis. The tool turns where that spares joints.
     """
     arm, here = arms[0], heres[0]
-    count, joints = here.tasks.shape
-    scaled, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
-    free = np.empty(3)
+    joints = here.tasks.shape[1]
+    scaled, root, right = np.empty((3, joints)), np.empty((3, 3)), np.empty(3)
     for order in range(3):
-        for i in range(count):
+        for i in range(3):
             for joint in range(joints):
                 scaled[i, joint] = here.tasks[i, joint] * arm.spared[order, joint]
         factorise(scaled, here.damping, root)
         for axis in range(3):
-            right[:], free[:] = 0.0, 0.0
-            right[axis] = free[axis] = 1.0
+            right[:] = 0.0
+            right[axis] = 1.0
             substitute(root, right)
-            substitute(root, free)  # the factor of the first tasks is the first of the factor
             for joint in range(joints):
-                still = turning = 0.0
-                for i in range(count):
-                    still += scaled[i, joint] * right[i]
+                moved = 0.0
                 for i in range(3):
-                    turning += scaled[i, joint] * free[i]
-                away = still + TURNS_AWAY[order] * (turning - still)
-                out[order, axis, joint] = away / arm.planned_limits[order, joint]
+                    moved += scaled[i, joint] * right[i]
+                out[order, axis, joint] = moved / arm.planned_limits[order, joint]
 
 
 @compiled
@@ -140,13 +132,13 @@ def follow(
     state, goal = states[0], goals[0]
     goal.position[:], goal.velocity[:] = state.setpoint[0], state.setpoint[1]
     goal.orientation[:], goal.turning[:] = state.orientation, state.turning
-    goal.moving[:], goal.horizon_s = state.joints[1], arms[0].horizon_s
+    goal.acceleration[:], goal.moving[:], goal.horizon_s = state.setpoint[2], state.joints[1], arms[0].horizon_s
     return joint_step(arms, heres, goals, constraints, count, out)
 
 
 @compiled
 def joint_step(arms: Records, heres: Records, goals: Records, constraints: Records, count: int, out: Vector) -> int:
-    """`Arm.step` into out (J,) [rad/s], under the first `count` constraints; flags."""
+    """`Arm.step` into out (2, J) [rad/s, rad/s²], under the first `count` constraints; flags."""
     arm, here, goal = arms[0], heres[0], goals[0]
     tasks, scale, damping = here.tasks, arm.scale, here.damping
     count_of_tasks, joints = tasks.shape
@@ -187,24 +179,29 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         limits[k] = constraints[k].planned
         for j in range(joints):
             rows[k, j] = constraints[k].row[j] * scale[j]
-    kept = solve(scaled, wanted, home, damping, bounds, rows, limits, out)
+    velocity = out[0]
+    kept = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     if kept:
         said |= SEPARATED
-    if not _can_have(arms, goals, out):  # it turns as far as costs its position nothing
+    near = _can_have(arms, goals, velocity)
+    scaled[3:], wanted[3:] = 0.0, 0.0
+    if not near:  # it turns as far as costs its position nothing
         free = np.empty(joints)
-        scaled[3:], wanted[3:] = 0.0, 0.0
         for j in range(joints):
             home[j] = goal.moving[j] / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not kept:  # what keeps distances was found for this solution, not for one on the way to it
-            _turn_less(arms, goals, out, free)
-    excess = _excess(arms, out)
+            _turn_less(arms, goals, velocity, free)
+    excess = _excess(arms, velocity)
+    wanted[:3], home[:] = goal.acceleration, 0.0
     for j in range(joints):
-        if math.isnan(excess):
-            out[j] = 0.0
-        else:
-            out[j] *= scale[j] / max(excess, 1.0)
-        out[j] = np.rint(out[j] * ROUND_TO) / ROUND_TO
+        bounds[1, j] = arm.acceleration[j] / scale[j]
+        bounds[0, j] = -bounds[1, j]
+    least_squares(scaled, wanted, home, damping, bounds, out[1])
+    for j in range(joints):
+        velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
+        for order in range(2):
+            out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
     return said | SPEED if excess > 1.0 + ROUNDING else said
 
 

@@ -1,7 +1,8 @@
 """The last stage: joint commands that hold every limit, whatever is wanted.
 
 Each joint moves by one tick at constant jerk toward the wanted velocity where its limits leave room
-for that, and by Ruckig's time-optimal profile where they do not. A step is taken only if a stop
+for that, and by Ruckig's time-optimal profile where they do not: to the wanted velocity as it goes
+on changing. One that took it to stay would be late for as long as it changes. A step is taken only if a stop
 after it stays within the position limits; else the joint stops now. As the step before was taken on
 the same condition, that stop is feasible too: the limits hold by induction, for any sequence of
 wanted velocities.
@@ -72,25 +73,33 @@ class Limiter:
         self._ruckig = ruckig.Ruckig(count)
         self._input = ruckig.InputParameter(count)
         self._input.control_interface = ruckig.ControlInterface.Velocity
+        self._input.target_velocity = [0.0] * count
         self._input.synchronization = ruckig.Synchronization.No
         self._input.max_velocity = list(limits.velocity)
-        self._input.max_acceleration = list(limits.acceleration)
         self._input.max_jerk = list(limits.jerk)
         self._trajectory = ruckig.Trajectory(count)
 
-    def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited:
-        """The joints one period later on the way to `velocity`; all (J,) [rad, rad/s, rad/s²].
+    def step(
+        self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector, acceleration: Vector | None = None
+    ) -> Limited:
+        """The joints one period later on the way to `velocity`, which itself changes by
+        `acceleration`, or stays; all (J,) [rad, rad/s, rad/s²].
 
-        A NaN in `velocity` means stop. A state that is not finite stays as it is, at velocity 0.
+        A NaN in either means stop. A state that is not finite stays as it is, at velocity 0.
         Never raises.
         """
-        state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.empty(len(q))
+        state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.zeros((2, len(q)))
         state[0], state[1], state[2] = q, dq, ddq
+        if acceleration is not None:
+            wanted[1] = acceleration
         met = _step(state, velocity, self._parameters, wanted, moved)
         if met == UNUSABLE:
             return _stuck(q)
         if met & CHASED:
             self._chase(state, wanted, moved)
+            if _forget_fast(moved, self._parameters):  # where the wanted velocity does not change as was said
+                wanted[1] = 0.0
+                self._chase(state, wanted, moved)
             _make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=met > 0)
 
@@ -123,15 +132,23 @@ class Limiter:
 
     def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
         """Puts those joints of `moved` (3, J) that are NaN one period along Ruckig's profile to the
-        wanted velocities (J,), or on the fastest stop where there is none.
+        wanted velocities, as seen from what moves at these and their accelerations (2, J); or on
+        the fastest stop where there is none.
         """
-        self._input.current_position, self._input.current_velocity, self._input.current_acceleration = state.tolist()
-        self._input.target_velocity = wanted.tolist()
+        (velocity, ramp), most, dt = wanted, self._parameters["max_acceleration"][0], self._period
+        self._input.current_position = state[0].tolist()
+        self._input.current_velocity = (state[1] - velocity).tolist()
+        self._input.current_acceleration = (state[2] - ramp).tolist()
+        self._input.max_acceleration, self._input.min_acceleration = (most - ramp).tolist(), (-most - ramp).tolist()
         try:
             self._ruckig.calculate(self._input, self._trajectory)
         except (ruckig.RuckigError, ValueError):  # ValueError: a result that the binding has no name for
             return
-        np.copyto(moved, self._trajectory.at_time(self._period), where=np.isnan(moved))
+        chased = np.array(self._trajectory.at_time(dt))
+        chased[0] += dt * (velocity + 0.5 * dt * ramp)
+        chased[1] += velocity + dt * ramp
+        chased[2] += ramp
+        np.copyto(moved, chased, where=np.isnan(moved))
 
 
 @compiled
@@ -147,8 +164,9 @@ def _step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, 
 
 @compiled
 def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
-    """Into `wanted` (J,) the velocity within speed limits, slower near position limits; into
-    `moved` (3, J) each joint one tick on at the jerk that reaches it, NaN where a limit forbids.
+    """Into `wanted` (2, J) the velocity within speed limits, slower near position limits, and as
+    much of its acceleration, which it is given, as keeps it there; into `moved` (3, J) each joint
+    one tick on at the jerk that reaches it, NaN where a limit forbids.
 
     A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
     profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
@@ -156,16 +174,20 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
     given, met, stopping = parameters[0], 0, False
     dt = given.period_s
     for i in range(len(velocity)):
-        stopping = stopping or math.isnan(velocity[i])
+        stopping = stopping or math.isnan(velocity[i]) or math.isnan(wanted[1, i])
     for i in range(len(velocity)):
         q, v, a = state[0, i], state[1, i], state[2, i]
         top, max_jerk = given.max_velocity[i], given.max_jerk[i]
         highest = min(top, given.approach_gain[i] * max(given.upper[i] - q, 0.0))
         lowest = max(-top, given.approach_gain[i] * min(given.lower[i] - q, 0.0))
-        wanted[i] = 0.0 if stopping else min(max(velocity[i], lowest), highest)
-        if wanted[i] != velocity[i]:
+        aim = 0.0 if stopping else min(max(velocity[i], lowest), highest)
+        if aim != velocity[i]:
             met |= BOUNDED
-        acceleration = (wanted[i] - v) / dt
+        ramp = 0.0 if stopping else wanted[1, i]
+        room = aim - lowest if ramp < 0.0 else highest - aim
+        most = min(INSIDE * given.max_acceleration[i], math.sqrt(2.0 * max_jerk * room))
+        wanted[0, i], wanted[1, i] = aim, min(max(ramp, -most), most)
+        acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
         crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # when acceleration has come to 0
         if (
@@ -179,6 +201,20 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
             met |= CHASED
     return met
+
+
+@compiled
+def _forget_fast(moved: Vector, parameters: Records) -> bool:
+    """Makes those joints of `moved` (3, J) NaN that pass their greatest speed now or as their
+    acceleration comes to 0; whether there are some.
+    """
+    given, found = parameters[0], False
+    for i in range(moved.shape[1]):
+        v, a = moved[1, i], moved[2, i]
+        if max(abs(v), abs(v + a * abs(a) / (2.0 * given.max_jerk[i]))) > given.max_velocity[i]:
+            found = True
+            moved[0, i] = moved[1, i] = moved[2, i] = math.nan
+    return found
 
 
 @compiled
@@ -291,15 +327,23 @@ class LimiterStage:
         state["joints"] = 0.0
         state["joints"][0] = joints
 
-    def step(self, state: Record, frame: Record, wanted: Vector, separation: Separation) -> Moved:
-        """Moves the joints on toward wanted velocities (J,) [rad/s].
+    def step(
+        self,
+        state: Record,
+        frame: Record,
+        wanted: Vector,
+        separation: Separation,
+        changing: Vector | None = None,
+    ) -> Moved:
+        """Moves the joints on toward wanted velocities (J,) [rad/s], which are `changing` (J,)
+        [rad/s²].
 
         They brake where the tool would pass its greatest speed, and one that does all the same is
         too fast. Where they would approach something too fast on the way, which each goes as fast
         as it can, they go it together, or brake, unless that brakes less.
         """
         q, dq, ddq = state["joints"]
-        moved = self._limiter.step(q, dq, ddq, wanted)
+        moved = self._limiter.step(q, dq, ddq, wanted, changing)
         limited, excess = moved.limited, separation.excess(*moved[1:3])
         separated = excess > 0.0
         if separated:
