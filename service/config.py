@@ -71,9 +71,7 @@ class ToolSettings(Section, frozen=True):
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk² beside error², at least
-    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = (
-        0.25  # share of a hand's way to a stop: more lags less, passes more
-    )
+    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # more of it lags less and passes a stop by more
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
 
     @property

@@ -201,7 +201,7 @@ class Controller:
         lap("setpoint")
         solution = self._arm.follow(state, here, separation)
         lap("arm")
-        moved = self._limiter.step(state, frame, solution.velocity, separation, solution.acceleration)
+        moved = self._limiter.step(state, frame, solution.velocity, solution.acceleration, separation)
         self._here = moved.here
         if moved.too_fast:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)
@@ -223,7 +223,7 @@ class Controller:
             own = own * separation.share(own)
             if state["leaves"]:
                 own = own + self._arm.follow(state, here, separation).velocity
-            moved = self._limiter.step(state, frame, own, separation)
+            moved = self._limiter.step(state, frame, own, np.zeros(len(own)), separation)
         self._here = moved.here
         lap("limiter")
         self._setpoint.begin(state, frame, moved.here)

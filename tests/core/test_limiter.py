@@ -36,12 +36,12 @@ class Run(NamedTuple):
     limited: list[bool]
 
 
-def drive(limits: JointSettings, q: Vector, inputs: Vector) -> Run:
+def drive(limits: JointSettings, q: Vector, inputs: Vector, changing: Vector | None = None) -> Run:
     limiter = Limiter(limits, PERIOD)
     state: tuple[Vector, Vector, Vector] = (q, REST, REST)
     steps: list[Limited] = []
-    for velocity in inputs:
-        steps.append(limiter.step(*state, velocity))
+    for k, velocity in enumerate(inputs):
+        steps.append(limiter.step(*state, velocity, None if changing is None else changing[k]))
         state = steps[-1][:3]
     position, speed, acceleration = (np.array([step[i] for step in steps]) for i in range(3))
     jerk = np.diff(acceleration, axis=0, prepend=0.0) / PERIOD
@@ -68,6 +68,7 @@ anything = st.one_of(
     st.floats(),
     st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 0.0, 1.5, -1.5]),
     st.floats(-2.0, 2.0),
+    st.floats(-30.0, 30.0),
 )
 pieces = st.lists(st.tuples(st.tuples(*[anything] * 7), st.integers(1, 60)), min_size=1, max_size=8)
 
@@ -79,6 +80,20 @@ def test_every_limit_holds_for_any_sequence_of_wanted_velocities(
 ) -> None:
     q = (LOWER + np.array(where) * (UPPER - LOWER)).round(9).clip(LOWER, UPPER)
     run = drive(limits, q, np.array([value for value, count in wanted for _ in range(count)]))
+    assert_held(limits, q, run)
+
+
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(pieces, pieces, st.tuples(*[st.floats(0.0, 1.0)] * 7), st.sampled_from([LIMITS, LOWERED]))
+def test_every_limit_holds_whatever_is_said_of_how_they_change(
+    wanted: list[tuple[tuple[float, ...], int]],
+    said: list[tuple[tuple[float, ...], int]],
+    where: tuple[float, ...],
+    limits: JointSettings,
+) -> None:
+    q = (LOWER + np.array(where) * (UPPER - LOWER)).round(9).clip(LOWER, UPPER)
+    inputs, changing = (np.array([value for value, count in one for _ in range(count)]) for one in (wanted, said))
+    run = drive(limits, q, inputs, np.resize(changing, inputs.shape))
     assert_held(limits, q, run)
 
 
@@ -113,6 +128,18 @@ def test_what_is_smooth_and_within_the_limits_passes_unchanged() -> None:
     run = drive(LIMITS, np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), wanted)
     assert np.abs(run.velocity - wanted).max() < 2e-5
     assert not any(run.limited)
+
+
+def test_velocities_that_begin_to_change_at_once_are_caught_up_with_if_it_is_said_how() -> None:
+    rate = np.array([5.0, -5.0, 5.0, 4.0, -5.0, 5.0, -3.0])
+    wanted = np.clip(PERIOD * np.arange(1, 201)[:, None], 0.0, 0.25) * rate
+    start, changing = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0]), np.where(wanted == 0.25 * rate, 0.0, rate)
+    told, untold = (np.abs(drive(LIMITS, start, wanted, said).velocity - wanted) for said in (changing, None))
+    last = slice(80, 124)  # of the ramp
+    assert told[last].max() < 1e-6
+    late = rate**2 / (2.0 * np.array(LIMITS.jerk))
+    np.testing.assert_allclose(untold[last], np.tile(late, (44, 1)), rtol=0.2)
+    assert told[-1].max() < 1e-9
 
 
 def test_a_step_of_wanted_velocity_is_reached_and_held_exactly() -> None:

@@ -27,11 +27,11 @@ POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_ra
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-HORIZON_S = 0.01  # for reaching the joint velocities that an orientation step needs; else it is scaled down
+HORIZON_S = 0.008  # for reaching the joint velocities that an orientation step needs; else it is scaled down
 SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
-# Of the joints' speed, acceleration and jerk that a plan may use: turning the tool needs the rest.
-PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
+# Of the joints' speed, acceleration and jerk that a plan may use: closing in needs the rest.
+PLANNED_SHARE = np.array([0.97, 0.95, 0.9])
 
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
@@ -193,7 +193,7 @@ class Arm:
     def costs(self, here: Kinematics) -> Vector:
         """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
 
-        (3, 3, J): by order of the derivative, then by axis. The tool turns where that spares joints.
+        (3, 3, J): by order of the derivative, then by axis. The tool turns where it spares joints.
         """
         out = np.empty((3, 3, len(self._jerk)))
         joint_costs(self.parameters, here.record, out)

@@ -1,11 +1,11 @@
 """The last stage: joint commands that hold every limit, whatever is wanted.
 
 Each joint moves by one tick at constant jerk toward the wanted velocity where its limits leave room
-for that, and by Ruckig's time-optimal profile where they do not: to the wanted velocity as it goes
-on changing. One that took it to stay would be late for as long as it changes. A step is taken only if a stop
-after it stays within the position limits; else the joint stops now. As the step before was taken on
-the same condition, that stop is feasible too: the limits hold by induction, for any sequence of
-wanted velocities.
+for that, and by Ruckig's time-optimal profile where they do not. That profile ends on the ramp by
+which the wanted velocity goes on: one that ended at rest on it would be late all along the ramp. A
+step is taken only if a stop after it stays within the position limits; else the joint stops now. As
+the step before was taken on the same condition, that stop is feasible too: the limits hold by
+induction, for any sequence of wanted velocities.
 """
 
 from __future__ import annotations
@@ -79,10 +79,8 @@ class Limiter:
         self._input.max_jerk = list(limits.jerk)
         self._trajectory = ruckig.Trajectory(count)
 
-    def step(
-        self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector, acceleration: Vector | None = None
-    ) -> Limited:
-        """The joints one period later on the way to `velocity`, which itself changes by
+    def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
+        """The joints one period later on the way to `velocity`, which goes on by
         `acceleration`, or stays; all (J,) [rad, rad/s, rad/s²].
 
         A NaN in either means stop. A state that is not finite stays as it is, at velocity 0.
@@ -135,7 +133,8 @@ class Limiter:
         wanted velocities, as seen from what moves at these and their accelerations (2, J); or on
         the fastest stop where there is none.
         """
-        (velocity, ramp), most, dt = wanted, self._parameters["max_acceleration"][0], self._period
+        dt, most, ramp = self._period, self._parameters["max_acceleration"][0], wanted[1]
+        velocity = wanted[0] - dt * ramp  # now: they are wanted a period later
         self._input.current_position = state[0].tolist()
         self._input.current_velocity = (state[1] - velocity).tolist()
         self._input.current_acceleration = (state[2] - ramp).tolist()
@@ -190,8 +189,10 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
         crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # when acceleration has come to 0
+        outside = int(q > given.upper[i]) - int(q < given.lower[i])
         if (
-            abs(acceleration - a) <= max_jerk * dt
+            outside * crest <= 0.0
+            and abs(acceleration - a) <= max_jerk * dt
             and abs(acceleration) <= given.max_acceleration[i]
             and max(abs(v_then), abs(crest)) <= top
         ):
@@ -327,15 +328,8 @@ class LimiterStage:
         state["joints"] = 0.0
         state["joints"][0] = joints
 
-    def step(
-        self,
-        state: Record,
-        frame: Record,
-        wanted: Vector,
-        separation: Separation,
-        changing: Vector | None = None,
-    ) -> Moved:
-        """Moves the joints on toward wanted velocities (J,) [rad/s], which are `changing` (J,)
+    def step(self, state: Record, frame: Record, wanted: Vector, ramp: Vector, separation: Separation) -> Moved:
+        """Moves the joints on toward wanted velocities (J,) [rad/s], which go on by a ramp (J,)
         [rad/s²].
 
         They brake where the tool would pass its greatest speed, and one that does all the same is
@@ -343,7 +337,7 @@ class LimiterStage:
         as it can, they go it together, or brake, unless that brakes less.
         """
         q, dq, ddq = state["joints"]
-        moved = self._limiter.step(q, dq, ddq, wanted, changing)
+        moved = self._limiter.step(q, dq, ddq, wanted, ramp)
         limited, excess = moved.limited, separation.excess(*moved[1:3])
         separated = excess > 0.0
         if separated:

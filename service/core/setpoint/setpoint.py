@@ -40,14 +40,14 @@ from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import decided
 
-ROOM = 0.0015  # [m] by which the setpoint's stop may pass the hands'
+ROOM = 0.0014  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.12  # [s] a target that brakes is taken to be slower by its deceleration times this
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
 BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
-SHARE = 0.85  # of acceleration and jerk that is planned with
+SHARE = 0.95  # of acceleration and jerk that is planned with
 SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
 GAP_FREE = 0.003  # [m] a tool so far behind its setpoint slows it ...
