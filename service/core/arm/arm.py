@@ -31,7 +31,7 @@ HORIZON_S = 0.008  # for reaching the joint velocities that an orientation step 
 SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: closing in needs the rest.
-PLANNED_SHARE = np.array([0.97, 0.95, 0.9])
+PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
 
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 

@@ -95,7 +95,7 @@ class Limiter:
             return _stuck(q)
         if met & CHASED:
             self._chase(state, wanted, moved)
-            if _forget_fast(moved, self._parameters):  # where the wanted velocity does not change as was said
+            if _forget_fast(state, moved, self._parameters):  # where the wanted velocity does not change as was said
                 wanted[1] = 0.0
                 self._chase(state, wanted, moved)
             _make_safe(state, moved, self._parameters)
@@ -205,14 +205,15 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
 
 
 @compiled
-def _forget_fast(moved: Vector, parameters: Records) -> bool:
-    """Makes those joints of `moved` (3, J) NaN that pass their greatest speed now or as their
-    acceleration comes to 0; whether there are some.
+def _forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
+    """Makes those joints of `moved` (3, J) NaN that pass their greatest speed on the way from where
+    they are, or as their acceleration comes to 0; whether there are some.
     """
     given, found = parameters[0], False
     for i in range(moved.shape[1]):
-        v, a = moved[1, i], moved[2, i]
-        if max(abs(v), abs(v + a * abs(a) / (2.0 * given.max_jerk[i]))) > given.max_velocity[i]:
+        v, a, on_the_way = moved[1, i], moved[2, i], (moved[0, i] - state[0, i]) / given.period_s
+        crest = v + a * abs(a) / (2.0 * given.max_jerk[i])
+        if max(abs(v), abs(crest), abs(on_the_way)) > given.max_velocity[i]:
             found = True
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
     return found
