@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,6 +42,7 @@ LABELS = {
     "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
 }
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+TICKS_MM = (0.5, 1, 2, 5, 10, 20, 50)
 AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
 TEACHERS, TAUGHT_S, TAUGHT_EVERY = range(100, 105), 20.0, 10  # people whom nobody follows, and ticks a sample
@@ -100,10 +102,9 @@ def followers(skill: Skill, share: float) -> dict[str, Follower]:
 
 
 def sequences(options: Options, middle: Array) -> list[Moving]:
-    """The hands that are followed: recorded where a folder is given, modelled otherwise."""
+    """The modelled hands that are followed."""
     share = options.share
-    count, seconds = max(1, round(PEOPLE * share)), max(4.0, SECONDS * share)
-    people = recorded(options.hands, middle) if options.hands else modelled(middle, count=count, seconds=seconds)
+    people = modelled(middle, count=max(1, round(PEOPLE * share)), seconds=max(4.0, SECONDS * share))
     if share < 1:  # a quick look
         people = [one for one in people if one.group in FLOOR_GROUPS]
     count = max(2, round(STOPS * share))
@@ -188,13 +189,13 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """Follows all hands with all followers; returns the numbers for its JSON."""
     prepare(options.share)
     skill, by_name = _known[SHIPPED]
+    if options.hands is not None:
+        return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
     tasks = [(name, SHIPPED, one) for name in by_name for one in hands]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
     tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
-    found = list(
-        shared_out(measure, tasks, options.workers, prepare=functools.partial(prepare, options.share), chunk=8)
-    )
+    found = _measured(tasks, options)
     table = {name: _summary([one for one in found if one.follower == name]) for name in by_name}
     for name, groups in table.items():
         results.say(f"{name}: {_line(groups)}")
@@ -203,14 +204,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         for group, rate_hz in FLOOR_GROUPS.items()
     }
     _record(results, hands[1], by_name["ours"](hands[1]))
-    people = _by_person([one for one in found if math.isnan(one.overshoot_mm)])
-    for group, rows in people.items():
-        told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in rows.items())
-        results.say(f"{group}, ours / best chase: {told}")
     numbers = {
-        "hands": "recorded" if options.hands else "modelled",
+        "hands": "modelled",
         "by_follower": table,
-        "by_person": people,
+        "by_person": _by_person(results, [one for one in found if math.isnan(one.overshoot_mm)]),
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
     }
@@ -238,20 +235,48 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
     return out
 
 
-def _by_person(rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each group and person the root mean square error [mm] over all sequences, ours and that of
-    the chase that is best in the group.
+def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Figures]:
+    """The figures of all tasks, shared out over processes."""
+    begin = functools.partial(prepare, options.share)
+    return list(shared_out(measure, tasks, options.workers, prepare=begin, chunk=8))
+
+
+def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
+    """The numbers of recorded hands: ours beside the chases."""
+    hands = [one for one in hands if one.group in FLOOR_GROUPS]
+    names = [name for name in _known[SHIPPED][1] if name == "ours" or name.startswith("chase")]
+    found = _measured([(name, SHIPPED, one) for name in names for one in hands], options)
+    takes = Counter(one.person for one in hands if one.group == "clean")
+    people = _by_person(results, found)
+    together: dict[str, dict[str, float]] = {}
+    for group, rows in people.items():
+        means = {
+            who: math.sqrt(sum(count * rows[one][who] ** 2 for one, count in takes.items()) / takes.total())
+            for who in ("ours", "chase")
+        }
+        lags = [one.lag_ms for one in found if one.follower == "ours" and one.group == group]
+        together[group] = means | {"ratio": means["ours"] / means["chase"], "lag_ms": float(np.median(lags))}
+        results.say(f"{group}, all: {', '.join(f'{name} {value:.2f}' for name, value in together[group].items())}")
+    numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together}
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each group and person the root mean square error [mm] over all sequences: ours, and that
+    of the chase that is best for them.
     """
     out: dict[str, dict[str, dict[str, float]]] = {}
     for group in dict.fromkeys(one.group for one in rows):
         of = [one for one in rows if one.group == group]
-        chases = {one.follower for one in of if one.follower.startswith("chase")}
-        best = min(sorted(chases), key=lambda name: _pooled(of, name))
+        chases = sorted({one.follower for one in of if one.follower.startswith("chase")})
         out[group] = {
-            person: {"ours": _pooled(mine, "ours"), "chase": _pooled(mine, best)}
+            person: {"ours": _pooled(mine, "ours"), "chase": min(_pooled(mine, name) for name in chases)}
             for person in dict.fromkeys(one.person for one in of)
             for mine in [[one for one in of if one.person == person]]
         }
+        told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in out[group].items())
+        results.say(f"{group}, ours / best chase: {told}")
     return out
 
 
@@ -276,31 +301,50 @@ def _line(groups: dict[str, dict[str, float]]) -> str:
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers: error against jerk, for every follower and the best
-    linear filters.
+    linear filters; of recorded hands each person's error, ours against the chase's.
     """
-    plt, table, floors = pyplot(), numbers["by_follower"], numbers["best_linear_filter"]
-    figure, axes = plt.subplots(1, len(floors), figsize=(10, 4.2), layout="constrained")
-    styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
-    for panel, (group, floor) in zip(axes, floors.items(), strict=True):
-        for family, (colour, marker) in styles.items():
-            rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
-            points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
-            label = LABELS.get(family, family)
-            panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
-            if family == "ours":
-                chosen = rows["ours"]
-                panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
-        panel.plot(
-            [row["jerk_ratio"] for row in floor],
-            [row["error_rms_mm"] for row in floor],
-            "k--",
-            lw=1,
-            label="best linear filter, without limits and arm",
-        )
-        panel.set(xscale="log", xlabel="jerk, times the truth's", ylabel="error, rms [mm]", ylim=(0, None))
-        panel.set_title({"clean": "clean, 100 Hz", "recorded": "as a camera sees them, 30 Hz"}[group])
+    plt = pyplot()
+    figure, axes = plt.subplots(1, len(FLOOR_GROUPS), figsize=(10, 4.2), layout="constrained")
+    for panel, group in zip(axes, FLOOR_GROUPS, strict=True):
+        if "by_follower" in numbers:
+            _draw_followers(panel, numbers["by_follower"], group, numbers["best_linear_filter"][group])
+            seen = "as a camera sees them, 30 Hz"
+        else:
+            _draw_people(panel, numbers["by_person"][group])
+            seen = "as recorded"
+        panel.set_title("clean, 100 Hz" if group == "clean" else seen)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     results.figure(figure)
+
+
+def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]) -> None:
+    styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
+    for family, (colour, marker) in styles.items():
+        rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
+        points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
+        label = LABELS.get(family, family)
+        panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
+        if family == "ours":
+            chosen = rows["ours"]
+            panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
+    x, y = ([row[name] for row in floor] for name in ("jerk_ratio", "error_rms_mm"))
+    panel.plot(x, y, "k--", lw=1, label="best linear filter, without limits and arm")
+    panel.set(xscale="log", xlabel="jerk, times the truth's", ylabel="error, rms [mm]", ylim=(0, None))
+
+
+def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
+    errors = [row[who] for row in rows.values() for who in ("ours", "chase")]
+    ends = (0.8 * min(errors), 1.3 * max(errors))
+    panel.plot(ends, ends, color=REFERENCE, lw=1, label="as well as the filter")
+    x, y = ([row[who] for row in rows.values()] for who in ("chase", "ours"))
+    panel.plot(x, y, "o", color=TOOL, ms=5, label="a person")
+    for name, row in rows.items():
+        panel.annotate(name, (row["chase"], row["ours"]), xytext=(4, -8), textcoords="offset points", fontsize=7)
+    panel.set(xscale="log", yscale="log", xlabel="best One-Euro filter and Ruckig, rms [mm]", ylabel="ours, rms [mm]")
+    ticks = [tick for tick in TICKS_MM if ends[0] <= tick <= ends[1]]
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
 
 
 def _record(results: Results, hands: Moving, seen: Followed) -> None:
