@@ -307,7 +307,10 @@ SOURCES: dict[str, list[Source]] = {
             for key in ("mean", "worst")
         ),
         of("motion/by_follower/ours/minimum jerk/lag_ms"),
-        "0.8",
+    ],
+    "How the joints move": [
+        *("4", "13"),
+        *(percent(f"motion/joint_speeds_in_the_scene/{who}/ripple") for who in ("ours", "chase")),
     ],
     "`separation`": [
         of("separation/scenes"),
@@ -322,7 +325,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/scenes"),
         of("separation/random/closest_of_shapes_mm/least"),
     ],
-    "In 92 of these": [
+    "In 94 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
         of("separation/thrust/above_after_reaction"),
         of("separation/thrust/excess_after_reaction"),

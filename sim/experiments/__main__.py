@@ -87,7 +87,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1"
     )
-    p.add_argument("--arm", default="wam", help="of `faults`: wam, franka, ur5 or FILE.toml (default: %(default)s)")
+    p.add_argument(
+        "--arm", default="wam", help="of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
+    )
     p.add_argument(
         "--redraw",
         action="store_true",

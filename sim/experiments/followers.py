@@ -31,11 +31,12 @@ SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it
 
 
 class Followed(NamedTuple):
-    """The tool's path (N, 3) [m], its greatest speed [m/s], and the share of ticks with a limit
-    met.
+    """The tool's path (N, 3) [m], the joints' velocities (N, J) [rad/s], the tool's greatest speed
+    [m/s], and the share of ticks with a limit met.
     """
 
     tool: Array
+    joints: Array
     top_speed: float
     limited: float
     estimate: Array | None = None  # (N, 2, 3) of the hands
@@ -61,7 +62,8 @@ def ours(skill: Skill, settings: Settings) -> Follower:
         seen = frames(skill, _ticks(hands), settings)[SETTLE_TICKS:]
         speed = np.linalg.norm(np.diff(seen["tool"], axis=0), axis=1) / PERIOD_S
         limited = float(np.mean(seen["flags"] & Flag.SPEED_LIMITED > 0))
-        return Followed(seen["tool"], float(speed.max()), limited, seen["hands"], seen["target"], seen["setpoint"])
+        shown = (seen[name] for name in ("hands", "target", "setpoint"))
+        return Followed(seen["tool"], seen["joint_velocities"], float(speed.max()), limited, *shown)
 
     return follow
 
@@ -98,11 +100,12 @@ class _Chain:
 
     def targets(self, samples: Array) -> Array:
         """What the skill makes of samples (M, 6): (M, 3) [m]."""
-        return targets(self.skill, samples)
+        return targets(self.skill, samples, self.settings)
 
     def start(self, position: Vector) -> tuple[Vector, Vector, Vector]:
         """The joints at rest with the tool at a position."""
-        q, dq, ddq = np.array(self.settings.arm.posture), np.zeros(7), np.zeros(7)
+        q = np.array(self.settings.arm.posture)
+        dq, ddq = np.zeros((2, len(q)))
         for _ in range(2000):
             wanted = self.arm.step(q, position, np.zeros(3), self.orientation)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
@@ -111,18 +114,19 @@ class _Chain:
     def follow(self, setpoints: Array) -> Followed:
         """The tool led by setpoints (N, 2, 3): position and velocity."""
         q, dq, ddq = self.start(setpoints[0, 0])
-        tool, limited = np.empty((len(setpoints), 3)), 0
+        tool, joints, limited = np.empty((len(setpoints), 3)), np.empty((len(setpoints), len(q))), 0
         for k, (position, velocity) in enumerate(setpoints):
-            wanted = self.arm.step(q, position, velocity, self.orientation)
+            # not at the acceleration that ours passes on: a time-optimal one leaps
+            wanted = self.arm.step(q, position, velocity, self.orientation, moving=dq)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
-            tool[k] = self.arm.at(q).position
+            tool[k], joints[k] = self.arm.at(q).position, dq
             limited += wanted.speed_limited
-        return _followed(tool, limited)
+        return _followed(tool, joints, limited)
 
 
-def _followed(tool: Array, limited: int) -> Followed:
+def _followed(tool: Array, joints: Array, limited: int) -> Followed:
     speed = np.linalg.norm(np.diff(tool, axis=0), axis=1) / PERIOD_S
-    return Followed(tool, float(speed.max()), limited / len(tool))
+    return Followed(tool, joints, float(speed.max()), limited / len(tool))
 
 
 def _newest(hands: Moving) -> Array:
@@ -185,8 +189,8 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
             q = q + PERIOD_S * solution.velocity
             low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)
             before, wanted[k] = q, low
-        moved = _by_ruckig(wanted, limits)[:, 0]
-        return _followed(np.array([chain.arm.at(q).position for q in moved]), limited)
+        moved = _by_ruckig(wanted, limits)
+        return _followed(np.array([chain.arm.at(q).position for q in moved[:, 0]]), moved[:, 1], limited)
 
     return follow
 
@@ -198,6 +202,17 @@ def unsmoothed(skill: Skill, settings: Settings) -> Follower:
         chain = _Chain(skill, settings)
         targets = chain.targets(hands.samples)[_newest(hands)]
         return chain.follow(np.stack([targets, np.zeros_like(targets)], axis=1))
+
+    return follow
+
+
+def truth(skill: Skill, settings: Settings) -> Follower:
+    """Where the truth wants the tool, straight to inverse kinematics: what the arm makes of it."""
+
+    def follow(hands: Moving) -> Followed:
+        chain = _Chain(skill, settings)
+        targets = chain.targets(hands.truth)
+        return chain.follow(np.stack([targets, np.gradient(targets, PERIOD_S, axis=0)], axis=1))
 
     return follow
 

@@ -22,8 +22,9 @@ from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
-from service.shipped import recordings
-from sim.experiments.followers import Followed, Follower, chase, ours, servo, unsmoothed
+from service.shipped import cell_of, recordings
+from sim.experiments import spectra
+from sim.experiments.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
 from sim.experiments.linear_floor import best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.open_loop import targets
@@ -41,8 +42,9 @@ LABELS = {
     "chase": "One-Euro filter, then Ruckig after the target",
     "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
 }
+TRUTH, SMOOTH = "truth", "minimum jerk"  # a follower for the group of which frequencies are shown
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-TICKS_MM = (0.5, 1, 2, 5, 10, 20, 50)
+TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
 TEACHERS, TAUGHT_S, TAUGHT_EVERY = range(100, 105), 20.0, 10  # people whom nobody follows, and ticks a sample
@@ -69,6 +71,7 @@ class Figures:
     top_speed: float  # [m/s] of the tool
     overshoot_mm: float
     settled_ms: float
+    joint_speeds: list[float]  # [rad/s] by frequency, as of `spectra`
 
 
 def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
@@ -85,9 +88,8 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
     return learn(demonstrations, name="of such hands", components=10)
 
 
-def followers(skill: Skill, share: float) -> dict[str, Follower]:
+def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follower]:
     """All that is compared; for a quick look one of each kind, and ours."""
-    settings = Settings()
     found = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
     for weight in WEIGHTS if share == 1 else ():
@@ -97,7 +99,7 @@ def followers(skill: Skill, share: float) -> dict[str, Follower]:
         found[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
     for coefficient in SERVOS[:first]:
         found[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
-    found["no smoothing"] = unsmoothed(skill, settings)
+    found["no smoothing"], found[TRUTH] = unsmoothed(skill, settings), truth(skill, settings)
     return found
 
 
@@ -119,19 +121,21 @@ def sequences(options: Options, middle: Array) -> list[Moving]:
 _known: dict[str, Any] = {}
 
 
-def prepare(share: float) -> None:
+def prepare(share: float, arm: str) -> None:
     """Loads the skills and what follows by them, once in a process."""
+    settings = cell_of(arm)
     # a function of where hands are alone: then how the tool follows is the followers' doing
     skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
-    _known.update({which: (one, followers(one, share)) for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other))})
+    for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
+        _known[which] = one, settings, followers(one, settings, share)
 
 
 def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, which, hands = task
-    skill, by_name = _known[which]
-    target = targets(skill, hands.truth)
+    skill, settings, by_name = _known[which]
+    target = targets(skill, hands.truth, settings)
     return figures(name, replace(hands, group=hands.group + which), target, by_name[name](hands))
 
 
@@ -163,6 +167,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         top_speed=seen.top_speed,
         overshoot_mm=overshoot,
         settled_ms=settled,
+        joint_speeds=spectra.speeds(seen.tool, seen.joints),
     )
 
 
@@ -187,16 +192,16 @@ def _lag_ms(target: Array, tool: Array) -> float:
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """Follows all hands with all followers; returns the numbers for its JSON."""
-    prepare(options.share)
-    skill, by_name = _known[SHIPPED]
+    prepare(options.share, options.arm)
+    skill, _, by_name = _known[SHIPPED]
     if options.hands is not None:
         return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
-    tasks = [(name, SHIPPED, one) for name in by_name for one in hands]
+    tasks = [(name, SHIPPED, one) for name in by_name for one in hands if name != TRUTH or one.group == SMOOTH]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
     tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
     found = _measured(tasks, options)
-    table = {name: _summary([one for one in found if one.follower == name]) for name in by_name}
+    table = {name: _summary([one for one in found if one.follower == name]) for name in by_name if name != TRUTH}
     for name, groups in table.items():
         results.say(f"{name}: {_line(groups)}")
     floors = {
@@ -209,6 +214,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "by_follower": table,
         "by_person": _by_person(results, [one for one in found if math.isnan(one.overshoot_mm)]),
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
+        "joint_speeds_in_the_scene": _joint_speeds(found, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
     }
     draw_numbers(results, numbers)
@@ -237,14 +243,14 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
 
 def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Figures]:
     """The figures of all tasks, shared out over processes."""
-    begin = functools.partial(prepare, options.share)
+    begin = functools.partial(prepare, options.share, options.arm)
     return list(shared_out(measure, tasks, options.workers, prepare=begin, chunk=8))
 
 
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
     """The numbers of recorded hands: ours beside the chases."""
     hands = [one for one in hands if one.group in FLOOR_GROUPS]
-    names = [name for name in _known[SHIPPED][1] if name == "ours" or name.startswith("chase")]
+    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
     found = _measured([(name, SHIPPED, one) for name in names for one in hands], options)
     takes = Counter(one.person for one in hands if one.group == "clean")
     people = _by_person(results, found)
@@ -278,6 +284,13 @@ def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dic
         told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in out[group].items())
         results.say(f"{group}, ours / best chase: {told}")
     return out
+
+
+def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """By follower the joints' speeds by frequency, and the share that is ripple."""
+    rows = {one.follower: one.joint_speeds for one in found if one.group == SMOOTH and one.follower in names}
+    kinds = {name.partition(",")[0]: rows[name] for name in names}
+    return {kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()}
 
 
 def _pooled(rows: list[Figures], follower: str) -> float:
@@ -315,6 +328,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         panel.set_title("clean, 100 Hz" if group == "clean" else seen)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     results.figure(figure)
+    if "by_follower" in numbers:
+        spectra.draw(results, {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()})
 
 
 def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]) -> None:
@@ -333,18 +348,16 @@ def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[d
 
 
 def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
-    errors = [row[who] for row in rows.values() for who in ("ours", "chase")]
-    ends = (0.8 * min(errors), 1.3 * max(errors))
-    panel.plot(ends, ends, color=REFERENCE, lw=1, label="as well as the filter")
-    x, y = ([row[who] for row in rows.values()] for who in ("chase", "ours"))
-    panel.plot(x, y, "o", color=TOOL, ms=5, label="a person")
-    for name, row in rows.items():
-        panel.annotate(name, (row["chase"], row["ours"]), xytext=(4, -8), textcoords="offset points", fontsize=7)
-    panel.set(xscale="log", yscale="log", xlabel="best One-Euro filter and Ruckig, rms [mm]", ylabel="ours, rms [mm]")
-    ticks = [tick for tick in TICKS_MM if ends[0] <= tick <= ends[1]]
-    for axis in (panel.xaxis, panel.yaxis):
-        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+    names = sorted(rows, key=lambda name: rows[name]["chase"])
+    ours, chase = ([rows[name][who] for name in names] for who in ("ours", "chase"))
+    panel.hlines(range(len(names)), ours, chase, color="0.8", lw=2)
+    panel.plot(chase, range(len(names)), "s", color=ADAPTED, ms=5, label="the best One-Euro filter and Ruckig")
+    panel.plot(ours, range(len(names)), "o", color=TOOL, ms=6, label="ours")
+    panel.set(xscale="log", xlabel="error, rms [mm]")
+    panel.set_yticks(range(len(names)), names)
+    panel.set_xticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
+    panel.set_xticks([], minor=True)
+    panel.set_xlim(0.8 * min(ours), 1.2 * max(chase))
 
 
 def _record(results: Results, hands: Moving, seen: Followed) -> None:

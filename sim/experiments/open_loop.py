@@ -26,6 +26,7 @@ from sim.experiments.results import Array
 
 Law: TypeAlias = Callable[[Array], Array]
 """From hands (M, 6) [m] to tool (M, 3) [m]."""
+USUAL = Settings()
 
 
 def controller(skill: Skill, settings: Settings) -> Controller:
@@ -41,9 +42,9 @@ def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> NDArray[n
     return np.array(found)
 
 
-def targets(skill: Skill, hands: Array) -> Array:
+def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:
     """Where the service would lead the tool (T, 3) [m] for hands (T, 6) [m] that rest there."""
-    still, reach = np.zeros(3), Settings().reach
+    still, reach = np.zeros(3), settings.reach
     return np.array([clamp(at, still, still, box=skill.workspace, reach=reach).position for at in skill.mean(hands)])
 
 

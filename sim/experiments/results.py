@@ -53,7 +53,7 @@ class Options:
     group: Literal["tuning", "test"] = "test"  # of people, for `people`
     workers: int = 1  # processes
     share: float = 1.0  # of the full size, for a quick look
-    arm: str = "wam"  # of `faults`: one of the shipped, or a cell's settings
+    arm: str = "wam"  # of `faults` and `motion`: one of the shipped, or a cell's settings
 
 
 @dataclass
