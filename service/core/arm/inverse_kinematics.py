@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.least_squares import factorise, least_squares, solve, substitute
+from service.core.arm.least_squares import factorise, solve, substitute
 from service.core.frame import Records, Vector
 from service.core.geometry import quaternion_of, swing, turn_between
 
@@ -197,7 +197,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     for j in range(joints):
         bounds[1, j] = arm.acceleration[j] / scale[j]
         bounds[0, j] = -bounds[1, j]
-    least_squares(scaled, wanted, home, damping, bounds, out[1])
+    solve(scaled, wanted, home, damping, bounds, rows[:0], limits[:0], out[1])
     for j in range(joints):
         velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
         for order in range(2):
