@@ -18,7 +18,7 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from service.config import Settings, robot_description
 from service.contract.records import SIDES, Flag
 from service.core.arm.arm import Arm, Closing
-from service.core.frame import Tick, Vector
+from service.core.frame import Event, Tick, Vector
 from service.core.limiter.limiter import Limiter
 from service.core.separation.clearance import FARTHEST
 from service.core.skill.skill import Skill
@@ -27,7 +27,8 @@ from sim.experiments.moving_hands import PERIOD_S, Moving
 from sim.experiments.open_loop import frames, targets
 from sim.experiments.results import Array
 
-SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it
+SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it ...
+RESTING_EVERY = 5  # ... which are seen every so many of them
 
 
 class Followed(NamedTuple):
@@ -69,21 +70,24 @@ def ours(skill: Skill, settings: Settings) -> Follower:
 
 
 def _ticks(hands: Moving) -> Iterator[Tick]:
-    """Hands that rest at their start, and then what the tracker says at each tick."""
-    at = np.ceil(hands.stamps / PERIOD_S - 1e-9).astype(int) + SETTLE_TICKS
-    next_sample = 0
-    for k in range(SETTLE_TICKS + len(hands.truth)):
-        inbox = []
-        positions = []
-        if k < SETTLE_TICKS and k % 5 == 0:
-            positions = [hands.truth[0]]
-        while next_sample < len(at) and at[next_sample] <= k:
-            positions = [hands.samples[next_sample]]
-            next_sample += 1
-        for position in positions:
-            for side, part in zip(SIDES, (position[:3], position[3:]), strict=True):
+    """Hands that rest at their start, and then what the tracker says, each tick what has come."""
+    count, resting = len(hands.stamps), np.arange(-SETTLE_TICKS, 0, RESTING_EVERY) * PERIOD_S
+    stamps = np.concatenate([resting, hands.stamps])
+    samples = np.vstack([np.tile(hands.truth[0], (len(resting), 1)), hands.samples])
+    late = np.zeros((len(stamps), 2))
+    if hands.late is not None:
+        late[:] = hands.late[np.arange(-len(resting), count) % count]
+        late[: len(resting)] = np.where(np.isinf(late[: len(resting)]), 0.0, late[: len(resting)])
+    inboxes: list[list[Event]] = [[] for _ in range(SETTLE_TICKS + len(hands.truth))]
+    for stamp, position, waits in zip(stamps, samples, late, strict=True):
+        for side, part, wait in zip(SIDES, (position[:3], position[3:]), waits, strict=True):
+            came = stamp + wait
+            at = SETTLE_TICKS + math.ceil(came / PERIOD_S - 1e-9) if came < math.inf else len(inboxes)
+            if at < len(inboxes):
                 x, y, z = part.tolist()
-                inbox.append(hand_event(side, (x, y, z), START_NS + k))
+                since_ns = round(1e9 * (stamp + SETTLE_TICKS * PERIOD_S))
+                inboxes[at].append(hand_event(side, (x, y, z), START_NS + since_ns))
+    for k, inbox in enumerate(inboxes):
         yield Tick(k, tuple(inbox))
 
 

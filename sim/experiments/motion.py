@@ -44,6 +44,7 @@ LABELS = {
 }
 TRUTH, SMOOTH = "truth", "minimum jerk"  # a follower for the group of which frequencies are shown
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+HARDER_GROUPS = ("late", "unseen")  # of clean hands: ours alone is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
@@ -248,7 +249,8 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
 
 
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
-    """The numbers of recorded hands: ours beside the chases."""
+    """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
+    harder = [("ours", SHIPPED, one) for one in hands if one.group in HARDER_GROUPS]
     hands = [one for one in hands if one.group in FLOOR_GROUPS]
     names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
     found = _measured([(name, SHIPPED, one) for name in names for one in hands], options)
@@ -263,7 +265,12 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
         lags = [one.lag_ms for one in found if one.follower == "ours" and one.group == group]
         together[group] = means | {"ratio": means["ours"] / means["chase"], "lag_ms": float(np.median(lags))}
         results.say(f"{group}, all: {', '.join(f'{name} {value:.2f}' for name, value in together[group].items())}")
-    numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together}
+    worse, of_harder = {}, _measured(harder, options)
+    for group in HARDER_GROUPS:
+        error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
+        worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
+        results.say(f"{group}, all: {error_mm:.2f} mm, {worse[group]['times_clean']:.2f} times clean")
+    numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together, "harder": worse}
     draw_numbers(results, numbers)
     return numbers
 

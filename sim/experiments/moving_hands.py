@@ -10,7 +10,7 @@ their truth is the recording without what is too fast for a wrist.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # below this rate a tracker is 
 CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # base from a camera's x right, y down
 MOST_SPEED = 1.0  # [m/s] 99th percentile of a hand: faster motion is made smaller
 STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
+MOST_LATE_S = 0.06  # of a wireless tracker's samples
+UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # shares of a recording at which one hand is not seen, for so long
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Moving:
     stamps: Array
     samples: Array
     stop_s: float = math.nan  # when a sudden stop begins
+    late: Array | None = None  # (M, 2) [s] by which each hand's samples come; inf: they never do
 
     @property
     def person(self) -> str:
@@ -48,7 +51,9 @@ class Moving:
 
 
 def recorded(folder: Path, middle: Array) -> list[Moving]:
-    """Each recording of a folder, clean, as it is, and seen at 30 Hz. Raises ExperimentError."""
+    """Each recording of a folder: clean, as it is, seen at 30 Hz; and clean, but late, or with one
+    hand out of sight twice. Raises ExperimentError.
+    """
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise ExperimentError(f"no recorded hands in {folder}: .npz files with time_s, left and right needed")
@@ -80,11 +85,24 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
         stamps = np.arange(0.0, t[-1] - PERIOD_S, 1 / rate_hz)
         return Moving(name, group, fine, stamps, spline(stamps) + noise * random.standard_normal((len(stamps), 6)))
 
+    clean = seen("clean", 100, 0.0005)
     return [
-        seen("clean", 100, 0.0005),
+        clean,
         Moving(name, "recorded", fine, t, middle + scale * hands),
         seen("30 Hz, 2 mm", 30, 0.002),
+        replace(clean, group="late", late=random.uniform(0.0, MOST_LATE_S, (len(clean.stamps), 2))),
+        replace(clean, group="unseen", late=_unseen(clean.stamps, random)),
     ]
+
+
+def _unseen(stamps: Array, random: np.random.Generator) -> Array:
+    """Lateness (M, 2) of samples of which one hand's are missing, twice."""
+    late = np.zeros((len(stamps), 2))
+    for share in UNSEEN_AT:
+        begin = stamps[-1] * (share + random.uniform(-0.1, 0.1))
+        away = (stamps >= begin) & (stamps < begin + random.uniform(*UNSEEN_S))
+        late[away, random.integers(2)] = np.inf
+    return late
 
 
 def _seen(t: Array, hand: Array) -> Array:

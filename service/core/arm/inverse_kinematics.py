@@ -21,6 +21,7 @@ POSTURE_GAIN = 1.0  # [1/s]
 POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
 FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
 FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
+IDLE_BRAKE = 0.5  # of the joints' acceleration, with which motion ends that neither moves the tool nor turns it
 ROUNDING = 1e-12  # of a speed
 ROUND_TO = 1e9  # [s/rad], [s²/rad] of the result: machines that differ in the last bits agree
 SPEED = 1  # flag of a step: a joint's speed limit was met
@@ -188,7 +189,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     if not near:  # it turns as far as costs its position nothing
         free = np.empty(joints)
         for j in range(joints):
-            home[j] = goal.moving[j] / scale[j]
+            brake = IDLE_BRAKE * arm.period_s * arm.acceleration[j]
+            home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not kept:  # what keeps distances was found for this solution, not for one on the way to it
             _turn_less(arms, goals, velocity, free)

@@ -37,6 +37,7 @@ STATE = (
     Field("mode_probabilities", "float64", (2, MODES)),
     Field("noise_variance", "float64", (2,)),  # of each hand's samples, each axis [m²]
     Field("sample_interval_s", "float64", (2,)),
+    Field("response_s", "float64"),  # in which the estimator follows a change of motion
     Field("past_samples", "float64", (2, 3, 3)),  # newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),
     Field("kept_means", "float64", (2, KEPT, MODES, STATES, 3)),  # the filter when each was taken, in all its parts

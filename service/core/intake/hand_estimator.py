@@ -21,7 +21,7 @@ from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.intake import KEPT, MODES
 from service.core.intake.mode_filter import advance, start, update
-from service.core.intake.motion_model import model
+from service.core.intake.motion_model import CHANGE, INTENSITY, model
 
 LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
 FALL_S = 0.03  # in which it is still no more
@@ -77,8 +77,8 @@ ALONE_S = 1.0  # since the sample before one that has none: longer than samples 
 class HandEstimator:
     """The estimates of both hands, in the state's arrays."""
 
-    def __init__(self, hands: HandSettings, period_s: float) -> None:
-        self._hands, self._period_s = hands, period_s
+    def __init__(self, hands: HandSettings, period_s: float, models: Records) -> None:
+        self._hands, self._period_s, self._models = hands, period_s, models
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
@@ -95,7 +95,7 @@ class HandEstimator:
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Moves both hands on by some ticks; one that is not seen stands still."""
-        _advance_both(as_array(state), stale_ticks, self._model(ticks))
+        _advance_both(as_array(state), stale_ticks, self._model(ticks), self._models, self._period_s)
 
 
 @compiled
@@ -127,13 +127,14 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
-    state, over = states[0], models[0]
+def _advance_both(states: Records, stale_ticks: int, one: Records, models: Records, period_s: float) -> None:
+    state, over = states[0], one[0]
+    state.response_s = _response_s(states, period_s)
     for side in range(2):
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
             advance(state.mode_means[side], state.mode_covariances[side], over.transition, over.noise)
-            combine(state.mode_means[side], state.mode_probabilities[side], hand)
+            look_ahead(states, models, side)
         else:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
@@ -142,13 +143,18 @@ def _advance_both(states: Records, stale_ticks: int, models: Records) -> None:
 
 
 @compiled
-def combine(means: Vector, modes: Vector, estimate: Vector) -> None:
-    """The estimate (3, 3): position, velocity and acceleration, by axis."""
+def look_ahead(states: Records, models: Records, side: int) -> None:
+    """Into the state's estimate (3, 3) where a hand is by now, by its newest sample."""
+    state, estimate = states[0], states[0].hands[side]
+    at = slot(states, side, 0)
+    means, modes = state.kept_means[side, at], state.kept_probabilities[side, at]
+    onward = models[min(state.tick - state.kept_ticks[side, at], len(models) - 1)].onward
     for row in range(3):
         for axis in range(3):
             total = 0.0
             for mode in range(MODES):
-                total += modes[mode] * means[mode, row, axis]
+                for k in range(3):
+                    total += modes[mode] * onward[mode, row, k] * means[mode, k, axis]
             estimate[row, axis] = total
 
 
@@ -157,6 +163,21 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
     """Whether a hand has been seen, and lately enough."""
     seen = states[0].hand_ticks[side]
     return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
+
+
+@compiled
+def _response_s(states: Records, period_s: float) -> float:
+    """In which time the filter follows a change of motion, of the hand that its tracker shows worse
+    [s]: for a Wiener process of jerk, (noise variance x interval / intensity)^(1/6).
+    """
+    state, slowest = states[0], 0.0
+    for side in range(2):
+        more = max(state.kept[side] - 1, 0)  # of them, so that an interval in which one is late counts little
+        if more > 0:
+            passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
+            each_s = min(passed * period_s / more, LATE_S)
+            slowest = max(slowest, state.noise_variance[side] * each_s / INTENSITY[CHANGE])
+    return float(np.rint(slowest ** (1.0 / 6.0) * ROUND_TO) / ROUND_TO)
 
 
 @compiled
@@ -240,7 +261,14 @@ def order_of(states: Records, side: int, stamp_ns: int) -> int:
 
 @compiled
 def take(
-    states: Records, parameters: Records, side: int, stamp_ns: int, position: Vector, restarts: bool, fresh: bool
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    stamp_ns: int,
+    position: Vector,
+    restarts: bool,
+    fresh: bool,
 ) -> None:
     """Filters in a sample (3,) [m] of one hand that is the newest and was made now; with one that
     `restarts`, or of a hand that was not `fresh`, the filter begins anew.
@@ -255,7 +283,7 @@ def take(
     state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
     state.kept_positions[side, at] = position
     filter_in(states, side, at, ALONE_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
-    combine(state.mode_means[side], state.mode_probabilities[side], state.hands[side])
+    look_ahead(states, models, side)
 
 
 @compiled

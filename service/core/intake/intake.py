@@ -29,7 +29,15 @@ from service.core.intake.arm_samples import (
     compared,
     still_ticks,
 )
-from service.core.intake.hand_estimator import LATE_S, HandEstimator, note_clock, order_of, take, ticks_late, turn_to
+from service.core.intake.hand_estimator import (
+    LATE_S,
+    HandEstimator,
+    note_clock,
+    order_of,
+    take,
+    ticks_late,
+    turn_to,
+)
 from service.core.intake.late_samples import expected, take_late, tick_made
 from service.core.intake.motion_model import models
 from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
@@ -113,7 +121,7 @@ class Intake:
         self._maps_base = hands.frame in ("", BASE)
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
-        self._estimator = HandEstimator(hands, settings.period_s)
+        self._estimator = HandEstimator(hands, settings.period_s, self._models)
 
     def begin(self, state: Record) -> None:
         """Sets in a state of zeros what no sample has reported yet."""
@@ -346,7 +354,7 @@ def _take_hand(
         state.rejected[cause] += 1
         return cause
     if order == 0 and made == state.tick:
-        take(states, parameters, side, stamp_ns, in_base, jumped, fresh)
+        take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
     else:
         note_clock(states, side, stamp_ns, period_s, fresh)
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)

@@ -20,8 +20,8 @@ from service.core.intake.hand_estimator import (
     ALONE_S,
     BELIEVED,
     ROUNDED,
-    combine,
     filter_in,
+    look_ahead,
     order_of,
     seconds_after,
     slot,
@@ -119,7 +119,7 @@ def take_late(
         filter_in(states, side, at, ALONE_S if first else ticks * given.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _move_on(means, covariances, models, ticks)
-    combine(means, state.mode_probabilities[side], state.hands[side])
+    look_ahead(states, models, side)
 
 
 @compiled

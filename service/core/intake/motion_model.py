@@ -4,6 +4,9 @@ Acceleration and velocity revert to 0, and the tremor of one that rests is a dam
 
     dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
     dy = w dt    dw = -TREMOR_RATE² y dt - 2 TREMOR_DAMPING TREMOR_RATE w dt + ... dW
+
+Against that samples are weighed. For KEPT_ON_S after the newest one a hand in motion keeps its
+velocity, and its acceleration fades: that its motion will end would say too early that it does.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ REST, REACH, CHANGE = range(MODES)  # the modes
 INTENSITY = np.array([1e-6, 1.0, 30.0])  # [m²/s⁵] of the modes
 REVERT_A = np.array([10.0, 14.0, 14.0])  # [1/s] of the acceleration
 REVERT_V = np.array([0.3, 95.0, 95.0])  # [1/s²] of the velocity: slow hands go on, reaches end
+KEPT_ON_S = 0.04  # [s] since the newest sample, in which velocity is kept, and ...
+FADING = 5.0  # [1/s] ... acceleration fades so fast
 TREMOR = 3e-4  # [m] standard deviation, each axis: most people's; more is told from motion by its rhythm
 TREMOR_RATE = 2.0 * math.pi * 10.0  # [1/s] people's is of 8 to 12 Hz ...
 TREMOR_DAMPING = 0.25  # ... each of its own
@@ -28,10 +33,16 @@ TREMOR_DAMPING = 0.25  # ... each of its own
 
 @functools.cache
 def models(period_s: float, count: int) -> Records:
-    """A `transition` and a process `noise` each, of all modes, over 0 to count - 1 periods."""
-    out = structured(count, [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")])
+    """A `transition` and a process `noise` each, of all modes, over 0 to count - 1 periods; and
+    `onward`, the motion since the newest sample.
+    """
+    kinds = [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")]
+    out = structured(count, [*kinds, ("onward", np.float64, (MODES, 3, 3))])
     for ticks, one in enumerate(out):
         one["transition"], one["noise"] = model(ticks * period_s)
+        kept_on_s = min(ticks * period_s, KEPT_ON_S)
+        one["onward"] = model(ticks * period_s - kept_on_s)[0][:, :3, :3] @ _over(_motion(0.0, FADING), kept_on_s)[0]
+        one["onward"][REST] = one["transition"][REST, :3, :3]
     return out
 
 
@@ -39,14 +50,19 @@ def model(interval_s: float) -> tuple[Vector, Vector]:
     """Transitions and process noise (MODES, STATES, STATES) of the modes over an interval."""
     transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
     for mode in (REST, REACH):
-        dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -REVERT_V[mode], -REVERT_A[mode]]])
-        transition[mode, motion, motion], noise[mode, motion, motion] = _over(dynamics, interval_s)
+        moves = _motion(REVERT_V[mode], REVERT_A[mode])
+        transition[mode, motion, motion], noise[mode, motion, motion] = _over(moves, interval_s)
     transition[CHANGE], noise[CHANGE] = transition[REACH], noise[REACH]
     noise *= INTENSITY[:, None, None]
     dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE]])
     transition[REST, tremor, tremor], driven = _over(dynamics, interval_s)
     noise[REST, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE**3 * TREMOR**2 * driven
     return transition, noise
+
+
+def _motion(revert_v: float, revert_a: float) -> Vector:
+    """How position, velocity and acceleration change (3, 3)."""
+    return np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -revert_v, -revert_a]])
 
 
 def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:

@@ -105,7 +105,7 @@ class Limiter:
         """As `step`, by velocities between those now and those wanted: an inequality that both keep
         is kept on the way. None where the joints' accelerations do not allow for that.
         """
-        share = _common_share(np.stack((q, dq, ddq)), velocity, self._parameters)
+        share = _common_share(np.stack((q, dq, ddq, velocity)), self._parameters)
         return self.step(q, dq, ddq, dq + share * (velocity - dq)) if share >= 0.0 else None
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
@@ -220,14 +220,14 @@ def _forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
 
 
 @compiled
-def _common_share(state: Vector, velocity: Vector, parameters: Records) -> float:
-    """The greatest share of the way to the wanted velocities (J,) that all joints can go in a tick
-    without passing these, as their acceleration comes to 0; -1 where there is none.
+def _common_share(state: Vector, parameters: Records) -> float:
+    """The greatest share of the way to the wanted velocities, the last row of state (4, J), that
+    all joints can go in a tick without passing these, as their acceleration comes to 0; -1: none.
     """
     given, least, most = parameters[0], 0.0, 1.0
     dt = given.period_s
-    for i in range(len(velocity)):
-        way, change = velocity[i] - state[1, i], INSIDE * dt * given.max_jerk[i]
+    for i in range(state.shape[1]):
+        way, change = state[3, i] - state[1, i], INSIDE * dt * given.max_jerk[i]
         a = state[2, i] if way >= 0.0 else -state[2, i]
         way = max(abs(way), LEAST_CHANGE)
         least = max(least, (a - change) * dt / way)

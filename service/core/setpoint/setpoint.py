@@ -2,11 +2,12 @@
 time.
 
 The setpoint is led by a linear-quadratic tracker whose input is jerk: it minimises the integral of
-error² + weight jerk². Along its motion that jerk is bounded so that the setpoint can stop, within
-its limits, where the hands would stop at the soonest (a discrete control barrier function; Agrawal
-and Sreenath, RSS 2017). A step is taken only if the stop after it keeps every limit; else the stop,
-which the step before had made sure of, begins now. So the limits hold by induction, whatever the
-target does:
+error² + weight jerk². Along its motion that jerk is bounded twice (discrete control barrier
+functions; Agrawal and Sreenath, RSS 2017). The setpoint can stop, within its limits, where the
+hands would stop at the soonest; the later, the later their tracker shows that they do. And it can
+come to the target's own speed before it passes that. A step is taken only if the stop after it
+keeps every limit; else the stop, which the step before had made sure of, begins now. So the limits
+hold by induction, whatever the target does:
 
 * speed, acceleration and jerk at most `max_speed`, `max_acceleration` and `max_jerk`, as norms;
 * never outside the box of the workspace, nor farther than HULL_MARGIN from the box around the last
@@ -17,6 +18,7 @@ target does:
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
@@ -27,34 +29,29 @@ from service.core.arm.inverse_kinematics import joint_costs
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import (
-    BOUNDS,
-    HULL_TIME_S,
-    bounds_around,
-    stop_distance,
-    take_safe,
-    what_is_wrong,
-)
+from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, bounds_around, stop_distance, take_safe, what_is_wrong
 from service.core.setpoint.tracker import GAP_WIDE, gains_for, waiting
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import decided
 
-ROOM = 0.0014  # [m] by which the setpoint's stop may pass the hands'
-STOP_TIME = 0.009  # [s] times the target's speed: no hand stops at once
+Pair: TypeAlias = tuple[float, float]
+ROOM = 0.0012  # [m] by which the setpoint's stop may pass the hands'
+STOP_TIME = 0.0115  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
-FORESEEN = 0.12  # [s] a target that brakes is taken to be slower by its deceleration times this
+FORESEEN = 0.11  # [s] a target that brakes is taken to be slower by its deceleration times this
+PROMPT_S = 0.0235  # response time of the estimator for the trackers on which these were chosen ...
+LATE_SHARE = 2.2  # ... and of what another one's is longer, by so much later a stop is seen
+MEETING_ROOM = 0.002  # [m] by which the setpoint may pass its target as it comes to the target's speed ...
+MEETING_SHARE, LEAST_MEETING = 0.4, 0.15  # ... of its braking, less what the target brakes; but so much at least
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
 BARRIER_RATE = 100.0  # [1/s] at which the room left may be used up ...
 BARRIER_TIME = 0.0035  # [s] ... and of it in a tick this by the period at most: in long ticks planning misses more
 SHARE = 0.95  # of acceleration and jerk that is planned with
 SPEED_SHARE = 0.97  # of speed, likewise
 LEAST_SPEED = 1e-3  # [m/s] below it no motion has a direction
-GAP_FREE = 0.003  # [m] a tool so far behind its setpoint slows it ...
-GAP_SLOW = 0.012  # [m] ... more so by every so far
-PLANNED = 1  # a step met a bound in planning
-STOPPED = 2  # the stop was begun
-WRONG = 3  # a bound was passed
+GAP_FREE, GAP_SLOW = 0.003, 0.012  # [m] a tool so far behind its setpoint slows it, more so by every so far
+PLANNED, STOPPED, WRONG = 1, 2, 3  # a step met a bound in planning; began the stop; passed a bound
 
 
 class SetpointGenerator:
@@ -95,10 +92,7 @@ class SetpointGenerator:
         return int(_lead(as_array(state), *motion, self._parameters, box, costs, slow))
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
-        """What of its bounds a setpoint passed in the step from `before` (3, 3); empty: none.
-
-        They hold by the way a step is made; this looks again, from outside.
-        """
+        """What of its bounds a setpoint passed since `before` (3, 3), seen from outside."""
         return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
 
 
@@ -135,7 +129,8 @@ def _lead(
     target[0], target[1], target[2] = position, velocity, acceleration
     state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
     jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
-    met = _track(setpoint, target, parameters, costs, slow, jerk)
+    late_s = LATE_SHARE * max(0.0, state.response_s - PROMPT_S)
+    met = _track(setpoint, target, parameters, costs, slow, late_s, jerk)
     for i in range(3):
         x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
@@ -150,9 +145,11 @@ def _lead(
 
 
 @compiled
-def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, jerk: Vector) -> int:
-    """The tracker's jerk (3,), less of it along the motion where the stop or the speed asks for
-    that.
+def _track(
+    setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, late_s: float, jerk: Vector
+) -> int:
+    """The tracker's jerk (3,), less of it along the motion where the stop, the target's speed or
+    the greatest one asks for that. A stop of the hands is seen `late_s` later than by most.
     """
     given = parameters[0]
     gains, dt = given.gains, given.period_s
@@ -181,21 +178,19 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
     change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
-    way += ROOM + given.stop_room * (STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE))
-    # what is left of the room for a stop shrinks at BARRIER_RATE at most; linear between most and
-    # least jerk
-    used = min(BARRIER_RATE * dt, BARRIER_TIME / dt)
-    left = way - stop_distance(speed, a, brake, change)
-    limit = way + min(coming, speed) * dt - (1.0 - used) * left
+    room = ROOM - late_s * speed
+    room += given.stop_room * (STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE))
     # with less jerk than the lowest it would brake on after it rests, and swing back
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = _between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
-    v_u, v_d = max(speed + dt * (a + 0.5 * dt * u), 0.0), max(speed + dt * (a + 0.5 * dt * lowest), 0.0)
-    most = stop_distance(v_u, a + u * dt, brake, change) + speed * dt
-    least = stop_distance(v_d, a + lowest * dt, brake, change) + speed * dt
-    chosen = _between(u, lowest, most, least, limit)
-    # so does what is left to the greatest speed
-    limit = top - (1.0 - used) * (top - now)
+    # what is left of a room shrinks at BARRIER_RATE at most
+    kept = 1.0 - min(BARRIER_RATE * dt, BARRIER_TIME / dt)
+    chosen = _stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
+    faster, a_faster = speed - v_target, a - a_target
+    if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
+        meeting = max(MEETING_SHARE * brake + min(a_target, 0.0), LEAST_MEETING * brake)
+        chosen = _stopping(way + MEETING_ROOM, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), kept, dt)
+    limit = top - kept * (top - now)
     most = _coasting(speed, a, chosen, change, dt)
     chosen = _between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
     if chosen >= u:
@@ -204,6 +199,18 @@ def _track(setpoint: Vector, target: Vector, parameters: Records, costs: Vector,
         jerk[i] += (chosen - u) * along[i]
     _limit_jerk(jerk, setpoint[2], parameters, costs)
     return PLANNED
+
+
+@compiled
+def _stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: Pair, kept: float, dt: float) -> float:
+    """The greatest jerk, from the wanted to the lowest of `jerks`, after which a stop by `brakes`
+    [m/s², m/s³] is `kept` this share of its room, on a way [m] that grows by what `comes`.
+    """
+    (brake, change), (wanted, lowest) = brakes, jerks
+    limit = way + comes - kept * (way - stop_distance(v, a, brake, change))
+    most = stop_distance(max(v + dt * (a + 0.5 * dt * wanted), 0.0), a + wanted * dt, brake, change) + v * dt
+    least = stop_distance(max(v + dt * (a + 0.5 * dt * lowest), 0.0), a + lowest * dt, brake, change) + v * dt
+    return _between(wanted, lowest, most, least, limit)
 
 
 @compiled
@@ -292,13 +299,7 @@ class OrientationSetpoint:
 
 
 @compiled
-def _turn(
-    quaternion: Vector,
-    turning: Vector,
-    target: Vector,
-    target_turning: Vector,
-    parameters: Records,
-) -> None:
+def _turn(quaternion: Vector, turning: Vector, target: Vector, target_turning: Vector, parameters: Records) -> None:
     """One period, in place."""
     given, dt = parameters[0], parameters[0].period_s
     error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
