@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pytest
 
+from sim.experiments.moving_hands import MOST_LATE_S, UNSEEN_S
 from support.told_numbers import NUMBER, WORDS, AtMost, Source, blocks, of, result, wrong
 
 
@@ -296,7 +297,11 @@ SOURCES: dict[str, list[Source]] = {
         for one in result("motion-of-others")["takes"]
     },
     "All together, ours errs": [
-        of(f"motion-of-others/all/{group}/{what}") for group in ("clean", "recorded") for what in ("ours", "ratio")
+        *(of(f"motion-of-others/all/{group}/{what}") for group in ("clean", "recorded") for what in ("ours", "ratio")),
+        1000 * MOST_LATE_S,
+        *(of(f"motion-of-others/harder/late/{what}") for what in ("ours", "times_clean")),
+        *(1000 * share for share in UNSEEN_S),
+        of("motion-of-others/harder/unseen/ours"),
     ],
     "After a sudden stop": [
         *(of(f"motion/by_follower/ours/sudden stops/overshoot_{key}_mm") for key in ("mean", "worst")),
@@ -325,7 +330,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/scenes"),
         of("separation/random/closest_of_shapes_mm/least"),
     ],
-    "In 94 of these": [
+    "In 97 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
         of("separation/thrust/above_after_reaction"),
         of("separation/thrust/excess_after_reaction"),

@@ -38,6 +38,17 @@ def test_a_hand_moves_in_each_tick_between_its_samples() -> None:
     assert (moving > 0).all()
 
 
+def test_a_hand_that_goes_evenly_is_not_taken_to_slow_down_where_a_sample_is_late() -> None:
+    """In the 60 ms after the newest one: as one that is about to end it would lose a third."""
+    hands = Hands()
+    follow(hands, lambda t: np.array([0.3 * t, 0.0, 0.2]), until_s=1.0)
+    speeds = []
+    for _ in range(30):
+        hands.intake.advance(hands.state, 1)
+        speeds.append(float(hands.state["hands"][LEFT, 1, 0]))
+    assert min(speeds) > 0.8 * speeds[0] > 0.2
+
+
 @pytest.mark.parametrize("noise_m", [0.0005, 0.002, 0.005])
 def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
     noise = np.random.default_rng(1).normal(0.0, noise_m, (600, 3))

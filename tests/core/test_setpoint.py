@@ -328,6 +328,39 @@ def test_a_target_that_moves_steadily_is_followed_close() -> None:
     assert np.abs(states[-200:, 2]).max() < 1e-3
 
 
+@pytest.mark.parametrize(("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)])
+def test_a_target_that_goes_to_and_fro_faster_than_the_arm_can_is_still_met(
+    brake: float, hz: float, most_m: float
+) -> None:
+    """Without a stop planned before the target's own speed it would run 120 to 200 mm off."""
+    costs, rate, far = FREE.copy(), 2.0 * np.pi * hz, np.array([0.12 if hz < 1.5 else 0.08, 0.0, 0.0])
+    costs[1, :, 0] = 1.0 / brake
+    phases = rate * PERIOD_S * np.arange(2000)
+    targets = [
+        np.array([MIDDLE + far * np.sin(at), rate * far * np.cos(at), -(rate**2) * far * np.sin(at)]) for at in phases
+    ]
+    states, _ = driven(targets, costs=costs)
+    off = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
+    assert off[700:].max() < most_m
+
+
+def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
+    """Of a target that stops at once, from 0.4 m/s."""
+    velocity, passed = np.array([0.4, 0.0, 0.0]), []
+    for response_s in (0.0235, 0.04):
+        generator, state, farthest = SetpointGenerator(Settings()), blank(STATE), 0.0
+        generator.begin(state, at_rest(MIDDLE))
+        state["response_s"] = response_s
+        for k in range(700):
+            here = MIDDLE + velocity * min(k, 300) * PERIOD_S
+            target = Target(here, velocity * (k < 300), np.zeros(3), clamped=False)
+            generator.step(state, target, BOX, FREE, 1.0)
+            farthest = max(farthest, float(state["setpoint"][0, 0] - here[0]))
+        passed.append(farthest)
+    assert passed[0] > 0.005
+    assert passed[1] < 0.001
+
+
 def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:
     states, said = driven([at_rest(MIDDLE)] * 100)
     np.testing.assert_array_equal(states, np.broadcast_to(states[0], states.shape))
