@@ -29,7 +29,7 @@ from service.core.separation.clearance import FARTHEST, ITSELF, NOBODY, PEOPLE, 
 
 TABLE_DEPTH = 1.0  # [m] below its top, nothing is free
 PEOPLE_ROOM = 0.01  # [m] from people, kept more where motion is planned
-THINGS_ROOM = 0.008  # [m] from things, likewise
+THINGS_ROOM = 0.01  # [m] from things, likewise
 PLAN_SHARE = 0.8  # of the braking that is planned with: its ramps need the rest
 PLAN_BRAKE = np.array(
     [1.0, 0.5, 0.5]
