@@ -77,7 +77,7 @@ def capsule_around(points: Points) -> tuple[float, ...]:
         return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max())
 
     def cost(ends: Points) -> float:  # volume times radius
-        r = radius(ends)
+        r = radius(ends) + 10.0**-ROUNDED  # at 0, on a line, no length would cost anything
         return r * r * r * float(np.linalg.norm(ends[3:] - ends[:3]) + 4.0 / 3.0 * r)
 
     middle = points.mean(axis=0)
