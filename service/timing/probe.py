@@ -95,8 +95,9 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
 
 
 def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
-    """Both hands [m] at a time [s], about the mean of the skill's inputs."""
-    middle = skill.hands.mean(axis=0).tolist()
+    """Both hands [m] at a time [s], about those demonstrated that are nearest to their mean."""
+    hands = skill.hands
+    middle = hands[((hands - hands.mean(axis=0)) ** 2).sum(axis=1).argmin()].tolist()
     x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 
