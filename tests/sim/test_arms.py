@@ -92,6 +92,20 @@ def test_the_franka_cell_keeps_the_makers_velocity_limits_everywhere() -> None:
         assert (slowest >= low).all(), (q, slowest, low)
 
 
+def test_the_ur5_cell_asks_for_less_than_half_of_its_motors_torque() -> None:
+    """All joints at full speed and acceleration at once, each the worse way round, about the posture."""
+    cell = cell_of("ur5")
+    model = pin.buildModelFromXML(robot_description(cell))
+    data, rng = model.createData(), np.random.default_rng(0)
+    for _ in range(300):
+        q = np.array(cell.arm.posture) + rng.uniform(-0.5, 0.5, model.nv)
+        velocity = np.array(cell.joints.velocity) * rng.choice([-1.0, 1.0], model.nv)
+        inertia = pin.crba(model, data, q)
+        inertia = np.triu(inertia) + np.triu(inertia, 1).T
+        torque = np.abs(inertia) @ cell.joints.acceleration + np.abs(pin.nonLinearEffects(model, data, q, velocity))
+        assert (torque < 0.5 * model.effortLimit).all(), torque
+
+
 # --- descriptions ---------------------------------------------------------------------------------
 
 

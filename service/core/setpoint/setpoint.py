@@ -41,7 +41,8 @@ STOP_TIME = 0.0115  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
 FORESEEN = 0.11  # [s] a target that brakes is taken to be slower by its deceleration times this
 PROMPT_S = 0.0285  # response time of the estimator that a good tracker at 30 Hz or more does not reach ...
-LATE_SHARE = 3.8  # ... and of what another one's is longer, by so much later a stop is taken to be seen
+LATE_SHARE = 4.0  # ... and of what another one's is longer, by so much later a stop is taken to be seen ...
+LATE_MOST = 0.008  # [m] ... but for no more way than this: all motion lags by that
 MEETING_ROOM = 0.004  # [m] by which the setpoint may pass its target as it comes to the target's speed ...
 MEETING_SHARE, LEAST_MEETING = 0.5, 0.15  # ... of its braking, less what the target brakes; but so much at least
 STOP_ERROR = 0.03  # [m] at which the tracker asks for a planned stop's jerk: what is braked harder swings
@@ -178,7 +179,7 @@ def _track(
     change = min(change, STOP_ERROR * gains[0])
     top = slow * SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     coming = max(0.0, v_target + FORESEEN * min(a_target, 0.0))
-    room = ROOM - late_s * speed
+    room = ROOM - min(late_s * speed, LATE_MOST)
     room += given.stop_room * (STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE))
     # with less jerk than the lowest it would brake on after it rests, and swing back
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
