@@ -1,10 +1,9 @@
-"""The setpoint: bounds that hold whatever the target does, planned stops, and smoothness."""
+"""The setpoint: bounds that hold whatever the target does; how it follows: test_following."""
 
 from __future__ import annotations
 
 import itertools
 
-import msgspec
 import numpy as np
 import pytest
 import ruckig
@@ -13,9 +12,7 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.config import Settings, ToolSettings
-from service.contract.messages import PoseStamped
 from service.core.frame import Vector, blank, copied
-from service.core.intake.intake import Intake
 from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_TIME_S,
@@ -24,51 +21,18 @@ from service.core.setpoint.bounds import (
     speed_to_come,
     stop_distance,
 )
-from service.core.setpoint.setpoint import LATE_MOST, SetpointGenerator, slow_down
-from service.core.setpoint.tracker import tracker_gains, waiting
+from service.core.setpoint.setpoint import SetpointGenerator, slow_down
+from service.core.setpoint.tracker import waiting
 from service.core.skill.model import Target
 from support.explained import Explained, margin
+from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE
 
-PERIOD_S = 0.002
-TOOL = ToolSettings()
-BOX = np.array([[0.2, -0.6, 0.05], [1.0, 0.6, 0.8]])
-MIDDLE = np.array([0.6, 0.0, 0.4])
-FREE = np.zeros((3, 3, 7))  # no joint limits
 WAY_TICKS = round(2.0 / PERIOD_S)  # to come from anywhere to where the targets have gone
 properties = example_settings(max_examples=60, deadline=None, derandomize=True)
 inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
 moving = st.tuples(*(st.floats(-20.0, 20.0),) * 3)
 wild = st.tuples(*(st.floats(-1e4, 1e4),) * 3)
-
-
-def at_rest(position: Vector | tuple[float, ...]) -> Vector:
-    """A motion (3, 3) that stands still at a position."""
-    return np.array([position, (0.0,) * 3, (0.0,) * 3])
-
-
-def driven(
-    targets: list[Vector],
-    *,
-    start: Vector | None = None,
-    tool: ToolSettings = TOOL,
-    costs: Vector = FREE,
-    slow: float = 1.0,
-    rate_hz: int = 500,
-) -> tuple[Vector, Vector]:
-    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
-
-    In each step the bounds are looked at from outside.
-    """
-    generator, state = Explained(Settings(tool=tool, rate_hz=rate_hz)), blank(STATE)
-    generator.begin(state, at_rest(targets[0][0]) if start is None else start)
-    out, said = [state["setpoint"].copy()], []
-    for target in targets:
-        before = state["setpoint"].copy()
-        said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
-        assert generator.why_wrong(state, before, BOX) == ""
-        out.append(state["setpoint"].copy())
-    return np.array(out), np.array(said)
 
 
 def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings = TOOL) -> None:
@@ -248,157 +212,6 @@ def ruckig_stop(velocity: float, acceleration: float, max_acceleration: float, m
 def test_the_way_of_a_stop_is_that_of_the_fastest_one(speed: float, acceleration: float) -> None:
     profile = ruckig_stop(speed, acceleration, 4.0, 200.0)
     assert stop_distance(speed, acceleration, 4.0, 200.0) == pytest.approx(profile.position_extrema[0].max, abs=1e-7)
-
-
-@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)])
-@pytest.mark.parametrize("distance_m", [0.01, 0.1, 0.3])
-def test_a_jump_is_approached_without_overshoot(direction: tuple[float, ...], distance_m: float) -> None:
-    way = distance_m * np.array(direction) / np.linalg.norm(direction)
-    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 2000)
-    assert ((states[:, 0] - MIDDLE) @ way / distance_m).max() <= distance_m + 0.0025
-    np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
-
-
-def test_a_target_that_stops_at_once_is_overshot_by_millimetres() -> None:
-    velocity = np.array([0.3, -0.4, 0.0])
-    run = [np.array([MIDDLE + velocity * (k * PERIOD_S - 0.4), velocity, (0.0,) * 3]) for k in range(200)]
-    states, _ = driven([*run, *[at_rest(MIDDLE)] * 500])
-    assert ((states[:, 0] - MIDDLE) @ velocity / 0.5).max() < 0.02
-    assert np.linalg.norm(states[300:, 0] - MIDDLE, axis=1).max() < 0.02
-
-
-@pytest.mark.parametrize("speed", [0.2, 0.4, 0.6])
-@pytest.mark.parametrize(("acceleration", "jerk"), [(5.0, 120.0), (7.5, 170.0), (10.0, 231.0)])
-def test_after_a_hard_stop_it_does_not_swing_back(speed: float, acceleration: float, jerk: float) -> None:
-    costs, way = FREE.copy(), np.array([0.6, -0.8, 0.0])
-    for joint in range(3):
-        costs[1, joint, joint], costs[2, joint, joint] = 1 / acceleration, 1 / jerk
-    time_s = np.arange(-500, 400) * PERIOD_S
-    velocity = speed * np.clip(1.0 - time_s / 0.02, 0.0, 1.0)
-    position = np.cumsum(velocity[::-1])[::-1] * -PERIOD_S
-    braking = np.where((time_s > 0.0) & (time_s < 0.02), -speed / 0.02, 0.0)
-    targets = [
-        np.array([MIDDLE + way * x, way * v, way * a]) for x, v, a in zip(position, velocity, braking, strict=True)
-    ]
-    states, _ = driven(targets, costs=costs, start=np.array([targets[0][0], targets[0][1], (0.0,) * 3]))
-    past = ((states[:, 0] - MIDDLE) @ way)[500:]
-    after = past[past.argmax() :]
-    assert after.min() > -0.002
-    assert np.abs(after[100:]).max() < 0.001
-
-
-# --- quiet motion ------------------------------------------------------------
-
-
-@pytest.mark.parametrize("weight", [1e-7, 1e-6, 1e-5])
-@pytest.mark.parametrize("distance_m", [0.05, 0.25])
-def test_a_slow_tracker_comes_to_rest_too(weight: float, distance_m: float) -> None:
-    tool, there = msgspec.structs.replace(TOOL, jerk_weight=weight), MIDDLE + np.array([distance_m, 0.0, 0.0])
-    states, _ = driven([at_rest(there)] * 3000, start=at_rest(MIDDLE), tool=tool)
-    assert np.abs(states[-200:, 2]).max() < 1e-3
-    assert states[:, 0, 0].max() < there[0] + 0.005
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "max_jerk", "weight"),
-    [(500, 5.0, 2.8e-9), (500, 2.0, 1e-11), (250, 1.0, 1e-7), (100, 50.0, 1e-7), (50, 20.0, 1e-5)],
-)
-def test_whatever_its_jerk_and_the_loops_rate_it_comes_to_rest(rate_hz: int, max_jerk: float, weight: float) -> None:
-    tool = msgspec.structs.replace(TOOL, jerk_weight=weight, max_jerk=max_jerk)
-    for way in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
-        u = np.minimum(1.0, np.arange(12 * rate_hz) / (0.4 * rate_hz))[:, None]
-        reach = np.stack(
-            [
-                MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * way,
-                30 * u * u * (1 - u) ** 2 / 0.4 * way,
-                (60 * u - 180 * u * u + 120 * u**3) / 0.16 * way,
-            ],
-            axis=1,
-        )
-        states, _ = driven(list(reach), tool=tool, rate_hz=rate_hz)
-        assert np.abs(states[-rate_hz:, 2]).max() < 1e-3
-        np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
-
-
-def test_a_target_that_moves_steadily_is_followed_close() -> None:
-    velocity = np.array([0.1, -0.05, 0.03])
-    targets = [np.array([MIDDLE + velocity * k * PERIOD_S, velocity, (0.0,) * 3]) for k in range(1200)]
-    states, _ = driven(targets)
-    assert np.linalg.norm(states[-1, 0] - targets[-1][0]) < 0.012
-    assert np.abs(states[-200:, 2]).max() < 1e-3
-
-
-@pytest.mark.parametrize(("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)])
-def test_a_target_that_goes_to_and_fro_faster_than_the_arm_can_is_still_met(
-    brake: float, hz: float, most_m: float
-) -> None:
-    """Without a stop planned before the target's own speed it would run 120 to 200 mm off."""
-    costs, rate, far = FREE.copy(), 2.0 * np.pi * hz, np.array([0.12 if hz < 1.5 else 0.08, 0.0, 0.0])
-    costs[1, :, 0] = 1.0 / brake
-    phases = rate * PERIOD_S * np.arange(2000)
-    targets = [
-        np.array([MIDDLE + far * np.sin(at), rate * far * np.cos(at), -(rate**2) * far * np.sin(at)]) for at in phases
-    ]
-    states, _ = driven(targets, costs=costs)
-    off = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
-    assert off[700:].max() < most_m
-
-
-def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
-    """Of a target that stops at once, from 0.4 m/s; while it moves, the setpoint is LATE_MOST farther behind."""
-    velocity, passed, behind = np.array([0.4, 0.0, 0.0]), [], []
-    for response_s in (0.0235, 0.04):
-        generator, state, farthest = SetpointGenerator(Settings()), blank(STATE), 0.0
-        generator.begin(state, at_rest(MIDDLE))
-        state["response_s"] = response_s
-        for k in range(700):
-            here = MIDDLE + velocity * min(k, 300) * PERIOD_S
-            target = Target(here, velocity * (k < 300), np.zeros(3), clamped=False)
-            generator.step(state, target, BOX, FREE, 1.0)
-            farthest = max(farthest, float(state["setpoint"][0, 0] - here[0]))
-            if k == 299:
-                behind.append(float(here[0] - state["setpoint"][0, 0]))
-        passed.append(farthest)
-    assert passed[0] > 0.005
-    assert passed[1] < 0.002
-    assert behind[1] - behind[0] < LATE_MOST + 0.002
-
-
-def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:
-    states, said = driven([at_rest(MIDDLE)] * 100)
-    np.testing.assert_array_equal(states, np.broadcast_to(states[0], states.shape))
-    assert not said.any()
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_reach_that_a_noisy_tracker_sees_is_followed_smoothly(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    settings = Settings()
-    intake, generator, state = Intake(settings), SetpointGenerator(settings), blank(STATE)
-    intake.begin(state)
-    generator.begin(state, at_rest(MIDDLE))
-    setpoints, truth = [], []
-    for tick in range(1500):
-        intake.advance(state, 1)
-        u = min(max((tick * PERIOD_S - 0.5) / 1.5, 0.0), 1.0)
-        here = MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * np.array([0.2, -0.15, 0.1])
-        if tick % 5 == 0:
-            seen = (here + random.normal(0.0, 0.0005, 3)).tolist()
-            intake.take_hand(state, 0, PoseStamped(1 + tick, "base", tuple(seen), (0.0, 0.0, 0.0, 1.0)))
-        generator.step(state, Target(*state["hands"][0], clamped=False), BOX, FREE, 1.0)
-        setpoints.append(state["setpoint"].copy())
-        truth.append(here)
-    moved, asked = np.array(setpoints), np.array(truth)
-    assert np.sqrt(np.mean(np.sum((moved[:, 0] - asked) ** 2, axis=1))) < 0.008
-    needed = np.sqrt(np.mean(np.sum(np.gradient(np.gradient(asked, PERIOD_S, axis=0), PERIOD_S, axis=0) ** 2, axis=1)))
-    assert np.sqrt(np.mean(np.sum(moved[:, 2] ** 2, axis=1))) < 4 * needed
-
-
-def test_more_weight_on_jerk_makes_gains_smaller() -> None:
-    soft, hard = tracker_gains(1e-8), tracker_gains(1e-9)
-    assert (np.abs(soft[[0, 3, 4]]) < np.abs(hard[[0, 3, 4]])).all()
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"jerk_weight": 0.0}, ToolSettings)
 
 
 def test_the_speed_to_come_counts_what_an_acceleration_still_adds() -> None:

@@ -93,7 +93,7 @@ def test_the_franka_cell_keeps_the_makers_velocity_limits_everywhere() -> None:
 
 
 def test_the_ur5_cell_asks_for_less_than_half_of_its_motors_torque() -> None:
-    """All joints at full speed and acceleration at once, each the worse way round, about the posture."""
+    """All joints about the posture, at full speed and acceleration, each the worse way round."""
     cell = cell_of("ur5")
     model = pin.buildModelFromXML(robot_description(cell))
     data, rng = model.createData(), np.random.default_rng(0)

@@ -1,0 +1,46 @@
+"""Setpoints led by targets, looked at from outside in each step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.config import Settings, ToolSettings
+from service.core.frame import Vector, blank
+from service.core.skill.model import Target
+from support.explained import Explained
+from support.wam import STATE
+
+PERIOD_S = 0.002
+TOOL = ToolSettings()
+BOX = np.array([[0.2, -0.6, 0.05], [1.0, 0.6, 0.8]])
+MIDDLE = np.array([0.6, 0.0, 0.4])
+FREE = np.zeros((3, 3, 7))  # no joint limits
+
+
+def at_rest(position: Vector | tuple[float, ...]) -> Vector:
+    """A motion (3, 3) that stands still at a position."""
+    return np.array([position, (0.0,) * 3, (0.0,) * 3])
+
+
+def driven(
+    targets: list[Vector],
+    *,
+    start: Vector | None = None,
+    tool: ToolSettings = TOOL,
+    costs: Vector = FREE,
+    slow: float = 1.0,
+    rate_hz: int = 500,
+) -> tuple[Vector, Vector]:
+    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
+
+    In each step the bounds are looked at from outside.
+    """
+    generator, state = Explained(Settings(tool=tool, rate_hz=rate_hz)), blank(STATE)
+    generator.begin(state, at_rest(targets[0][0]) if start is None else start)
+    out, said = [state["setpoint"].copy()], []
+    for target in targets:
+        before = state["setpoint"].copy()
+        said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
+        assert generator.why_wrong(state, before, BOX) == ""
+        out.append(state["setpoint"].copy())
+    return np.array(out), np.array(said)
