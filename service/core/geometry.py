@@ -254,6 +254,21 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:
 
 
 @compiled
+def carry_back(near: Vector, then: Vector, now: Vector) -> None:
+    """Moves the first point of `near` from where it is on a segment (2, 3) to the same point of the
+    segment now.
+    """
+    long = whole = 0.0
+    for i in range(3):
+        way = then[1, i] - then[0, i]
+        long += way * (near[i] - then[0, i])
+        whole += way * way
+    share = long / whole if whole > 0.0 else 0.0
+    for i in range(3):
+        near[i] = now[0, i] + share * (now[1, i] - now[0, i])
+
+
+@compiled
 def nearest_to_box(segment: Vector, box: Vector) -> float:
     """Where along a segment (2, 3), 0 to 1, it is nearest to a box (2, 3) of lower and upper
     corner: the root of the distance's slope, which grows along the segment.

@@ -20,6 +20,7 @@ from service.core.arm.arm import Arm, Kinematics
 from service.core.controller import Controller, start_state
 from service.core.frame import Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
+from service.core.limiter.limiter import LimiterStage
 from service.core.separation.body import Body, body_of
 from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
 from service.core.skill.skill import Skill
@@ -29,7 +30,7 @@ from sim.scene import Scene
 from sim.script import HandScript
 from support.arms import MODELS, cell_of
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
-from support.wam import URDF
+from support.wam import STATE, URDF
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
 LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)
@@ -367,3 +368,24 @@ def test_it_costs_little_beside_a_tick(taught: Skill) -> None:
     for _ in range(500):
         apart.step(state, FRAME, here.record)
     assert (time.perf_counter() - began) / 500 < 0.5 * tick_s
+
+
+def test_joints_of_which_some_lead_away_do_not_take_turns_between_stopping_and_going_on() -> None:
+    """As a Panda had it, whose forearm slid along a box: braking each alone, and all together,
+    approaches it more in turn.
+    """
+    cell = cell_of("panda")
+    urdf = robot_description(cell)
+    arm, separation, state, frame = Arm(cell, urdf), Separation(cell, urdf), blank(STATE), blank(frame_layout(7))
+    stage = LimiterStage(cell, arm)
+    stage.begin(state, np.array(cell.arm.posture))
+    state["joints"][1:] = [[-0.4, -0.17, 0.33, 0.12, 0.18, -0.28, -0.1], [-1.29, -3.0, -2.22, -1.79, -1.4, -1.89, 1.32]]
+    separation.constraints["row"][0] = row = np.array([-0.5, 0.03, -0.48, -0.1, 0.12, 0.06, -0.01])
+    separation.constraints["planned"][0], separation.constraints["allowed"][0] = 0.0, 0.006
+    separation.count = 1
+    wanted, approach = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1]), []
+    for _ in range(100):
+        stage.step(state, frame, wanted, np.zeros(7), separation)
+        approach.append(row @ state["joints"][1])
+    assert max(approach) < 0.05
+    assert max(approach[50:]) <= 0.006

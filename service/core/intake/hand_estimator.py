@@ -71,6 +71,7 @@ STEADY_S = 0.01  # that it may differ by all the same: clocks that are 1 % apart
 EXACT_NS = 2.0**62  # of differences of two stamps that do not overflow
 ROUNDED = 1e-6  # of a tick, that a lateness may lack: sums of periods are not exact
 LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # clocks: in their first second, not steady, steady
+AGAIN = 16.0  # times the variance that a hand seen again may be off
 ALONE_S = 1.0  # since the sample before one that has none: longer than samples are compared over
 
 
@@ -163,6 +164,16 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
     """Whether a hand has been seen, and lately enough."""
     seen = states[0].hand_ticks[side]
     return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
+
+
+@compiled
+def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> bool:
+    """Whether a hand that is seen again may have come there (3,) [m], as the filter has it."""
+    state, square = states[0], 0.0
+    for axis in range(3):
+        square += (position[axis] - state.hands[side, 0, axis]) ** 2
+    variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
+    return bool(is_fresh(states, side, unseen_ticks) and square < AGAIN * variance)
 
 
 @compiled

@@ -32,6 +32,7 @@ from service.core.intake.arm_samples import (
 from service.core.intake.hand_estimator import (
     LATE_S,
     HandEstimator,
+    goes_on,
     note_clock,
     order_of,
     take,
@@ -320,9 +321,9 @@ def _take_hand(
         newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
         cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, LATE_S)
         if cause < 0:
-            if not fresh:
+            if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, given.unseen_ticks)):
                 state.kept[side] = 0
-            elif stamp_ns < newest_ns:
+            elif fresh and stamp_ns < newest_ns:
                 order = order_of(states, side, stamp_ns)
             late = ticks_late(states, side, stamp_ns, period_s)
             if order >= KEPT - 1:

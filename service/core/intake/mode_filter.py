@@ -2,15 +2,16 @@
 started, moved on, and given a sample.
 
 A hand rests, reaches, or changes its way. Each mode is a Kalman filter of position, velocity and
-acceleration (`motion_model`). One that rests is slow, and trembles about where it is: an
-oscillation that its samples show and that is no part of its motion. Its speed and tremor are
-bounded: without that a mode that expects most to happen within one sample would win in the quickest
-motion, which none explains. Only who has become slow comes to rest, with what was known of its
-motion and that it is slow; who leaves rest begins with all that the samples showed.
+acceleration (`motion_model`). One that rests or reaches trembles too: an oscillation that its
+samples show and that is no part of its motion. Who changes their way does not, as a change would be
+taken for tremor at first. One that rests is slow. Its speed and tremor are bounded: without that a
+mode that expects most to happen within one sample would win in the quickest motion, which none
+explains. Only who has become slow comes to rest, with what was known of its motion and that it is
+slow. Who leaves rest begins with all that the samples showed.
 
 Arrays of one hand: means (MODES, STATES, 3), by mode, then position, velocity, acceleration, tremor
 and its velocity, by axis [m, m/s, m/s²]; covariances (MODES, STATES, STATES), alike for the axes;
-probabilities (MODES,). Only who rests trembles: of the other modes the last two states are 0.
+probabilities (MODES,).
 """
 
 from __future__ import annotations
@@ -31,11 +32,10 @@ START_ACCELERATION = 1.0  # [m/s²] likewise
 SLOW = 0.01  # [m/s] standard deviation of one that rests, each axis: hands that hold something drift
 SLOW_CHANGE = 0.01  # [m/s²] likewise: it comes to that speed within a second
 MOST_SLOW = 0.03  # [m/s] it is no faster: reaches begin and end at once, and are to be followed so
-MOST_TREMOR = 3e-3  # [m] of amplitude, which only the ill have more of
+MOST_TREMOR = 6e-3  # [m] of amplitude, which only the ill have more of
 LEAST_PROBABILITY = 1e-4  # of a mode
 MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
 ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
-TO_REST, TO_MOVE = 0, 1  # what a mode is for one that is taken up: who rests, or moves
 
 
 @compiled
@@ -49,8 +49,8 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
         covariances[mode, 0, 0] = noise
         covariances[mode, 1, 1] = START_SPEED**2
         covariances[mode, 2, 2] = START_ACCELERATION**2
+        _tremble(means[mode], covariances[mode], mode)
         modes[mode] = PRIOR[mode]
-    covariances[REST, 3, 3], covariances[REST, 4, 4] = TREMOR**2, (TREMOR * TREMOR_RATE) ** 2
 
 
 @compiled
@@ -59,10 +59,9 @@ def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vecto
     moved, product = np.empty((STATES, 3)), np.empty((STATES, STATES))
     for mode in range(MODES):
         mean, covariance, over = means[mode], covariances[mode], transition[mode]
-        size = STATES if mode == REST else 3
-        for row in range(size):
+        for row in range(STATES):
             first, end = (0, 3) if row < 3 else (3, STATES)  # motion and tremor do not drive each other
-            for column in range(size):
+            for column in range(STATES):
                 p = 0.0
                 for k in range(first, end):
                     p += over[row, k] * covariance[k, column]
@@ -72,14 +71,23 @@ def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vecto
                 for k in range(first, end):
                     m += over[row, k] * mean[k, axis]
                 moved[row, axis] = m
-        mean[:size] = moved[:size]
-        for row in range(size):
-            for column in range(row, size):
+        mean[:] = moved
+        for row in range(STATES):
+            for column in range(row, STATES):
                 p = noise[mode, row, column]
                 first, end = (0, 3) if column < 3 else (3, STATES)
                 for k in range(first, end):
                     p += product[row, k] * over[column, k]
                 covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def _tremble(mean: Vector, covariance: Vector, mode: int) -> None:
+    """Nothing is known yet of the tremor of a hand of this mode."""
+    mean[3:] = 0.0
+    covariance[3:, :] = 0.0
+    covariance[:, 3:] = 0.0
+    covariance[3, 3], covariance[4, 4] = TREMOR[mode] ** 2, (TREMOR[mode] * TREMOR_RATE) ** 2
 
 
 @compiled
@@ -96,7 +104,6 @@ def _come_to_rest(mean: Vector, covariance: Vector) -> None:
         for row in range(3):
             for column in range(3):
                 covariance[row, column] -= row_of[row] * row_of[column] / variance
-    covariance[3, 3], covariance[4, 4] = TREMOR * TREMOR, (TREMOR * TREMOR_RATE) ** 2
 
 
 @compiled
@@ -105,7 +112,6 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
     for row in range(2):
         for axis in range(3):
             mean[row, axis] += mean[row + 3, axis]
-            mean[row + 3, axis] = 0.0
         for column in range(STATES):
             covariance[row, column] += covariance[row + 3, column]
     for column in range(2):
@@ -134,33 +140,34 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
 @compiled
 def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -> None:
     """Each mode mixed of all, by those shares: the modes' probabilities (MODES,) are `expected`."""
-    of_means, of_covariances = np.empty((2, MODES, STATES, 3)), np.empty((2, MODES, STATES, STATES))
-    for i in range(MODES):
-        for to in range(2):
-            of_means[to, i], of_covariances[to, i] = means[i], covariances[i]
-        if i == REST:
-            _leave_rest(of_means[TO_MOVE, i], of_covariances[TO_MOVE, i])
-        else:
-            _come_to_rest(of_means[TO_REST, i], of_covariances[TO_REST, i])
+    of_means, of_covariances = np.empty((MODES, MODES, STATES, 3)), np.empty((MODES, MODES, STATES, STATES))
     for j in range(MODES):
-        to, size = (TO_REST, STATES) if j == REST else (TO_MOVE, 3)
+        for i in range(MODES):
+            of_means[j, i], of_covariances[j, i] = means[i], covariances[i]
+            if i != j:
+                if j == REST:
+                    _come_to_rest(of_means[j, i], of_covariances[j, i])
+                elif i == REST:
+                    _leave_rest(of_means[j, i], of_covariances[j, i])
+                _tremble(of_means[j, i], of_covariances[j, i], j)
+    for j in range(MODES):
         expected[j], mixed, spread = 0.0, means[j], covariances[j]
         for i in range(MODES):
             expected[j] += shares[i, j]
         mixed[:], spread[:] = 0.0, 0.0
         for i in range(MODES):
             share = shares[i, j] / expected[j]
-            for a in range(size):
+            for a in range(STATES):
                 for b in range(3):
-                    mixed[a, b] += share * of_means[to, i, a, b]
+                    mixed[a, b] += share * of_means[j, i, a, b]
         for i in range(MODES):
-            share, mean = shares[i, j] / expected[j], of_means[to, i]
-            for a in range(size):
-                for b in range(a, size):
+            share, mean = shares[i, j] / expected[j], of_means[j, i]
+            for a in range(STATES):
+                for b in range(a, STATES):
                     between = 0.0
                     for k in range(3):
                         between += (mean[a, k] - mixed[a, k]) * (mean[b, k] - mixed[b, k])
-                    spread[a, b] += share * (of_covariances[to, i, a, b] + between / 3.0)
+                    spread[a, b] += share * (of_covariances[j, i, a, b] + between / 3.0)
 
 
 @compiled
@@ -170,7 +177,8 @@ def _beyond_rest(mean: Vector) -> float:
     for axis in range(3):
         speed += mean[1, axis] ** 2
         tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE) ** 2
-    return max(speed - MOST_SLOW**2, 0.0) / SLOW**2 + max(tremor - MOST_TREMOR**2, 0.0) / TREMOR**2
+    trembles = max(tremor - MOST_TREMOR**2, 0.0) / float(TREMOR[REST]) ** 2
+    return max(speed - MOST_SLOW**2, 0.0) / SLOW**2 + trembles
 
 
 @compiled
@@ -185,21 +193,19 @@ def update(
     _mix(means, covariances, shares, expected)
     best = -1e300
     for i in range(MODES):
-        mean, p, size = means[i], covariances[i], STATES if i == REST else 3
-        for row in range(size):
+        mean, p = means[i], covariances[i]
+        for row in range(STATES):
             for column in range(row):
                 p[row, column] = p[column, row]
             seen[row] = p[row, 0] + p[row, 3]  # a sample shows position and tremor
-        variance, square = seen[0] + noise, 0.0
-        if i == REST:
-            variance += seen[3]
+        variance, square = seen[0] + seen[3] + noise, 0.0
         for axis in range(3):
             innovation = position[axis] - mean[0, axis] - mean[3, axis]
             square += innovation * innovation
-            for row in range(size):
+            for row in range(STATES):
                 mean[row, axis] += seen[row] / variance * innovation
-        for row in range(size):
-            for column in range(row, size):
+        for row in range(STATES):
+            for column in range(row, STATES):
                 p[row, column] -= seen[row] * seen[column] / variance
                 p[column, row] = p[row, column]
         likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MOST_INNOVATION)

@@ -1,6 +1,6 @@
 """How a hand moves on over an interval: transition and process noise of the estimator's modes.
 
-Acceleration and velocity revert to 0, and the tremor of one that rests is a damped oscillation:
+Acceleration and velocity revert to 0, and tremor is a damped oscillation beside them:
 
     dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
     dy = w dt    dw = -TREMOR_RATE² y dt - 2 TREMOR_DAMPING TREMOR_RATE w dt + ... dW
@@ -26,9 +26,9 @@ REVERT_A = np.array([10.0, 14.0, 14.0])  # [1/s] of the acceleration
 REVERT_V = np.array([0.3, 95.0, 95.0])  # [1/s²] of the velocity: slow hands go on, reaches end
 KEPT_ON_S = 0.06  # [s] since the newest sample, in which velocity is kept, and ...
 FADING = 5.0  # [1/s] ... acceleration fades so fast
-TREMOR = 3e-4  # [m] standard deviation, each axis: most people's; more is told from motion by its rhythm
+TREMOR = np.array([5e-4, 3e-4, 0.0])  # [m] standard deviation, each axis: more is told from motion by its rhythm
 TREMOR_RATE = 2.0 * math.pi * 10.0  # [1/s] people's is of 8 to 12 Hz ...
-TREMOR_DAMPING = 0.25  # ... each of its own
+TREMOR_DAMPING = 0.18  # ... each of its own
 
 
 @functools.cache
@@ -49,14 +49,13 @@ def models(period_s: float, count: int) -> Records:
 def model(interval_s: float) -> tuple[Vector, Vector]:
     """Transitions and process noise (MODES, STATES, STATES) of the modes over an interval."""
     transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
-    for mode in (REST, REACH):
-        moves = _motion(REVERT_V[mode], REVERT_A[mode])
-        transition[mode, motion, motion], noise[mode, motion, motion] = _over(moves, interval_s)
-    transition[CHANGE], noise[CHANGE] = transition[REACH], noise[REACH]
-    noise *= INTENSITY[:, None, None]
     dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE]])
-    transition[REST, tremor, tremor], driven = _over(dynamics, interval_s)
-    noise[REST, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE**3 * TREMOR**2 * driven
+    trembles, driven = _over(dynamics, interval_s)
+    for mode in range(MODES):
+        moves, driving = _over(_motion(REVERT_V[mode], REVERT_A[mode]), interval_s)
+        transition[mode, motion, motion], noise[mode, motion, motion] = moves, INTENSITY[mode] * driving
+        transition[mode, tremor, tremor] = trembles
+        noise[mode, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE**3 * TREMOR[mode] ** 2 * driven
     return transition, noise
 
 

@@ -335,7 +335,7 @@ class LimiterStage:
 
         They brake where the tool would pass its greatest speed, and one that does all the same is
         too fast. Where they would approach something too fast on the way, which each goes as fast
-        as it can, they go it together, or brake, unless that brakes less.
+        as it can, they go it together, or brake, or, where that brakes less, change the least.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted, ramp)
@@ -345,6 +345,8 @@ class LimiterStage:
             other = self._limiter.together(q, dq, ddq, wanted)
             if other is None or separation.excess(*other[1:3]) > 0.0:
                 other = self._limiter.stop(q, dq, ddq)
+            if separation.excess(*other[1:3]) >= excess:  # these two in turn would be neither
+                other = self._limiter.step(q, dq, ddq, separation.less(dq, moved[1:3]))
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
         here, too_fast = self._arm.at(moved.position), 0.0

@@ -23,7 +23,7 @@ from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
-from service.core.geometry import between_segments, nearest_to_box, place, to_box
+from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
 from service.core.separation.body import body_of, own_clearance
 from service.core.separation.clearance import FARTHEST, ITSELF, NOBODY, PEOPLE, THINGS, clearance
 
@@ -154,7 +154,16 @@ class Separation:
         """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
         as their acceleration comes to 0; at most 0 if they do not.
         """
-        return float(_excess(self.constraints, self.count, velocity, acceleration, self._jerk))
+        return float(_excess(self.constraints, self.count, velocity, acceleration, self._jerk)[0])
+
+    def less(self, velocity: Vector, moved: tuple[Vector, Vector]) -> Vector:
+        """The velocities (J,) [rad/s] nearest to these by which what joints that have `moved` so
+        (J,) [rad/s, rad/s²] pass the most is passed no more.
+        """
+        excess, k = _excess(self.constraints, self.count, *moved, self._jerk)
+        row = self.constraints["row"][k]
+        slower: Vector = velocity - excess / (row @ row) * row
+        return slower
 
 
 @compiled
@@ -235,7 +244,7 @@ def _step(
                     constraint.planned = planned
                     constraint.allowed = max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + SLIP
                     if k > 0:
-                        _carry_back(near, then[capsule], now[capsule])
+                        carry_back(near, then[capsule], now[capsule])
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
@@ -332,21 +341,6 @@ def _receives(contacts: Records, hands: Vector, side: int) -> bool:
 
 
 @compiled
-def _carry_back(near: Vector, then: Vector, now: Vector) -> None:
-    """Moves the first point of `near` from where it is on a segment (2, 3) to the same point of the
-    segment now.
-    """
-    long = whole = 0.0
-    for i in range(3):
-        way = then[1, i] - then[0, i]
-        long += way * (near[i] - then[0, i])
-        whole += way * way
-    share = long / whole if whole > 0.0 else 0.0
-    for i in range(3):
-        near[i] = now[0, i] + share * (now[1, i] - now[0, i])
-
-
-@compiled
 def _bring_together(
     constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
 ) -> None:
@@ -381,14 +375,15 @@ def _share_of(constraints: Records, count: int, velocity: Vector) -> float:
 
 
 @compiled
-def _excess(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> float:
-    """`Separation.excess`."""
-    most = -math.inf
+def _excess(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
+    """`Separation.excess`, and of which constraint."""
+    most, which = -math.inf, 0
     for k in range(count):
         constraint = constraints[k]
         now = crest = 0.0
         for j in range(len(dq)):
             now += constraint.row[j] * dq[j]
             crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
-        most = max(most, max(now, crest) - constraint.allowed)
-    return most
+        if max(now, crest) - constraint.allowed > most:
+            most, which = max(now, crest) - constraint.allowed, k
+    return most, which
