@@ -125,6 +125,44 @@ def test_a_hand_that_trembles_is_known_at_once_where_it_goes() -> None:
     assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < 0.004
 
 
+@pytest.mark.parametrize("size_m", [0.002, 0.003, 0.004])
+def test_a_tremor_is_little_of_the_motion_of_a_hand_on_its_way(size_m: float) -> None:
+    """Its velocity is off by 29 mm/s without tremor, and would be by 60, 89 and 117 of an unknown
+    one.
+    """
+    noise = trembling(4.0, size_m, np.random.default_rng(8))
+    found = follow(Hands(), lambda t: np.array([0.2 * t, 0.0, 0.0]), until_s=4.0, noise=noise)[1000:]
+    assert np.sqrt(np.mean(np.sum((found[:, 1] - [0.2, 0.0, 0.0]) ** 2, axis=1))) < 0.055
+
+
+@pytest.mark.parametrize(("rate_hz", "noise_m"), [(30, 0.002), (100, 0.0005)])
+@pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
+def test_a_hand_at_rest_that_is_not_seen_for_a_moment_does_not_dart(
+    rate_hz: int, noise_m: float, unseen_s: float
+) -> None:
+    hands, still, random = Hands(), np.array([0.5, 0.0, 0.2]), np.random.default_rng(9)
+    follow(hands, lambda t: still, until_s=4.0, rate_hz=rate_hz, noise=random.normal(0.0, noise_m, (4 * rate_hz, 3)))
+    hands.advance(round(unseen_s / PERIOD_S))
+    fastest = 0.0
+    for k in range(rate_hz):
+        stamp_ns = round(1e9 * (5.0 + unseen_s + k / rate_hz))
+        hands.hand(stamp_ns, tuple((still + random.normal(0.0, noise_m, 3)).tolist()))
+        fastest = max(fastest, float(np.linalg.norm(hands.state["hands"][LEFT, 1])))
+        hands.advance(round(1.0 / rate_hz / PERIOD_S))
+    assert fastest < 0.01
+
+
+def test_a_hand_that_comes_again_elsewhere_is_there_at_once() -> None:
+    hands, there = Hands(), np.array([0.8, 0.0, 0.2])
+    follow(hands, lambda t: np.array([0.5, 0.0, 0.2]), until_s=2.0)
+    hands.advance(round(0.2 / PERIOD_S))
+    for k in range(10):
+        hands.hand(3_200_000_000 + 10_000_000 * k, tuple(there.tolist()))
+        hands.advance(5)
+    assert np.linalg.norm(hands.state["hands"][LEFT, 0] - there) < 0.002
+    assert np.linalg.norm(hands.state["hands"][LEFT, 1]) < 0.02
+
+
 @pytest.mark.parametrize("speed", [0.0, 0.002, 0.005, 0.02])
 @pytest.mark.parametrize("rate_hz", [30, 100, 240])
 def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
