@@ -133,14 +133,18 @@ def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_
 
 
 def added_in(path: Path) -> Add:
-    """The request to add via-points in a file (-: standard input). Raises RequestError, OSError."""
-    request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+    """The request to add via-points in a file (-: standard input). Raises RequestError, which names
+    the file.
+    """
+    try:
+        request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
+    except OSError as error:
+        raise RequestError(f"{path} cannot be read: {error.strerror}") from None
+    except RequestError as error:
+        raise RequestError(f"{path}: {error}") from None
     return request
 
 
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
-    """The via-points in such a file. Raises RequestError, which names the file, and OSError."""
-    try:
-        return added_in(path).points
-    except RequestError as error:
-        raise RequestError(f"{path}: {error}") from None
+    """The via-points in such a file. Raises RequestError, which names the file."""
+    return added_in(path).points
