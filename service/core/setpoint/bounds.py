@@ -6,6 +6,7 @@ one axis or of several that come to rest together.
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,8 +14,10 @@ from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.setpoint import HULL_SPANS
 
+Pair: TypeAlias = tuple[float, float]
 LEAST_SHARE = 1e-3  # of its acceleration with which an axis waits for the slowest
 HALVINGS = 40  # in which that share is found
+SPARE, SECANTS = 1e-3, 8  # [m] of a room left unused, and steps to that: in long ticks it is no straight line
 
 
 @compiled
@@ -294,3 +297,37 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
     if speed_then >= brake * brake / change:
         return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
     return way + speed_then * math.sqrt(speed_then / change)
+
+
+@compiled
+def _stop_after(v: float, a: float, jerk: float, brakes: Pair, dt: float) -> float:
+    """The way [m] of a period at a jerk [m/s³] and of the stop by such brakes after it."""
+    return stop_distance(max(v + dt * (a + 0.5 * dt * jerk), 0.0), a + jerk * dt, *brakes) + v * dt
+
+
+@compiled
+def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float) -> float:
+    """The greatest jerk up to the wanted one at which something, linear in jerk, stays at its
+    limit.
+    """
+    if at_wanted <= limit:
+        return wanted
+    if at_lowest >= limit or at_wanted - at_lowest < 1e-15:
+        return lowest
+    return lowest + (wanted - lowest) * (limit - at_lowest) / (at_wanted - at_lowest)
+
+
+@compiled
+def stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: Pair, kept: float, dt: float) -> float:
+    """The greatest jerk, from the wanted to the lowest of `jerks`, after which a stop by `brakes`
+    [m/s², m/s³] is `kept` this share of its room, on a way [m] that grows by what `comes`.
+    """
+    (brake, change), (wanted, chosen) = brakes, jerks
+    limit = way + comes - kept * (way - stop_distance(v, a, brake, change))
+    most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
+    for _ in range(SECANTS):
+        chosen = between(wanted, chosen, most, passed, limit)
+        passed = _stop_after(v, a, chosen, brakes, dt)
+        if limit - passed < SPARE or chosen >= wanted:
+            break
+    return chosen

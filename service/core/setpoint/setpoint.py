@@ -18,7 +18,6 @@ hold by induction, whatever the target does:
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
 
@@ -29,13 +28,12 @@ from service.core.arm.inverse_kinematics import joint_costs
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, bounds_around, stop_distance, take_safe, what_is_wrong
+from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, between, bounds_around, stopping, take_safe, what_is_wrong
 from service.core.setpoint.tracker import GAP_WIDE, gains_for, waiting
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import decided
 
-Pair: TypeAlias = tuple[float, float]
 ROOM = 0.0012  # [m] by which the setpoint's stop may pass the hands'
 STOP_TIME = 0.0115  # [s] times the target's speed: no hand stops at once
 STOP_BRAKE = 16.0  # [m/s²] no hand brakes harder
@@ -183,17 +181,17 @@ def _track(
     room += given.stop_room * (STOP_TIME * coming + coming * coming / (2.0 * STOP_BRAKE))
     # with less jerk than the lowest it would brake on after it rests, and swing back
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
-    lowest = _between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
+    lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
     # what is left of a room shrinks at BARRIER_RATE at most
     kept = 1.0 - min(BARRIER_RATE * dt, BARRIER_TIME / dt)
-    chosen = _stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
+    chosen = stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
     faster, a_faster = speed - v_target, a - a_target
     if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
         meeting = max(MEETING_SHARE * brake + min(a_target, 0.0), LEAST_MEETING * brake)
-        chosen = _stopping(way + MEETING_ROOM, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), kept, dt)
+        chosen = stopping(way + MEETING_ROOM, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), kept, dt)
     limit = top - kept * (top - now)
     most = _coasting(speed, a, chosen, change, dt)
-    chosen = _between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
+    chosen = between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
     if chosen >= u:
         return 0
     for i in range(3):
@@ -203,34 +201,10 @@ def _track(
 
 
 @compiled
-def _stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: Pair, kept: float, dt: float) -> float:
-    """The greatest jerk, from the wanted to the lowest of `jerks`, after which a stop by `brakes`
-    [m/s², m/s³] is `kept` this share of its room, on a way [m] that grows by what `comes`.
-    """
-    (brake, change), (wanted, lowest) = brakes, jerks
-    limit = way + comes - kept * (way - stop_distance(v, a, brake, change))
-    most = stop_distance(max(v + dt * (a + 0.5 * dt * wanted), 0.0), a + wanted * dt, brake, change) + v * dt
-    least = stop_distance(max(v + dt * (a + 0.5 * dt * lowest), 0.0), a + lowest * dt, brake, change) + v * dt
-    return _between(wanted, lowest, most, least, limit)
-
-
-@compiled
 def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
     """The speed [m/s] at which the acceleration, after dt of a jerk, comes to 0 by `change`."""
     then = a + dt * jerk
     return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
-
-
-@compiled
-def _between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float) -> float:
-    """The greatest jerk up to the wanted one at which something, linear in jerk, stays at its
-    limit.
-    """
-    if at_wanted <= limit:
-        return wanted
-    if at_lowest >= limit or at_wanted - at_lowest < 1e-15:
-        return lowest
-    return lowest + (wanted - lowest) * (limit - at_lowest) / (at_wanted - at_lowest)
 
 
 @compiled
