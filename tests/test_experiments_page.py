@@ -332,7 +332,7 @@ SOURCES: dict[str, list[Source]] = {
         of("separation/scenes"),
         of("separation/random/closest_of_shapes_mm/least"),
     ],
-    "In 97 of these": [
+    "In 93 of these": [
         of("separation/scenes") - of("separation/thrust/above_after_reaction"),
         of("separation/thrust/above_after_reaction"),
         of("separation/thrust/excess_after_reaction"),
