@@ -168,7 +168,7 @@ class TestExperiments:
     def test_hands_that_go_back_take_the_robot_back(self, tmp_path: Path) -> None:
         found = numbers("phase", tmp_path)
         # at the same progress of the hands the tool is behind by its lag, either way
-        assert found["ours"]["back_against_forth_rms_mm"] < 45
+        assert found["ours"]["back_against_forth_rms_mm"] < 60
         assert found["promp"]["back_against_forth_rms_mm"] > 100
         assert found["ours"]["success"]
 
