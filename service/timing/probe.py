@@ -8,6 +8,7 @@ from __future__ import annotations
 from service import one_blas_thread  # noqa: F401
 
 # isort: split
+import functools
 import json
 import math
 import sys
@@ -94,10 +95,17 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
     }
 
 
-def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
-    """Both hands [m] at a time [s], about those demonstrated that are nearest to their mean."""
+@functools.cache
+def _middle(skill: Skill) -> list[float]:
+    """Both hands (6,) [m], those demonstrated that are nearest to their mean."""
     hands = skill.hands
-    middle = hands[((hands - hands.mean(axis=0)) ** 2).sum(axis=1).argmin()].tolist()
+    nearest: list[float] = hands[((hands - hands.mean(axis=0)) ** 2).sum(axis=1).argmin()].tolist()
+    return nearest
+
+
+def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
+    """Both hands [m] at a time [s], about some that were demonstrated."""
+    middle = _middle(skill)
     x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 

@@ -1,6 +1,6 @@
 """Where a setpoint may go and how fast: the box around the last targets, the step that can still
 stop in it, and what comes back to it; docs/bounds.md has the proof. And the stops themselves, of
-one axis or of several that come to rest together.
+one axis or of several that come to rest together, and the jerk after which one keeps its room.
 """
 
 from __future__ import annotations
@@ -327,7 +327,9 @@ def stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: 
     most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
     for _ in range(SECANTS):
         chosen = between(wanted, chosen, most, passed, limit)
+        if chosen >= wanted:
+            break
         passed = _stop_after(v, a, chosen, brakes, dt)
-        if limit - passed < SPARE or chosen >= wanted:
+        if limit - passed < SPARE:
             break
     return chosen
