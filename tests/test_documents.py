@@ -1,5 +1,5 @@
 """The pages agree with the code: incidents, faults with their figures, tests behind promises, the
-wire, ROS 2 topics. Their prose is short, and words that the glossary retires do not come back.
+wire, ROS 2 topics. Words that the glossary retires do not come back.
 """
 
 from __future__ import annotations
@@ -197,17 +197,6 @@ def test_a_word_that_the_glossary_retires_does_not_come_back() -> None:
     assert [word for word in RETIRING if not with_word(word)] == [], "gone: move it to the table in docs/glossary.md"
 
 
-def sentences(page: Path) -> list[str]:
-    """The sentences of a page's prose and lists, without tables, headings and code."""
-    text = re.sub(r"^```.*?^```$|<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
-    text = "\n".join(line for line in text.splitlines() if not line.startswith(("|", "#", "!", "    ")))
-    blocks = re.split(r"\n\s*\n|^\s*(?:[*-]|\d+\.) ", text, flags=re.MULTILINE)
-    return [
-        one for block in blocks for one in re.split(r"(?<=[.!?])\s+(?=`|\W*[A-Z\d])", " ".join(block.split())) if one
-    ]
-
-
 # All but the log of changes.
 PAGES = sorted(
     path
@@ -217,14 +206,7 @@ PAGES = sorted(
 )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_sentences_of_a_page_have_25_words_on_average_at_most(page: Path) -> None:
-    words = [len(sentence.split()) for sentence in sentences(page)]
-    assert sum(words) <= 25 * len(words), f"{sum(words) / len(words):.1f} words a sentence"
-
-
-def test_the_readme_is_read_in_five_minutes_and_the_data_flow_is_drawn_once() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+def test_the_data_flow_is_drawn_once() -> None:
     drawn = [page.name for page in PAGES if "Tick(index, inbox)" in page.read_text(encoding="utf-8")]
     assert drawn == ["how-it-works.md"]
 
