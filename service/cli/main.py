@@ -20,6 +20,7 @@ from service.cli.usage import Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError
+from service.contract.printable import printable_lines
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
@@ -268,20 +269,26 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "view",
-        "Shows a recording, or a running daemon, in Rerun.",
-        "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
+        "Shows recordings, or a running daemon, in Rerun. In a window, as a picture, or in a browser.",
+        "thirdhand view thirdhand-demo/*.rrd\n  thirdhand view thirdhand-demo/*.rrd --screenshot scene.png --time 12\n"
+        "  thirdhand view live --web 8080",
     )
+    option(c, "files", "FILE|live", "drawings (.rrd) and recordings (.mcap); or `live`: a running daemon", nargs="+")
+    picture = c.add_argument_group("a picture")
+    option(picture, "--screenshot", "PNG", "write this picture instead of opening a window; of several files the last")
+    option(picture, "--time", "S", "show this time after the start (default: the last moment in mode follow)")
+    tabs = ("task", "timing", "learning")
+    option(picture, "--tab", None, "show this tab of the viewer", "task", choices=tabs)
+    browser = c.add_argument_group("a browser")
+    web = "with `live`: serve a page with hold, resume and reset at this address (default: any port of this machine)"
+    option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     _reach(c)
-    option(c, "file", "FILE|live", "an .rrd or .mcap file, or `live`")
-    option(c, "--screenshot", "PNG", "write a picture instead of opening a window")
-    option(c, "--time", "S", "of the picture, from the recording's start (default: its end)")
-    web = "with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)"
-    option(c, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
-    option(c, "--tab", None, "of the picture", "task", choices=("task", "timing", "learning"))
 
-    about, example = "Prints what lets a shell complete these commands and their options.", "thirdhand completion bash"
-    c = command("completion", about, f"{example} > ~/.local/share/bash-completion/completions/thirdhand")
+    about = "Prints or writes a script by which a shell completes these commands, their options and files."
+    example = "thirdhand completion bash --output ~/.local/share/bash-completion/completions/thirdhand"
+    c = command("completion", about, example)
     c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    option(c, "--output", "FILE", "write the script there; folders that are missing are made")
     top.groups = {
         title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
     }
@@ -325,13 +332,13 @@ def main(arguments: list[str] | None = None) -> int:
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
     except (UsageError, SettingsError) as error:
-        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        print(f"thirdhand {args.command}: {printable_lines(str(error))}", file=sys.stderr)
         return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:
-        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        print(f"thirdhand {args.command}: {printable_lines(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         interrupt.end_at_once()

@@ -223,6 +223,9 @@ def test_a_shell_completes_commands_options_and_choices(words: str, found: set[s
     assert done.returncode == 0, done.stderr
     script.write_text(done.stdout)
     program = BASH.format(words=words, last=len(words.split()) - 1)
+    written = tmp_path / "missing" / "folders" / "thirdhand"
+    assert told("completion", "bash", "--output", str(written)).returncode == 0
+    assert written.read_text() == script.read_text().removesuffix("\n")
     asked = subprocess.run(
         ["bash", "-c", program, "bash", str(script)], capture_output=True, text=True, timeout=30, check=False
     )
