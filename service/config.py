@@ -22,11 +22,12 @@ from service.urdf import Urdf, UrdfError
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 Cell = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A[^/*$?#\s\0]+(/[^/*$?#\s\0]+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces and * $ ? #,"},
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
     ),
 ]
 Point = tuple[float, float, float]

@@ -129,13 +129,18 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             wait_s=args.wait,
             longest_s=args.seconds,
             progress=_progress if sys.stderr.isatty() else lambda line: None,
-            say=lambda line: say(f"\r{line}"),
+            say=_say_over_progress,
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
     captured.write(path, places)
     for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
+
+
+def _say_over_progress(line: str) -> None:
+    print("\r", end="", file=sys.stderr)
+    say(line)
 
 
 def _progress(line: str) -> None:

@@ -87,7 +87,7 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     def _take(self, sample: zenoh.Sample) -> None:
         if len(self._keys) < MOST_KEYS:
-            self._keys.add(str(sample.key_expr))
+            self._keys.add(printable(str(sample.key_expr)))
 
 
 def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:

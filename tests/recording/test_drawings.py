@@ -15,6 +15,7 @@ from service.cli.main import main
 from service.cli.view import RRD_MAGIC, last_followed, screenshot
 from service.config import WAM, Settings
 from service.contract.messages import SceneObject
+from service.contract.printable import as_markdown, printable
 from service.contract.records import Mode, Reason
 from service.contract.requests import encode_json
 from service.core.separation.body import body_of
@@ -22,6 +23,7 @@ from service.core.skill.skill import Skill
 from service.viewer.blueprint import blueprint
 from service.viewer.stream import Viewer
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views
+from support.wicked import WICKED, wicked_skill
 
 
 def viewer(**where: Any) -> Viewer:
@@ -164,3 +166,24 @@ def test_without_vulkan_one_line_tells_what_a_picture_needs(
     assert error.startswith("thirdhand view: a picture without a screen needs a Vulkan driver")
     assert "apt install mesa-vulkan-drivers" in error
     assert error.count("\n") == 1
+
+
+def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
+    thing = SceneObject(WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1))
+    one = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index == 10:
+            one.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
+            one.note("log", f"rejected: {WICKED}", at_ns(tick.index))
+            one.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))
+    assert values(rows[named], "Points3D:labels")[-1] == [printable(WICKED)]
+    log = [text for (text,) in values(rows["/log"], "TextLog:text")]
+    assert f"rejected: {printable(WICKED)}" in log
+    assert f"Skill {printable(WICKED)} is in force." in log
+    ((about,),) = values(rows["/about/skill"], "TextDocument:text")
+    assert as_markdown(WICKED) in about
+    assert all(line.isprintable() for text in (*log, about) for line in text.split("\n"))
