@@ -39,16 +39,18 @@ from service.contract.requests import Status
 
 ORDERS = ("hold", "resume", "reset")
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
-PIECE = 64 * 1024
+PIECE = 64 * 1024  # bytes of a file that are passed on at once
 MOST_BODY = 4096  # bytes of a request
-TIMEOUT_S = 10.0
-START_S = 15.0
+TIMEOUT_S = 10.0  # the viewer's server and the stream answer within this time
+START_S = 15.0  # the viewer's server starts within this time
 HTML = "text/html; charset=utf-8"
+INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 FROZEN_S = 30.0  # a browser that sends no request, or reads no answer, for this long is disconnected
-A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which all comes that is repeated often
-BEHIND_MS, PATIENCE_S = 1000.0, 15.0  # of what is sent ahead, and without word of a picture
-HISTORY_S = 2.0  # in which what was drawn before comes, and is left out
-# of gRPC-Web, after its header of 5 bytes: rows of a recording, not static
+A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which everything frequent is repeated
+BEHIND_MS = 1000.0  # a picture older than this, compared with the newest message sent, makes no room for more
+PATIENCE_S = 15.0  # a viewer that does not report a picture for this time is sent messages again
+HISTORY_S = 2.0  # the samples of the past, which arrive first, are left out for this time
+# A message of gRPC-Web after its header of 5 bytes: rows of a recording that are not static.
 SAMPLES = re.compile(rb"\n[\x80-\xff]*.\x12[\x80-\xff]*.\n.\x08\x01.*8\0", re.DOTALL)
 FOREIGN = "This page answers at this machine's own address only, and only to itself."
 UNKNOWN = "There is no such page. The page of this cell is at /."
@@ -231,15 +233,17 @@ class LivePage:
         text = _text("live.html")
         for name, value in fields.items():
             text = text.replace(name, value)
-        return _answer(200, text, kind=HTML)
+        policy = f"connect-src 'self'; frame-src {fields['__VIEWER__']}; {INLINE}; frame-ancestors 'none'"
+        return _answer(200, text, kind=HTML, policy=policy)
 
     async def _status(self, _: web.Request) -> web.Response:
         told = self._latest.summary() | {"page": self._page}
         return _answer(200, json.dumps(told), kind="application/json")
 
     async def _viewer_page(self, request: web.Request) -> web.Response:
-        within = f"http://{_other_name(request.host)}"
-        return _answer(200, _text("live_viewer.html"), kind=HTML, within=within)
+        sources = f"connect-src 'self'; worker-src 'self' blob:; {INLINE} 'self' 'wasm-unsafe-eval'"
+        policy = f"{sources}; frame-ancestors http://{_other_name(request.host)}"
+        return _answer(200, _text("live_viewer.html"), kind=HTML, policy=policy)
 
     async def _viewer_file(self, request: web.Request) -> web.StreamResponse:
         path = request.rel_url.raw_path_qs.removeprefix("/viewer")
@@ -321,13 +325,15 @@ class LivePage:
                 del self._rooms[page]
 
 
-def _answer(code: int, text: str, *, kind: str = "text/plain; charset=utf-8", within: str = "'none'") -> web.Response:
+def _answer(
+    code: int, text: str, *, kind: str = "text/plain; charset=utf-8", policy: str = "frame-ancestors 'none'"
+) -> web.Response:
     headers = {
         "Content-Type": kind,
         "Server": "thirdhand",
         "Cache-Control": "no-store",
         "X-Content-Type-Options": "nosniff",
-        "Content-Security-Policy": f"frame-ancestors {within}",
+        "Content-Security-Policy": f"default-src 'none'; {policy}",
     }
     return web.Response(status=code, body=text.encode(errors="replace"), headers=headers)
 

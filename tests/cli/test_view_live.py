@@ -180,6 +180,17 @@ def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere
     assert "re_viewer.js" in text
     assert "https:" not in text
     assert page.ask("GET", "/viewer/re_viewer.js")[0] == 200
+    for path in ("/", "/viewer/", "/nowhere"):  # whatever a script in them asks for, a browser fetches nothing else
+        connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+        connection.request("GET", path)
+        policy = connection.getresponse().headers["Content-Security-Policy"].split("; ")
+        assert policy[0] == "default-src 'none'"
+        hosts = {source for part in policy for source in part.split(" ")[1:] if ":" in source and "//" in source}
+        assert hosts <= {
+            f"http://localhost:{page.host.split(':')[1]}",
+            f"http://localhost:{page.host.split(':')[1]}/viewer/",
+        }
+        connection.close()
     connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
     connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
     answer = connection.getresponse()
