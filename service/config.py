@@ -66,8 +66,8 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; less at a low `max_speed`
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; less at a low `max_speed`
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
     orientation: Literal["direction", "full"] = "direction"  # follow the direction of the tool's +z, or all axes
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool

@@ -59,9 +59,9 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
 
     Exact, by the product of exponentials: joint i is a screw with axis w and moment u = o × w, or
     with w = 0 and direction u where it slides, as the Jacobian has them now. The joints before it
-    carry both along:
+    carry both along, by (R, s) = exp(screw_1 way_1) ... exp(screw_(i-1) way_(i-1)):
 
-        w' = R w,  u' = R u + s × w',  tool' = R tool + s,  (R, s) = exp(screw_1 way_1) ... exp(screw_i way_i)
+        w' = R w,  u' = R u + s × w',  and with all joints  tool' = R tool + s
 
     and the speed is |sum dq (u' + w' × tool')|.
     """
