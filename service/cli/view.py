@@ -119,7 +119,8 @@ def _serve(args: argparse.Namespace, url: str) -> int:
         try:
             asyncio.run(page.serve(listen, listening))
         except OSError as error:
-            raise UsageError(f"--web {listen}: {error.strerror or error}; another port, or 0 for any, needed") from None
+            why = os.strerror(error.errno) if error.errno else error
+            raise UsageError(f"--web {listen}: {why}; another port, or 0 for any, needed") from None
     return 0
 
 
