@@ -212,22 +212,7 @@ def options(sub: argparse.ArgumentParser) -> Iterator[argparse.Action]:
             yield action
 
 
-@pytest.mark.parametrize(
-    "command",
-    (
-        "via-points",
-        "stage",
-        "status",
-        "doctor",
-        "hold",
-        "cells",
-        "certificates",
-        "view",
-        "report",
-        "replay",
-        "completion",
-    ),
-)
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {"sim", *FRAGMENTARY}))
 def test_the_help_of_an_option_says_what_it_is_without_the_name_before_it(command: str) -> None:
     (commands,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))  # noqa: SLF001
     assert [one.help for one in options(commands.choices[command]) if FRAGMENT.match(one.help or "")] == []
