@@ -87,8 +87,9 @@ class Client:
         return tried(self.status, timeout_s)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
+        answer = self._answer(suffix, request)
         try:
-            return decoded(self._answer(suffix, request), kind)
+            return decoded(answer, kind)
         except RefusedError as error:
             raise RefusedError(f"the answer on {self._key(suffix)} is {error}") from None
 
