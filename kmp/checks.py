@@ -46,6 +46,19 @@ def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     return frozen(array)
 
 
+_SHOWN = 60  # characters of a value in a message
+
+
+def brief(value: object) -> str:
+    """The value as a message shows it: an array by its shape where it is long."""
+    text = " ".join(repr(value.tolist() if isinstance(value, np.ndarray) else value).split())
+    if len(text) <= _SHOWN:
+        return text
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    return text[: _SHOWN - 4] + " ..."
+
+
 def check_finite(name: str, array: Array, what: str = "") -> None:
     """Raises ValueError unless every number is finite."""
     flat = array.ravel()

@@ -17,6 +17,7 @@ from kmp.immutable import Immutable, frozen
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
 _MISSED = 3.0  # of a via-point's deviations: more is a miss
+_NAMED = 5  # via-points in a message
 _WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
 
 
@@ -119,8 +120,9 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
         for n in np.flatnonzero((distance[:, c] > _WORTH_SAYING) & (deviations > _MISSED)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
+        more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""
         warnings.warn(
-            f"Via-points missed [unit of the outputs]: {', '.join(missed)}. Another point near in the "
+            f"Via-points missed [unit of the outputs]: {', '.join(missed[:_NAMED])}{more}. Another point near in the "
             "inputs asks for something else, or lambda is large: give the via-point less variance, "
             "replace what is near by a larger tolerance, or take a larger ell.",
             ViaPointMissed,

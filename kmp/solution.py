@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, Self
+from typing import Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,15 @@ from kmp.hyperparameters import Hyperparameters
 from kmp.kernel import between, variances
 
 _RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
+
+
+class ErrorBounds(NamedTuple):
+    """Upper bounds of the distance between a mean and equation (9)'s [unit of the outputs]."""
+
+    at_points: float
+    """At the reference points."""
+    anywhere: float
+    """At any query. Of a kernel with rates, the largest of the two channels' units counts."""
 
 
 class Solution(Protocol):
@@ -47,8 +56,8 @@ class Solution(Protocol):
         """w_r (R, O)."""
 
     @property
-    def error_bound(self) -> float:
-        """How far the mean can be from equation (9)'s at the points [unit of the outputs]."""
+    def error_bounds(self) -> ErrorBounds:
+        """Upper bounds of the distance between the mean and equation (9)'s."""
 
     def solved(self) -> Self:
         """This solution, its weights and factors made. Raises ValueError if that fails."""

@@ -36,7 +36,7 @@ def solved(
     if not enough:
         warnings.warn(
             f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} was asked for: the mean at them may be off by up to {solution.error_bound:.2g} "
+            f"{tolerance:.2g} was asked for: the mean at them may be off by up to {solution.error_bounds.at_points:.2g} "
             "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
             RankReached,
             stacklevel=3,

@@ -17,8 +17,8 @@ from kmp.gaussians import Gaussians
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
-from kmp.low_rank.error_bound import error_bound
-from kmp.solution import check_resolved
+from kmp.low_rank.error_bound import error_bounds
+from kmp.solution import ErrorBounds, check_resolved
 
 if TYPE_CHECKING:
     from kmp.low_rank.solution import LowRank
@@ -89,8 +89,8 @@ class Conditioned(Immutable):
         return frozen(np.concatenate([base.features.kernel_weights(w), added]))
 
     @cached_property
-    def error_bound(self) -> float:
-        return error_bound(self, self.base.features, added=self._added)
+    def error_bounds(self) -> ErrorBounds:
+        return error_bounds(self, self.base.features, added=self._added)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
 from support.primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 
@@ -211,6 +211,22 @@ def test_without_variability_all_uncertainty_is_distance():
     of_exact = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=2.0).predict(queries).covariance
     found = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0).uncertainty(queries).distance
     np.testing.assert_allclose(found, of_exact, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_with_rates_too_all_uncertainty_is_distance_without_variability(count, representation):
+    t, queries = np.linspace(0, 2, count)[:, None], np.linspace(-0.5, 2.5, 31)[:, None]
+    mean = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t)])
+    options = {"kernel": VelocityKernel(20.0), "lambda_mean": 2.0, "representation": representation}
+
+    def fit(variance):
+        return KMP.fit(t, Gaussians(mean, np.tile(variance * np.eye(2), (count, 1, 1))), **options)
+
+    found, of_exact = fit(0.01).uncertainty(queries), fit(1e-9).predict(queries).covariance
+    np.testing.assert_allclose(found.distance, of_exact, rtol=1e-3, atol=1e-6 * count)
+    total = fit(0.01).predict(queries).covariance
+    np.testing.assert_allclose(found.variability + found.distance, total, rtol=1e-6, atol=1e-6)
 
 
 def test_threads_may_share_a_primitive():
