@@ -46,6 +46,7 @@ def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     return frozen(array)
 
 
+_LARGEST = 1e150  # of a number: sums of squares of larger ones may be infinite
 _SHOWN = 60  # characters of a value in a message
 
 
@@ -60,13 +61,15 @@ def brief(value: object) -> str:
 
 
 def check_finite(name: str, array: Array, what: str = "") -> None:
-    """Raises ValueError unless every number is finite."""
+    """Raises ValueError unless every number is finite, and so is its square."""
     flat = array.ravel()
     if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
         return
-    for place in np.argwhere(~np.isfinite(array))[:1].tolist():
-        of = f"{name}: {what} " if what else name
-        raise ValueError(f"{of}{place} is {array[tuple(place)]}, and every number must be finite.")
+    of = f"{name}: {what} " if what else name
+    with np.errstate(over="ignore"):
+        for place in np.argwhere(~(np.abs(array) <= _LARGEST))[:1].tolist():
+            needed = "finite" if not np.isfinite(array[tuple(place)]) else f"at most {_LARGEST:g} in size"
+            raise ValueError(f"{of}{place or ''} is {array[tuple(place)]:g}, and every number must be {needed}.")
 
 
 def check_shape(name: str, array: Array, *shape: int | str) -> None:

@@ -153,6 +153,9 @@ class Constrained(Immutable):
     def adapted(self, changes: Changes) -> Constrained:
         return Constrained(self.solution.adapted(changes), self.constraints)
 
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Constrained:
+        return Constrained(self.solution.with_hyperparameters(hyperparameters), self.constraints)
+
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from kmp.checks import Array, ViaPointMissed
@@ -16,6 +17,7 @@ from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
+_PAIR = 2  # points, at least, have a distance
 _MISSED = 3.0  # of a via-point's deviations: more is a miss
 _NAMED = 5  # via-points in a message
 _WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
@@ -77,6 +79,18 @@ class Database(Immutable):
             Functionals.concatenated([functionals, changes.functionals]),
             Gaussians.concatenated([reference, changes.points]),
         )
+
+    def spacing(self, period: float | None) -> float:
+        """Median distance from a value to the nearest other one; 0 where there is none."""
+        values = np.unique(self.inputs[self.functionals.values], axis=0)
+        if len(values) < _PAIR:
+            return 0.0
+        if period is not None:
+            values = np.unique(values % period, axis=0)
+            gaps = np.diff(values[:, 0], append=values[0, 0] + period)
+            return float(np.median(np.minimum(gaps, np.roll(gaps, 1))))
+        distances, _ = cKDTree(values).query(values, k=[2])
+        return float(np.median(distances))
 
     def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
         """The indices, ascending, of the values nearest to those of via, if near enough.

@@ -173,6 +173,9 @@ class Dense(Immutable):
         factors = {"_mean_solver": bordered.mean_factor, "_covariance_solver": bordered.covariance_factor}
         return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
 
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
+        return Dense(hyperparameters, self.database)
+
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
 

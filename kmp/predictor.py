@@ -23,9 +23,8 @@ from kmp.kernel import Kernel, between
 from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.low_rank import Features
 from kmp.query import MotionPrediction, Query
-from kmp.solution import Solution, mean_at
+from kmp.solution import BLOCK, Solution, least_variances, mean_at
 
-_BATCH = 256  # queries at once, which bounds the memory of `predict`
 _RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
 
 
@@ -77,7 +76,7 @@ class Predictor(Immutable):
         if len(s) == 1:
             row = self.query.row(s[0])
             return unchecked(self.query.mean(row)[None], self.query.covariance(row.kernel)[None])
-        batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
+        batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
         posterior = [self.solution.posterior_covariance(self._rows(one)) for one in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
         return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.query.covariance_scale)
@@ -148,15 +147,9 @@ class Predictor(Immutable):
 
         Raises ValueError if the shape is another or a number is not finite.
         """
-        s, i = self._checked_many(queries), self._dimensions
-        weights = self.weights.reshape(-1, self.outputs // self.kernel.channels)
-        slope = self.solution.hyperparameters.prior_matrix
-        found = np.empty((len(s), i, self.outputs))
-        for a in range(0, len(s), _BATCH):
-            each = np.repeat(s[a : a + _BATCH], i, axis=0)
-            rows = self._rows(each, np.tile(np.eye(i), (len(each) // i, 1)))
-            found[a : a + _BATCH] = (rows @ weights).reshape(-1, i, self.outputs)
-        return found.transpose(0, 2, 1) if slope is None else found.transpose(0, 2, 1) + slope
+        s = self._checked_many(queries)
+        batches = [self.query.jacobians(s[a : a + BLOCK]) for a in range(0, len(s), BLOCK)]
+        return np.concatenate(batches) if batches else np.empty((0, self.outputs, self._dimensions))
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
@@ -196,6 +189,18 @@ class Predictor(Immutable):
     def lambda_covariance(self) -> float:
         """lambda of the covariance [1 / (unit of the outputs)^2]."""
         return self.solution.hyperparameters.lambda_covariance
+
+    @property
+    def least_variance(self) -> float:
+        """Least variance of a via-point's values that rounding does not hide [unit of outputs^2].
+
+        A rate's, with a `VelocityKernel`, is 2 ell times that. `adapt` refuses smaller ones.
+        """
+        parameters, anywhere = self.solution.hyperparameters, Functionals(np.zeros((1, self._dimensions)))
+        penalty = parameters.lambda_covariance
+        if self.representation == "low_rank":
+            penalty = min(penalty, parameters.lambda_mean)
+        return float(least_variances(parameters, anywhere, penalty)[0, 0])
 
     @property
     def prior_mean(self) -> Array | AffineMean:

@@ -5,8 +5,9 @@ The paper, sections II-B and II-C.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -14,7 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp import named_arrays
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_kind, check_some, not_negative, numbers, one_of, positive, squared, whole
+from kmp.checks import (
+    Array,
+    brief,
+    check_kind,
+    check_some,
+    not_negative,
+    numbers,
+    one_of,
+    parts_of,
+    positive,
+    squared,
+    whole,
+)
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
@@ -26,8 +39,11 @@ from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Predictor
-from kmp.solution import Solution, mean_of
-from kmp.solving import solved
+from kmp.solution import Solution, mean_of, resolved
+from kmp.solving import LARGE, solved
+
+_REACH_STEPS = 300  # distances at which a via-point's effect is looked at
+_FREE = 1e6  # [unit of the outputs / unit of the inputs] the deviation of a rate that may be any
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,7 +115,8 @@ class KMP(Predictor, Plotted):
         whole("rank", rank)
         if positive("rank_tolerance", rank_tolerance) >= 1:
             raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
-        database = Database(Functionals.checked(s, directions), reference)
+        points = Functionals.checked(s, directions)
+        database = Database(points, resolved(parameters, points, reference))
         return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
 
     def adapt(
@@ -107,16 +124,19 @@ class KMP(Predictor, Plotted):
         inputs: ArrayLike,
         desired: Gaussians,
         *,
-        tolerance: float,
+        tolerance: float | None = None,
         directions: ArrayLike | None = None,
     ) -> KMP:
         """A new primitive that also goes through desired points: inputs (V, I), V normals.
 
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
         point of the *base's* reference takes the place of its nearest one (of all, where several
-        are equally near); any other is inserted. The order of the desired points does not matter.
-        Earlier via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the
-        base's, so that teaching here changes nothing elsewhere.
+        are equally near); any other is inserted. None is `base.spacing / 2`: evenly spaced points
+        are then replaced one by one. The order of the desired points does not matter. Earlier
+        via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the base's,
+        so that teaching here changes nothing elsewhere.
+
+        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows.
 
         Where a row of `directions` (V, I) [unit of the inputs] is not zero, that normal is of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
@@ -132,8 +152,11 @@ class KMP(Predictor, Plotted):
         via = numbers("inputs", inputs, "V", self._dimensions)
         check_gaussians("desired", desired)
         check_pairs("desired", via, desired, self.outputs)
+        if tolerance is None:
+            tolerance = self.base.spacing / 2
         not_negative("tolerance", tolerance)
         points = Functionals.checked(via, directions)
+        desired = resolved(self.solution.hyperparameters, points, desired)
         adapted = self._through(points, desired, tolerance)
         warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
         return adapted
@@ -163,7 +186,8 @@ class KMP(Predictor, Plotted):
 
         They hold at the inputs that they are given at; between them the mean may cross a little, so
         give them closer than the kernel is long. Later via-points obey them, and `base` is without.
-        The covariance is as without. For the dense representation.
+        The covariance is as without. The constraints need the dense representation: a low rank
+        primitive of up to 6000 numbers N O is solved anew for them.
 
         Raises ValueError if shapes do not agree, or the constraints cannot be met together.
         """
@@ -179,7 +203,14 @@ class KMP(Predictor, Plotted):
             constraints = solution.constraints.joined(constraints)
             solution = solution.solution
         if not isinstance(solution, Dense):
-            raise ValueError('constraints: representation "low_rank" given, "dense" needed; fit the primitive so.')
+            base = self.base.solution.database
+            if (size := base.reference.mean.size) > LARGE:
+                raise ValueError(
+                    f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} or the dense "
+                    'representation needed. Fit fewer points, or with representation="dense".'
+                )
+            dense = KMP(Dense(solution.hyperparameters, base), base.unchanged())
+            return self._on(dense).constrained(constraints)
         return KMP(Constrained(solution, constraints).solved(), self.changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
@@ -187,9 +218,9 @@ class KMP(Predictor, Plotted):
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        points = self.base.solution.database.functionals
+        points, parameters = self.base.solution.database.functionals, self.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
-        database, parameters = Database(points, reference), self.solution.hyperparameters
+        database = Database(points, resolved(parameters, points, reference))
         fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
         return self._on(fitted)
 
@@ -207,8 +238,9 @@ class KMP(Predictor, Plotted):
         check_some("inputs", added)
         check_gaussians("reference", reference)
         check_pairs("reference", added, reference, self.outputs)
-        more = Database(Functionals.checked(added, directions), reference)
         before: Solution = self.base.solution
+        points = Functionals.checked(added, directions)
+        more = Database(points, resolved(before.hyperparameters, points, reference))
         database = before.database.joined(more)
         grown = (
             before.extended(database)
@@ -267,6 +299,78 @@ class KMP(Predictor, Plotted):
     def _count(self) -> int:
         return len(self.base.inputs)
 
+    def with_lambda_covariance(self, lambda_covariance: float) -> KMP:
+        """This primitive with another lambda of the covariance: the mean stays, bit for bit.
+
+        A larger lambda_covariance makes the predicted deviations smaller far from the points.
+        Raises ValueError if it is not above 0, or the equations cannot be solved with it.
+        """
+        other = positive("lambda_covariance", lambda_covariance)
+
+        parameters = replace(self.solution.hyperparameters, lambda_covariance=other)
+        before = self.base.solution
+        base = KMP(before.with_hyperparameters(parameters).with_weights(before.weights).solved(), self.base.changes)
+        if self is self.base:
+            return base
+        adapted: Solution = base.solution.adapted(self.changes) if len(self.via_inputs) else base.solution
+        if isinstance(self.solution, Constrained) and isinstance(adapted, Dense):
+            adapted = Constrained(adapted, self.solution.constraints)
+        return KMP(adapted.with_weights(self.solution.weights).solved(), self.changes, base)
+
+    def adapt_many(
+        self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
+    ) -> tuple[KMP, ...]:
+        """A new primitive for each of several pairs of inputs (V, I) and V normals, as by `adapt`.
+
+        Each is adapted from this primitive, not from the one before it: several goals to choose
+        from, several people, several rollouts. Raises ValueError as `adapt` does.
+        """
+        pairs = parts_of("points", points)
+        for i, one in enumerate(pairs):
+            if not (isinstance(one, (tuple, list)) and len(one) == 2):
+                raise ValueError(f"points[{i}]: {brief(one)} given, a pair of inputs (V, I) and V normals needed.")
+        return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
+
+    def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
+        """Distances (I,) [unit of the inputs] up to which a via-point at `query` (I,) matters.
+
+        An exact via-point is inserted at the query (I,), some distance off the mean there. Along
+        each input, either way and within the range of the reference points, this is the largest
+        distance at which the mean moves by at least `share` of that. It depends on ell, on lambda
+        and on how certain the reference is.
+
+        Raises ValueError if the shape is another, a number is not finite, or the share is not
+        between 0 and 1.
+        """
+        s = self._one_query(query)
+        if not 0 < positive("share", share) < 1:
+            raise ValueError(f"share is {share:g}, and must be between 0 and 1.")
+        values = self.outputs // self.kernel.channels
+        desired = Gaussians.of(self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs])
+        point = Functionals(s[None])
+        adapted = self._through(point, resolved(self.solution.hyperparameters, point, desired), 0.0)
+        found = np.empty(len(s))
+        for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
+            r = np.linspace(0.0, farthest, _REACH_STEPS)
+            path = np.tile(s, (2, len(r), 1))
+            path[:, :, i] += [r, -r]
+            moved = np.linalg.norm(
+                (adapted.mean(flat := path.reshape(-1, len(s))) - self.mean(flat))[:, :values], axis=1
+            )
+            matters = moved.reshape(2, -1) >= share * moved[0]
+            if self.kernel.period is None:  # beyond the data the mean is an extrapolation
+                matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (path[:, :, i] <= self.inputs[:, i].max())
+            found[i] = r[matters.any(axis=0)].max(initial=0.0)
+        return found
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance from a point of the reference to its nearest other one [unit of inputs].
+
+        Points that are derivatives, or equal to another, are left out; 0 where there is one point.
+        """
+        return self.solution.database.spacing(self.kernel.period)
+
     @property
     def base(self) -> KMP:
         """The primitive before any adaptation: itself, if there was none."""
@@ -296,6 +400,14 @@ class KMP(Predictor, Plotted):
     def via_points(self) -> Gaussians:
         """The V via-points."""
         return self.changes.points
+
+
+def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:
+    """Distances (I,) along each input, at which the kernel has fallen to exp(-9); half a period."""
+    if kernel.period is not None:
+        return np.full(inputs, kernel.period / 2)
+    scale, stretch = kernel.coordinates(inputs)
+    return np.asarray(3.0 / (np.sqrt(scale) * stretch))
 
 
 def checked_primitive(value: object, name: str = "primitive") -> KMP:

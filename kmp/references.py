@@ -226,14 +226,15 @@ class LocalKMP(Immutable, Plotted):
         """The mean (M, O) [unit of the outputs] of `predict`. Raises ValueError as that does."""
         return self.predict(queries).mean
 
-    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> LocalKMP:
+    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float | None = None) -> LocalKMP:
         """A new skill through desired points (V, I), V normals in the world's coordinates.
 
         They are mapped into each frame, where `tolerance` [unit of the inputs] is that of
         `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
-        not_negative("tolerance", tolerance)
+        if tolerance is not None:
+            not_negative("tolerance", tolerance)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
         pairs = zip(self.frames, self.primitives, strict=True)
         adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)

@@ -108,6 +108,9 @@ class Conditioned(Immutable):
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         return self.base.adapted(changes)
 
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Conditioned:
+        return Conditioned(self.base.with_hyperparameters(hyperparameters), self.changes)
+
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
 

@@ -15,18 +15,18 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     The last `added` reference points are via-points. Let K = Z^T Z + E: E is positive semidefinite
     and its diagonal e is known. Let alpha = Sigma^-1 (mu - xi) / lambda, the prior mean subtracted.
 
-    At any query: the gradient of the cost (4) at the mean xi is 2 lambda h, h = xi - sum_n k(., s_n)
-    alpha_n, and its Hessian is at least 2 lambda. So the mean is at most |h| from the least cost's,
-    in the norm of the kernel, and at most sqrt(k(s, s)) |h| at a query s. |h|^2 is at most |g|^2 +
-    (sum_n sqrt(e_n) |alpha_n|)^2, with g = Z alpha - w, which is what the low rank equations leave.
+    At any query: the gradient of the cost (4) at the mean xi is 2 lambda h with h = xi - sum_n
+    k(., s_n) alpha_n, and its Hessian is at least 2 lambda. So the mean is at most |h| from the one
+    of least cost, in the norm of the kernel, and at most sqrt(k(s, s)) |h| at a query s. |h|^2 is
+    at most |g|^2 + (sum_n sqrt(e_n) |alpha_n|)^2, where g = Z alpha - w is what the solution of the
+    low rank equations leaves.
 
-    At the reference points: the least of two bounds. The low rank solution is the dense one for means moved by delta = K alpha - xi, the prior mean
-    subtracted, and off by (I - S) delta, where S smooths: |Sigma^-1/2 (I - S) delta| is at most
-    |Sigma^-1/2 delta|, and sqrt(lambda) / 2 |g| where delta = Z^T g. So count E alpha, of which
-    element n is at most sqrt(e_n) sum_m sqrt(e_m) |alpha_m|, and g = Z alpha - w, by which the low
-    rank equations are not solved. This is the lower where the rank suffices.
-    The cost (4) is quadratic and least at the dense solution: |Sigma^-1/2 df|^2 is at most what (4)
-    is.
+    At the reference points: the lesser of two bounds. The low rank solution is the dense one for
+    means moved by delta = K alpha - xi, and off by (I - S) delta, where S smooths: |Sigma^-1/2 (I -
+    S) delta| is at most |Sigma^-1/2 delta|, and sqrt(lambda) / 2 |g| where delta = Z^T g. So add
+    the bound of E alpha, of which element n is at most sqrt(e_n) sum_m sqrt(e_m) |alpha_m|, and
+    that of g. This is the lower one where the rank suffices. The other: the cost (4) is quadratic
+    and least at the dense solution, so |Sigma^-1/2 df|^2 is at most what (4) is.
     """
     kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
     points, reference, known = solution.database.functionals, solution.database.reference, solution.functionals

@@ -159,6 +159,9 @@ class LowRank(Immutable):
         features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
         return LowRank.fit(self.hyperparameters, database, features, base)
 
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> LowRank:
+        return LowRank(hyperparameters, self.database, self.features, self.information, self.w)
+
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
 
