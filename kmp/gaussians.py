@@ -51,7 +51,7 @@ class Gaussians(Immutable):
         deviations = real("deviation", deviation)
         if deviations.shape not in {(), means.shape[1:], means.shape}:
             wanted = f"(), {means.shape[1:]} or {means.shape}"
-            raise ValueError(f"deviation: shape {deviations.shape} given, {wanted} needed for means of {means.shape}.")
+            raise ValueError(f"deviation: shape {deviations.shape} given, {wanted} needed for a mean of {means.shape}.")
         check_finite("deviation", deviations)
         if (deviations < 0).any():
             raise ValueError(f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact.")

@@ -5,15 +5,15 @@ The paper, sections II-B and II-C.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, cast
+from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from kmp import named_arrays
 from kmp.affine_mean import AffineMean
 from kmp.checks import (
     Array,
@@ -35,6 +35,7 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
+from kmp.inner import Inner
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
 from kmp.plot import Plotted, Points, Shown
@@ -50,13 +51,12 @@ _FREE = 1e6  # [unit of the outputs / unit of the inputs] the deviation of a rat
 class KMP(Predictor, Plotted):
     """A skill: a reference database, the via-points in it, and its solution.
 
-    Made by `fit`, `adapt` and `from_arrays`. N points in all, I inputs, O outputs. Immutable, so
+    Made by `fit`, `adapt` and `load`. N points in all, I inputs, O outputs. Immutable, so
     that threads may share it. What is fitted depends on the database and the parameters alone, bit
     for bit, however the primitive came about; after `extended`, but for rounding.
     """
 
-    solution: Solution
-    changes: Changes
+    inner: Inner
     _base: KMP | None = None
 
     def __repr__(self) -> str:
@@ -117,7 +117,7 @@ class KMP(Predictor, Plotted):
             raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
         points = Functionals.checked(s, directions)
         database = Database(points, resolved(parameters, points, reference))
-        return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
+        return cls(Inner.of_base(solved(parameters, database, representation, rank, rank_tolerance)))
 
     def adapt(
         self,
@@ -156,9 +156,9 @@ class KMP(Predictor, Plotted):
             tolerance = self.base.spacing / 2
         not_negative("tolerance", tolerance)
         points = Functionals.checked(via, directions)
-        desired = resolved(self.solution.hyperparameters, points, desired)
+        desired = resolved(self.inner.solution.hyperparameters, points, desired)
         adapted = self._through(points, desired, tolerance)
-        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
@@ -178,7 +178,7 @@ class KMP(Predictor, Plotted):
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
         adapted = self._through(points, desired, 0.0)
-        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
@@ -198,30 +198,30 @@ class KMP(Predictor, Plotted):
         ):
             if given != needed:
                 raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
-        solution: Solution = self.solution
+        solution: Solution = self.inner.solution
         if isinstance(solution, Constrained):
             constraints = solution.constraints.joined(constraints)
             solution = solution.solution
         if not isinstance(solution, Dense):
-            base = self.base.solution.database
+            base = self.base.inner.solution.database
             if (size := base.reference.mean.size) > LARGE:
                 raise ValueError(
                     f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} or the dense "
                     'representation needed. Fit fewer points, or with representation="dense".'
                 )
-            dense = KMP(Dense(solution.hyperparameters, base), base.unchanged())
+            dense = KMP(Inner.of_base(Dense(solution.hyperparameters, base)))
             return self._on(dense).constrained(constraints)
-        return KMP(Constrained(solution, constraints).solved(), self.changes, self.base)
+        return self._changed(Constrained(solution, constraints), self.inner.changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        points, parameters = self.base.solution.database.functionals, self.solution.hyperparameters
+        points, parameters = self.base.inner.solution.database.functionals, self.inner.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
         database = Database(points, resolved(parameters, points, reference))
-        fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
+        fitted = KMP(Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE)))
         return self._on(fitted)
 
     def extended(self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None) -> KMP:
@@ -238,7 +238,7 @@ class KMP(Predictor, Plotted):
         check_some("inputs", added)
         check_gaussians("reference", reference)
         check_pairs("reference", added, reference, self.outputs)
-        before: Solution = self.base.solution
+        before: Solution = self.base.inner.solution
         points = Functionals.checked(added, directions)
         more = Database(points, resolved(before.hyperparameters, points, reference))
         database = before.database.joined(more)
@@ -247,57 +247,67 @@ class KMP(Predictor, Plotted):
             if isinstance(before, Dense)
             else solved(before.hyperparameters, database, self.representation, RANK, TOLERANCE)
         )
-        return self._on(KMP(grown, database.unchanged()))
-
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
-        return named_arrays.to_arrays(self.base.solution, self.changes, self.solution)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> KMP:
-        """The primitive that `to_arrays` gave these arrays for, with its very weights.
-
-        Other names are left alone. The factors are made when `predict` or `adapt` first asks for
-        them, and come out the same bit for bit, given the same libraries and kind of processor.
-        Raises ValueError if an array is missing, or the arrays do not go together.
-        """
-        base, changes, solution = named_arrays.from_arrays(arrays)
-        unadapted = cls(base, base.database.unchanged())
-        return unadapted if solution is base else cls(solution, changes, unadapted)
+        return self._on(KMP(Inner.of_base(grown)))
 
     def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
         if len(points) == 0:
             return self
-        before = self.changes
-        nearest = self.base.solution.database.nearest(points, tolerance, self.kernel.period)
+        before = self.inner.changes
+        nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
         changes = Changes(
             frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
             Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )
-        return KMP(self.solution.adapted(changes).solved(), changes, self.base)
+        return self._changed(self.inner.solution.adapted(changes), changes, self.base)
 
     def _on(self, fitted: KMP) -> KMP:
         """This primitive's via-points and constraints on another base."""
         if self is self.base:
             return fitted
-        changed: Solution = fitted.solution.adapted(self.changes) if len(self.via_inputs) else fitted.solution
-        before: Solution = self.solution
+        return self._changed(self._solution_on(fitted), self.inner.changes, fitted)
+
+    def _solution_on(self, base: KMP) -> Solution:
+        """The solution of another base with this primitive's via-points and constraints."""
+        before: Solution = self.inner.solution
+        changed: Solution = base.inner.solution
+        if len(self.via_inputs):
+            changed = changed.adapted(self.inner.changes)
         if isinstance(before, Constrained) and isinstance(changed, Dense):
-            changed = Constrained(changed, before.constraints)
-        return KMP(changed.solved(), self.changes, fitted)
+            return Constrained(changed, before.constraints)
+        return changed
 
     def to_plot(self) -> Shown:
         """Its references and via-points that are values."""
-        known, count = self.solution.database, len(self.inputs) - len(self.via_inputs)
+        known, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
         values = known.functionals.values
         before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
         references, via = (Points(self.inputs[part], known.reference.take(part)) for part in (before, taught))
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
-    @property
-    def _count(self) -> int:
-        return len(self.base.inputs)
+    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
+        """Writes the primitive, and the units of its numbers, to an .npz file: as `kmp.save` does.
+
+        Raises OSError if the file cannot be written.
+        """
+        from kmp.storage import save
+
+        save(path, self, input_unit=input_unit, output_unit=output_unit)
+
+    @classmethod
+    def load(cls, path: str | Path) -> KMP:
+        """The primitive that `save` wrote; `kmp.load` gives its units too.
+
+        Raises OSError if the file cannot be read, and ValueError if it holds no primitive.
+        """
+        from kmp.storage import load
+
+        return load(path).primitive
+
+    @staticmethod
+    def _changed(solution: Solution, changes: Changes, base: KMP) -> KMP:
+        """The primitive of a base with these changes, solved."""
+        return KMP(Inner(solution.solved(), changes, base.inner.count), base)
 
     def with_lambda_covariance(self, lambda_covariance: float) -> KMP:
         """This primitive with another lambda of the covariance: the mean stays, bit for bit.
@@ -306,16 +316,13 @@ class KMP(Predictor, Plotted):
         Raises ValueError if it is not above 0, or the equations cannot be solved with it.
         """
         other = positive("lambda_covariance", lambda_covariance)
-
-        parameters = replace(self.solution.hyperparameters, lambda_covariance=other)
-        before = self.base.solution
-        base = KMP(before.with_hyperparameters(parameters).with_weights(before.weights).solved(), self.base.changes)
+        parameters = replace(self.inner.solution.hyperparameters, lambda_covariance=other)
+        before = self.base.inner.solution
+        base = KMP(Inner.of_base(before.with_hyperparameters(parameters).with_weights(before.weights).solved()))
         if self is self.base:
             return base
-        adapted: Solution = base.solution.adapted(self.changes) if len(self.via_inputs) else base.solution
-        if isinstance(self.solution, Constrained) and isinstance(adapted, Dense):
-            adapted = Constrained(adapted, self.solution.constraints)
-        return KMP(adapted.with_weights(self.solution.weights).solved(), self.changes, base)
+        weighted = self._solution_on(base).with_weights(self.inner.solution.weights)
+        return self._changed(weighted, self.inner.changes, base)
 
     def adapt_many(
         self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
@@ -348,7 +355,7 @@ class KMP(Predictor, Plotted):
         values = self.outputs // self.kernel.channels
         desired = Gaussians.of(self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs])
         point = Functionals(s[None])
-        adapted = self._through(point, resolved(self.solution.hyperparameters, point, desired), 0.0)
+        adapted = self._through(point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0)
         found = np.empty(len(s))
         for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
@@ -369,7 +376,7 @@ class KMP(Predictor, Plotted):
 
         Points that are derivatives, or equal to another, are left out; 0 where there is one point.
         """
-        return self.solution.database.spacing(self.kernel.period)
+        return self.inner.solution.database.spacing(self.kernel.period)
 
     @property
     def base(self) -> KMP:
@@ -379,27 +386,27 @@ class KMP(Predictor, Plotted):
     @property
     def inputs(self) -> Array:
         """(N, I) the reference points: the base's that were not replaced, then the via-points."""
-        return self.solution.database.inputs
+        return self.inner.solution.database.inputs
 
     @property
     def reference(self) -> Gaussians:
         """The N reference points."""
-        return self.solution.database.reference
+        return self.inner.solution.database.reference
 
     @property
     def via_inputs(self) -> Array:
         """(V, I) where the via-points are."""
-        return self.changes.inputs
+        return self.inner.changes.inputs
 
     @property
     def via_directions(self) -> Array:
         """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
-        return self.changes.functionals.along
+        return self.inner.changes.functionals.along
 
     @property
     def via_points(self) -> Gaussians:
         """The V via-points."""
-        return self.changes.points
+        return self.inner.changes.points
 
 
 def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 
+import numpy as np
+
 from kmp.checks import RankReached
 from kmp.database import Database
 from kmp.dense import Dense
@@ -11,11 +13,11 @@ from kmp.hyperparameters import Hyperparameters
 from kmp.low_rank import Features, LowRank
 from kmp.solution import Solution, is_resolved
 
-_SMALL = 450  # numbers N O up to which the dense solution takes a millisecond at most
+_TINY = 450  # numbers N O up to which the dense solution takes a millisecond at most
+_SMALL = 1500  # numbers N O up to which a look for the rank of several inputs costs more than it may save
 LARGE = 6000  # numbers N O above which the dense solution takes seconds and 300 MB
-_LOW = 0.3  # rank over N C, up to which the low rank solution is the faster one
-_PROBE = 1 / 16  # of N C: the rank of a first look
-_PROMISING = 0.1  # share of k(s, s) left by that first look, above which the rank is not low
+_LOW_SMALL, _LOW = 0.2, 0.45  # rank over N C up to which the low rank solution is the faster one
+_RANK_AT_0, _RANK_PER_LENGTH = 8.0, 3.5  # rank = 8 + 3.5 range sqrt(ell) of one input, measured
 _ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever was asked for
 
 
@@ -51,10 +53,12 @@ def solved(
 
 
 def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
-    """Whether a first look at the kernel allows a low rank."""
-    size = database.reference.mean.size
-    if not _SMALL < size <= LARGE:
-        return size > LARGE
-    rank = int(_PROBE * len(database) * parameters.kernel.channels)
-    _, residual = Features.of(parameters.kernel, database.functionals, rank=rank, tolerance=_PROMISING)
-    return residual <= _PROMISING
+    """Whether the low rank solution may be the faster one, before any feature is made."""
+    size, kernel = database.reference.mean.size, parameters.kernel
+    if size <= _TINY or size > _SMALL:
+        return size > _SMALL
+    if database.inputs.shape[1] > 1:  # the rank grows with the number of inputs
+        return False
+    length = np.ptp(database.inputs) if kernel.period is None else kernel.period
+    expected = _RANK_AT_0 + _RANK_PER_LENGTH * length * np.sqrt(np.max(kernel.ell))
+    return bool(expected <= _LOW_SMALL * len(database) * kernel.channels)

@@ -57,7 +57,7 @@ out = np.zeros(1000)
 compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
 s = random.normal(size=(37, 3))
-query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).query
+query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
 from kmp.compiled_query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))

@@ -22,6 +22,12 @@ def base(representation="dense", **options):
     return KMP.fit(T, REFERENCE, representation=representation, **options)
 
 
+def many():
+    inputs = np.linspace(0, 2, 3001)[:, None]
+    reference = Gaussians.of(np.hstack([np.sin(3 * inputs), np.cos(2 * inputs)]), deviation=0.03)
+    return KMP.fit(inputs, reference, kernel=GaussianKernel(5.0), lambda_mean=1.0)
+
+
 def violation(skill, constraints=LOW):
     slack = (skill.mean(constraints.inputs) * constraints.normals).sum(axis=1) - constraints.bounds
     return max(-slack.min(), 0.0)
@@ -124,7 +130,8 @@ def test_files_and_pickles_give_it_back_bit_for_bit(tmp_path, adapted):
 
 
 def test_a_low_rank_is_solved_anew_for_constraints():
-    dense, low = (base(one).adapt([[0.1]], Gaussians([[0.3, 0.9]], [1e-4 * np.eye(2)]), tolerance=0) for one in KINDS)
+    via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
+    dense, low = (base(one).adapt(*via, tolerance=0) for one in ("dense", "low_rank"))
     assert low.representation == "low_rank"
     constrained = low.constrained(LOW)
     assert violation(constrained) < 1e-9
