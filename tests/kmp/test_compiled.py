@@ -77,6 +77,26 @@ def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
     assert native == generic
 
 
+FIRST = """
+import numpy as np
+from kmp import KMP, GaussianKernel, Gaussians
+skill = KMP.fit([[0.0], [1.0]], Gaussians.of([[0.0], [1.0]], deviation=0.1), kernel=GaussianKernel(1.0), lambda_mean=1)
+print(skill.mean([[0.5]]), skill.jacobian([0.5]))
+"""
+
+
+def test_the_first_compilation_is_announced_once_and_what_is_cached_is_not(tmp_path):
+    command = [sys.executable, "-c", FIRST]
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True) for _ in range(2)
+    )
+    assert first.stderr.splitlines() == [
+        "kmp compiles its loops for this machine: some seconds, once; later runs load them from its cache."
+    ]
+    assert (second.stdout, second.stderr) == (first.stdout, "")
+
+
 def test_exponentials_are_right_to_a_unit_in_the_last_place():
     values = np.concatenate([np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]])
     found = values.copy()
