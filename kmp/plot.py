@@ -193,4 +193,4 @@ def _add_legend(axes: Axes) -> None:
     named = dict(zip(reversed(labels), reversed(handles), strict=True))
     look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}
     order = sorted(named, key=labels.index)
-    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=6, **look)
+    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, **look)
