@@ -203,7 +203,7 @@ class OrientationKMP(Immutable):
             smallest = np.linalg.eigvalsh(given[n])[0]
             raise ValueError(
                 f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is {smallest:.3g}, and "
-                f"{4 * least:.3g} is enough. Give 0 for the least, or the primitive a larger lambda_covariance."
+                f"{4.1 * least:.2g} is enough. Give 0 for the least, or the primitive a larger lambda_covariance."
             )
         return np.where(exact, Gaussians.of(np.zeros(3), deviation=0).covariance, turned)
 

@@ -115,16 +115,19 @@ def check_resolved(
     *,
     first: int = 0,
     name: Literal["lambda_mean", "lambda_covariance"] = "lambda_covariance",
+    both: bool = False,
 ) -> None:
     """Raises ValueError where rounding would hide what lambda Sigma adds to k(s, s).
 
-    The points are numbered from the `first` on; `name` says which lambda.
+    The points are numbered from the `first` on; `name` says which lambda. The least variance that
+    the message names is for that lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
     least = penalty * _least_shares(parameters, points)
     for n in np.flatnonzero(least < _RESOLVED)[:1]:
         enough = penalty * _RESOLVED / max(least[n], 1e-300)
-        accepted = least_variances(parameters, points.functionals.take(slice(n, n + 1)), penalty)[0]
+        smaller = min(parameters.lambda_mean, parameters.lambda_covariance) if both else penalty
+        accepted = least_variances(parameters, points.functionals.take(slice(n, n + 1)), smaller)[0]
         of = ("",) if len(accepted) == 1 else (" of the values", " of their rates")
         named = " and ".join(f"{one:.2g}{what}" for one, what in zip(accepted, of, strict=True))
         raise ValueError(

@@ -161,7 +161,9 @@ class Conditioned(Immutable):
 
     def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
         parameters, added = self.hyperparameters, Database(self.changes.functionals, self.changes.points)
-        check_resolved(parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name)
+        check_resolved(
+            parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name, both=True
+        )
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
         first = self._added_columns

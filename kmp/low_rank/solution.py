@@ -61,7 +61,7 @@ class LowRank(Immutable):
 
         Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
         """
-        check_resolved(hyperparameters, database, name="lambda_mean")
+        check_resolved(hyperparameters, database, name="lambda_mean", both=True)
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
@@ -201,7 +201,7 @@ class LowRank(Immutable):
     def covariance_factor(self) -> Array:
         """The same with the lambda of the covariance."""
         parameters = self.hyperparameters
-        check_resolved(parameters, self.database)
+        check_resolved(parameters, self.database, both=True)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self.mean_factor
         return _factorised(self.information, parameters.lambda_covariance)
