@@ -11,7 +11,7 @@ kernel with parameter ell, K its matrix (N, N), lambda the weight of the penalty
 fitted weights.
 """
 
-from typing import TYPE_CHECKING, Any
+import typing
 
 from kmp.affine_mean import AffineMean
 from kmp.checks import RankReached, ViaPointMissed
@@ -30,7 +30,7 @@ from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
-if TYPE_CHECKING:
+if typing.TYPE_CHECKING:
     from kmp.estimator import KMPRegressor as KMPRegressor
 
 __version__ = "0.1.0"
@@ -65,7 +65,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> typing.Any:
     """`KMPRegressor`, imported when it is first needed, as scikit-learn loads slowly."""
     if name == "KMPRegressor":
         from kmp.estimator import KMPRegressor

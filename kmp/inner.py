@@ -1,6 +1,6 @@
 """The inside of a primitive, for the package itself, its tests and those who extend it.
 
-It may change in any version. `KMP.inner` is the only door to it.
+It may change in any version. `KMP.inner` is the only way to it.
 """
 
 from __future__ import annotations

@@ -91,10 +91,10 @@ class KMP(Predictor, Plotted):
 
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
         (4) on at most `rank` features of the kernel, which leave a share of at most
-        `rank_tolerance` of it at the inputs. "auto" is low rank where that is the faster one: over time
-        from about 200 points on, for more inputs from 1500 numbers N O on, if the rank is low and
-        no digits are lost. A rank that did not suffice is said in a `RankReached` warning, with the
-        accuracy lost.
+        `rank_tolerance` of it at the inputs. "auto" is low rank where that is the faster one: over
+        time from about 200 points on, for more inputs from 1500 numbers N O on, if the rank is low
+        and no digits are lost. A rank that did not suffice is said in a `RankReached` warning, with
+        the accuracy lost.
 
         Raises ValueError if there is no point, shapes do not agree, a number is not finite, a
         parameter is out of its range, or the equations cannot be solved to working precision.
