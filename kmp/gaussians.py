@@ -160,8 +160,12 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
         fault = f"is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}"
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
+    own = np.diagonal(covariance, axis1=1, axis2=2)
+    alone = np.count_nonzero(covariance, axis=2) == 1
+    exact = alone & (own > 0) & (own < _EXACT_BELOW)  # `Gaussians.of` makes these, and others beside them
+    filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
     try:
-        smallest = np.linalg.eigvalsh(covariance)[:, 0]
+        smallest = np.linalg.eigvalsh(filled)[:, 0]
     except np.linalg.LinAlgError:
         raise ValueError(f"{name}: {brief(value)} given, and its eigenvalues cannot be found.") from None
     for n in np.flatnonzero(smallest <= covariance.shape[1] * _MACHINE * size)[:1]:

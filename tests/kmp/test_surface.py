@@ -54,7 +54,12 @@ def test_normals_of_means_and_deviations():
     assert (len(one), one.outputs) == (1, 2)
     np.testing.assert_allclose(one.covariance, [np.diag([0.01, 0.04])])
     assert not one.exact.any()
-    assert Gaussians.of(VALUES, deviation=[0.0, 0.1]).exact[5].tolist() == [True, False]
+    mixed = Gaussians.of(VALUES, deviation=[0.0, 0.1])
+    assert mixed.exact[5].tolist() == [True, False]
+    again = Gaussians(mixed.mean, mixed.covariance)
+    assert np.array_equal(again.exact, mixed.exact)
+    with pytest.raises(ValueError, match="not positive definite"):
+        Gaussians([[0.0, 0.0]], [[[1.0, 1e-3], [1e-3, 1e-200]]])
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
@@ -115,6 +120,15 @@ def test_a_learned_orientation_names_the_least_variance_of_a_rotation_or_takes_0
         for covariance in (enough * np.eye(3), np.zeros((3, 3))):
             found = skill.adapt([[1.0]], upright, covariance).mean([[1.0]])
             assert abs(found[0, 3]) > 1 - 1e-5
+
+
+def test_in_frames_too_a_place_is_exact():
+    takes = [(T, VALUES + 0.1 * n) for n in range(3)]
+    frames = [(kmp.CoordinateFrame.at(one[0]), kmp.CoordinateFrame.at(one[-1])) for _, one in takes]
+    options = {"kernel": GaussianKernel(8.0), "lambda_mean": 0.1, "components": 5, "seed": 0}
+    skill = kmp.LocalKMP.learn(takes, frames, T, **options)
+    through = skill.adapt([[1.0]], Gaussians.of([0.5, 0.5], deviation=0))
+    np.testing.assert_allclose(through.mean([[1.0]]), [[0.5, 0.5]], atol=1e-3)
 
 
 def test_the_default_tolerance_replaces_the_nearest_point_of_an_even_reference():
