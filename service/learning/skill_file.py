@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP
+from kmp.named_arrays import from_arrays, to_arrays
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
 from service.contract.printable import printable, printable_lines
@@ -116,7 +117,7 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         components=np.array(skill.components),
         places=np.array(msgspec.json.encode(skill.via_points).decode()),
         tolerance=np.array(skill.tolerance),
-        **skill.model.primitive.to_arrays(),
+        **to_arrays(skill.model.primitive),
     )
     if skill.conductor is not None:
         arrays["conductor"] = np.array(skill.conductor)
@@ -126,10 +127,10 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         arrays["figures"] = np.array(skill.figures)
     arrays |= skill.model.own_arrays()
     if skill.turn:
-        arrays |= {TURN + name: array for name, array in skill.turn.primitive.to_arrays().items()}
+        arrays |= {TURN + name: array for name, array in to_arrays(skill.turn.primitive).items()}
         arrays[TURN + "auxiliary"] = skill.turn.auxiliary
     if skill.gripper:
-        arrays |= {GRIPPER + name: array for name, array in skill.gripper.primitive.to_arrays().items()}
+        arrays |= {GRIPPER + name: array for name, array in to_arrays(skill.gripper.primitive).items()}
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
 
@@ -170,8 +171,8 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             components=int(arrays["components"]),
             via_points=via_points,
             tolerance=float(arrays["tolerance"]),
-            turn=LearnedOrientation(KMP.from_arrays(turn), turn["auxiliary"]) if turn else None,
-            gripper=LearnedGripper(KMP.from_arrays(gripper)) if gripper else None,
+            turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
+            gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),
