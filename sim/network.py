@@ -103,7 +103,8 @@ class Commands:
         """Keep one command. Only the first answer to each new hand stamp tells of latency."""
         now_ns, now = time.time_ns(), time.perf_counter_ns()
         try:
-            command = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), self._names)
+            message = cdr.decode_joints(sample.payload.to_bytes())
+            command = messages.in_order(message, self._names)
             attachment = cdr.decode_attachment(sample.attachment.to_bytes()) if sample.attachment else None
             if not messages.finite(command[0] + command[1]):
                 raise messages.WireError("a joint that is not finite")
@@ -114,7 +115,7 @@ class Commands:
             return
         with self._lock:
             self._newest = command
-            self._queue.append(Command(0, *command, *(attachment or (-1, 0, 0))))
+            self._queue.append(Command(message.stamp_ns, *command, *(attachment or (-1, 0, 0))))
             self.count += 1
             if self._last_ns:
                 self.largest_gap_ms = max(self.largest_gap_ms, (now - self._last_ns) / 1e6)
@@ -140,19 +141,23 @@ class Commands:
 class Led:
     """The bench's arm, led as `thirdhand follow` leads a real one."""
 
-    def __init__(self, bench: Bench, bridge: Bridge) -> None:
-        self._bench, self._bridge, self._period_s = bench, bridge, bench.period_s
+    def __init__(self, bench: Bench, commands: Commands, gripper: Gripper) -> None:
+        self._bench, self._commands, self._gripper = bench, commands, gripper
         names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
         more = {name: tuple(HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
         limits = msgspec.structs.replace(bench.limits, **more)
-        self._playback = Playback(limits, joints, tick_s=bench.period_s, period_s=bench.period_s)
+        self._playback = Playback(limits, joints, period_s=bench.period_s)
 
     def step(self, periods: int = 1) -> tuple[Observation, bool]:
-        """The bench a period later, of so many that passed, and whether commands came."""
-        commands = self._bridge.commands.queued()
-        moved = self._playback.step(commands, elapsed_s=periods * self._period_s)
+        """The bench a period later, of so many that passed, and whether commands came. Raises
+        BenchError where they come too slowly to be followed.
+        """
+        commands = self._commands.queued()
+        moved = self._playback.step(commands, elapsed_s=periods * self._bench.period_s)
+        if reason := self._playback.too_slow:
+            raise BenchError(f"the service: {reason}")
         position, velocity = tuple(moved.position.tolist()), tuple(moved.velocity.tolist())
-        return self._bench.step(position, velocity, gripper=self._bridge.gripper.newest), bool(commands)
+        return self._bench.step(position, velocity, gripper=self._gripper.newest), bool(commands)
 
 
 class Gripper:
@@ -268,7 +273,7 @@ def _play(
     rate_hz = round(1.0 / bench.period_s)
     hands_every = max(1, round(rate_hz / live.hands_hz))
     things_every = max(1, round(rate_hz / THINGS_HZ))
-    led = Led(bench, bridge)
+    led = Led(bench, commands, bridge.gripper)
     deadlines, before = Deadlines(rate_hz), -1
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running, spoke_s, quiet = False, 0.0, False

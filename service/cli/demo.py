@@ -14,7 +14,7 @@ from typing import Any
 
 from service.child import python
 from service.cli.progress import say
-from service.client import Client, open_session
+from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.launch import engine_of, launched, played
@@ -38,16 +38,17 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def run(
-    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int, say: Callable[[str], None]
+    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
-    engine, settings = engine_of(engine), cell_of(arm)
+    engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
+    if reason := no_room_to_brake(settings.period_s):
+        raise DemoError(reason)
     say("starting: the scene, then the service")
     out.mkdir(parents=True, exist_ok=True)
     request = _output("sim.scene", "--arm", arm, *([str(scene)] if scene else []), say=say)
-    bench = ["--engine", engine, "--arm", arm, *(["--scene", str(scene)] if scene else [])]
     add = decode_request(request.encode(), Add)
-    with launched(out, "--arm", "state", "--rate", str(rate_hz), settings=settings, record=out, say=say) as service:
+    with launched(out, "--joints", "state", settings=settings, record=out, say=say) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
@@ -56,6 +57,7 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
             report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()

@@ -219,7 +219,7 @@ def _of_unit(source: Source) -> str:
 
 def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
-        return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --arm state")
+        return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --joints state")
     commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
     told = f"{'somebody' if heard else 'nobody'} listens to {commands}"
     return judged(heard, "arm's driver", told, "a driver", f"let the arm's driver subscribe to {commands}")

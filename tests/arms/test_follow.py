@@ -209,7 +209,7 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     arm, told_so = SimulatedArm(Settings()), r"no command came on thirdhand/joints/command within 0\.3 s: is the daemon"
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
-        follow(arm, session, "thirdhand", tick_s=0.002, stop=threading.Event(), wait_s=0.3)
+        follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)
 
 
@@ -218,7 +218,7 @@ def test_the_joints_are_told_by_their_names() -> None:
         heard = session.declare_subscriber("thirdhand/joints/state", RingChannel(1))
         stop = threading.Event()
         arm = threading.Thread(
-            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"tick_s": 0.002, "stop": stop}
+            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"stop": stop}
         )
         arm.start()
         state = cdr.decode_joints(heard.recv().payload.to_bytes())
