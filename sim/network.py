@@ -49,7 +49,9 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     commands: int
     rejected: int
     largest_gap_ms: float  # between commands received
-    skipped: int  # periods that the bench itself missed
+    periods: int  # of the bench while the script ran
+    skipped: int  # of them the bench itself missed
+    longest_pause_ms: float  # of the bench
     begun_ns: int  # the system clock's time at which the script began
     seed: int
     scene: Scene
@@ -277,7 +279,7 @@ def _play(
     deadlines, before = Deadlines(rate_hz), -1
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running, spoke_s, quiet = False, 0.0, False
-    said = missed_before = sent_before = begun_ns = 0
+    said = missed_before = sent_before = begun_ns = begun_index = longest = 0
     say(
         f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
     )
@@ -286,6 +288,7 @@ def _play(
         now_s = index * bench.period_s
         if now_s >= live.duration_s:
             return
+        longest = max(longest, index - before)
         (seen, commanded), before = led.step(index - before), index
         bridge.publish_joints(seen)
         if commanded:
@@ -319,7 +322,7 @@ def _play(
                 bench.begin()
                 commands.restart()
                 running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent
-                begun_ns = time.time_ns()
+                begun_ns, begun_index, longest = time.time_ns(), index, 0
                 say("the script begins")
         else:
             for name in TaskEvents.__struct_fields__[said : bench.closed]:
@@ -331,7 +334,9 @@ def _play(
                         bench,
                         commands,
                         hands=bridge.hands_sent - sent_before,
+                        periods=index - begun_index,
                         skipped=deadlines.missed - missed_before,
+                        longest_pause_ms=1000 * longest * bench.period_s,
                         begun_ns=begun_ns,
                     )
                 )
@@ -352,7 +357,16 @@ def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> N
         bridge.publish_joints(led.step()[0])
 
 
-def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun_ns: int) -> RunReport:
+def _report(
+    bench: Bench,
+    commands: Commands,
+    *,
+    hands: int,
+    periods: int,
+    skipped: int,
+    longest_pause_ms: float,
+    begun_ns: int,
+) -> RunReport:
     events = bench.events()
     latencies = list(commands.latencies_ms)
     percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
@@ -365,7 +379,9 @@ def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun
         commands=commands.count,
         rejected=commands.rejected,
         largest_gap_ms=round(commands.largest_gap_ms, 3),
+        periods=periods,
         skipped=skipped,
+        longest_pause_ms=round(longest_pause_ms, 1),
         begun_ns=begun_ns,
         seed=bench.script.seed,
         scene=bench.scene,

@@ -17,6 +17,7 @@ from service.cli.progress import say
 from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
+from service.daemon.machine import LATE_MS, MISSED_SHARE
 from service.launch import engine_of, launched, played
 from service.shipped import cell_of
 
@@ -74,9 +75,11 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
     found = reported(recording)
     timing = found.columns.timing
+    busy = too_busy(report, status.busy)
     for name, event in report["events"].items():
         if not event["reached"]:
-            event["why"] = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+            why = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+            event["why"] = f"this machine was too busy, {busy}; {why}" if busy else why
     return {
         "success": report["success"],
         "events": report["events"],
@@ -87,9 +90,21 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
         "realtime": status.realtime,
+        "busy": busy,
         "recording": recording,
         "rrd": rrd,
     }
+
+
+def too_busy(report: dict[str, Any], service: str) -> str:
+    """How this machine was too busy for the bench, and for the service; empty where it was not."""
+    periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
+    bench = []
+    if skipped > MISSED_SHARE * periods:
+        bench.append(f"the bench missed {skipped} of its {periods} periods")
+    if pause_ms > LATE_MS:
+        bench.append(f"the bench stood still for {pause_ms:.0f} ms")
+    return ", ".join([*bench, *([service] if service else [])])
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
@@ -126,6 +141,7 @@ def text(report: dict[str, Any]) -> str:
         f"p99 {latency['p99']:.2f}, max {latency['max']:.2f} ms",
         f"  late     p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} µs;  "
         f"work p50 {work['p50']:.0f}, p99 {work['p99']:.0f}, max {work['max']:.0f} µs",
+        *([f"  machine  too busy: {report['busy']}"] if report["busy"] else []),
         "",
         f"  thirdhand replay {_shown(report['recording'])}",
         f"  thirdhand view {_shown(report['rrd'])}",

@@ -40,7 +40,7 @@ fault_error_rad = 0.5
 frame = "optitrack"
 stale_ms = 500
 """
-OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
+OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 def template() -> ModuleType:
