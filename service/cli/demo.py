@@ -75,11 +75,11 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
     found = reported(recording)
     timing = found.columns.timing
-    busy = too_busy(report, status.busy)
+    bench = too_busy(report)
     for name, event in report["events"].items():
         if not event["reached"]:
             why = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
-            event["why"] = f"this machine was too busy, {busy}; {why}" if busy else why
+            event["why"] = f"this machine was too busy, {bench}; {why}" if bench else why
     return {
         "success": report["success"],
         "events": report["events"],
@@ -90,21 +90,21 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
         "realtime": status.realtime,
-        "busy": busy,
+        "busy": ", ".join(filter(None, (bench, status.busy))),
         "recording": recording,
         "rrd": rrd,
     }
 
 
-def too_busy(report: dict[str, Any], service: str) -> str:
-    """How this machine was too busy for the bench, and for the service; empty where it was not."""
+def too_busy(report: dict[str, Any]) -> str:
+    """How this machine was too busy for the bench, by its report; empty where it was not."""
     periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
-    bench = []
+    found = []
     if skipped > MISSED_SHARE * periods:
-        bench.append(f"the bench missed {skipped} of its {periods} periods")
+        found.append(f"the bench missed {skipped} of its {periods} periods")
     if pause_ms > LATE_MS:
-        bench.append(f"the bench stood still for {pause_ms:.0f} ms")
-    return ", ".join([*bench, *([service] if service else [])])
+        found.append(f"the bench stood still for {pause_ms:.0f} ms")
+    return ", ".join(found)
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:

@@ -105,8 +105,8 @@ def test_a_service_that_stood_still_names_the_machine_before_the_tracker(tmp_pat
 
 
 def test_a_bench_that_skips_periods_is_told_by_the_demo() -> None:
-    calm, late = {"periods": 5000, "skipped": 20, "longest_pause_ms": 12.0}, "the loop was up to 45 ms late"
-    assert too_busy(calm, "") == ""
-    assert too_busy(calm | {"skipped": 400, "longest_pause_ms": 90.0}, late) == (
-        f"the bench missed 400 of its 5000 periods, the bench stood still for 90 ms, {late}"
+    calm = {"periods": 5000, "skipped": 20, "longest_pause_ms": 12.0}
+    assert too_busy(calm) == ""
+    assert too_busy(calm | {"skipped": 400, "longest_pause_ms": 90.0}) == (
+        "the bench missed 400 of its 5000 periods, the bench stood still for 90 ms"
     )
