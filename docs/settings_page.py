@@ -46,7 +46,9 @@ values that would have been accepted.
 * Units are part of the name (`_ms`, `_hz`, `_mb`) or stand in brackets in the last column.
 * Positions are in frame `base`, unless the last column names another frame.
 * Quaternions are x y z w. A pose is x y z in metres, then a quaternion.
-* Paths may begin with `~`. `[arm] urdf` and `[network] certificate` may be relative to the file.
+* Paths may begin with `~`. Relative paths of `[arm] urdf` and `packages`, `[network] certificate`
+  and `zenoh_config` start from the folder of the file, those of `[files]` from the folder where the
+  command runs.
 """
 
 

@@ -16,7 +16,15 @@ from service.client.session import (
     endpoints,
     open_session,
 )
-from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, publisher
+from service.client.streams import (
+    BRAKE_AFTER_S,
+    ENCODINGS,
+    Command,
+    Follower,
+    Tracker,
+    no_room_to_brake,
+    publisher,
+)
 
 __all__ = [
     "AUTHORITY",
@@ -40,6 +48,7 @@ __all__ = [
     "decoded",
     "endpoints",
     "living",
+    "no_room_to_brake",
     "open_session",
     "publisher",
     "why_silent",

@@ -40,6 +40,7 @@ class CellStatus(NamedTuple):
     settings: Settings
     failure: str = ""
     inside: Inside | None = None  # of an arm that is not ready
+    busy: str = ""  # how this machine was too busy when the arm stopped
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core knows nothing of."""
@@ -110,6 +111,7 @@ class CellStatus(NamedTuple):
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
+            busy=self.busy,
         )
 
     def _spare(self, name: str, source: Source) -> bool:
