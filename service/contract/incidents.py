@@ -53,6 +53,15 @@ class Outside(NamedTuple):
     unit: str = "rad"
 
 
+class Jump(NamedTuple):
+    """A joint that leapt from one state to the next."""
+
+    joint: str
+    before: float
+    after: float
+    unit: str = "rad"
+
+
 class Inside(NamedTuple):
     """A part of the arm that is inside of something."""
 
@@ -91,6 +100,8 @@ class Evidence(NamedTuple):
     newest_ns: int = 0  # stamp of the newest one accepted before
     frames: tuple[str, ...] = ()  # that are accepted
     mistake: str = ""  # in its unit, its names or its bytes
+    jump: Jump | None = None
+    held_up_s: float | None = None  # delay of the newest accepted one beyond the others; None: its clock differs
 
 
 NOTHING = Evidence()
@@ -236,7 +247,10 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
         case Cause.NOT_FINITE:
             also = f", orientation {figures(turned)}" if turned else ""
             about, found = "a NaN, an infinity", f"{at}{also}; finite numbers needed"
-            remedy = "publish nothing while the tracker has lost the hand, or the driver a joint"
+            remedy = "publish nothing while the tracker has lost the hand, or the driver a joint; "
+            remedy += "a joint's velocity may be NaN where it is not measured"
+            if (out := seen.outside) is not None:
+                found = f"{out.joint} at {out.value:g} {out.unit}; a finite number needed"
         case Cause.NOT_A_ROTATION:
             norm = sum(v * v for v in turned) ** 0.5
             about = "a quaternion that is not of norm 1"
@@ -256,12 +270,22 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
             found = f"stamped {-apart_s:.3g} s before the newest accepted one"
             remedy = "stop the second tracker or driver of this key; look for a network that reorders"
         case Cause.AHEAD:
-            about = "a stamp farther ahead than the time that has passed"
-            remedy = "mend the publisher's clock; it is believed once the source was silent"
+            about = "a stamp farther ahead than the time that has passed: its clock stepped, or samples were held up"
+            remedy = "mend the publisher's clock, or see what holds samples up; the status says which of the two; "
+            remedy += "accepted again once the source was silent"
             found = f"stamped {apart_s:.3g} s after the newest accepted one"
+            if came.stamp_ns and seen.held_up_s is None:
+                found += ": its clock stepped ahead"
+                remedy = "mend the publisher's clock; it is believed once the source was silent"
+            elif came.stamp_ns:
+                found += f", which was held up for {seen.held_up_s:.3g} s on its way; the clock is right"
+                remedy = "see what holds samples up: the network, or a publisher or daemon that is too busy"
         case Cause.JUMPED:
             about = "a hand or a joint that leapt; a hand is believed after three samples over 20 ms that agree"
             remedy, found = "look for reflections and for a second source", f"{at}, from one sample to the next"
+            if (jump := seen.jump) is not None:
+                found = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, "
+                found += "from one sample to the next"
         case Cause.SWAPPED:
             about = "a hand where the other one was, and the other where it was; believed after 2 s"
             remedy = "the tracker takes left for right: let it see both hands apart for a moment"
@@ -345,7 +369,7 @@ def _is_refused(source: Source) -> bool:
 def _of_rejected(seen: Evidence, *needed: str) -> str:
     """What to do about the first needed source whose samples are all rejected."""
     refused = (source for name in needed if (source := seen.sources.get(name)) is not None and _is_refused(source))
-    return next((BY_WORD[source.cause].remedy for source in refused), "")
+    return next((source.advice or BY_WORD[source.cause].remedy for source in refused), "")
 
 
 def _time(duration_ms: float) -> str:

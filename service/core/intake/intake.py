@@ -15,7 +15,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.channels import BY_KEY
-from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
+from service.contract.joint_states import measured
+from service.contract.messages import BASE, JointState, PoseStamped, WireError
 from service.contract.records import SIDES, SOURCES, Cause, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
@@ -79,11 +80,14 @@ def _stale_ticks(key: str, settings: Settings) -> int:
 
 
 class Refused(NamedTuple):
-    """A sample that was rejected, and the stamp [ns] of the newest one accepted before."""
+    """A sample that was rejected, the stamp [ns] of the newest one accepted before, and for the arm
+    the joints that one measured.
+    """
 
     cause: Cause
     sample: PoseStamped | JointState
     newest_ns: int
+    joints: tuple[float, ...] = ()
 
 
 class Intake:
@@ -169,7 +173,7 @@ class Intake:
     def take_arm(self, state: Record, sample: JointState) -> None:
         """The arm's sample into the state, or counted as rejected."""
         try:
-            position, velocity = in_order(sample, self._names)
+            position, velocity = measured(sample, self._names)
         except WireError:
             state["rejected"][Cause.INCOMPLETE] += 1
             self._note(state, ARM, Cause.INCOMPLETE, sample)
@@ -180,7 +184,8 @@ class Intake:
 
     def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
         newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
-        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns)
+        joints = tuple(state["measured"].tolist()) if source == ARM else ()
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
         self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other
 
 
