@@ -33,14 +33,16 @@ class JointStates:
     def __init__(self, names: tuple[str, ...], patience_s: float) -> None:
         self._names, self._patience_s = names, patience_s
         self._parts: dict[str, tuple[float, int, float, float]] = {}  # arrival [s], stamp [ns], position, velocity
-        self._state_s = math.nan  # arrival of the newest state
+        self._heard_s = -math.inf  # arrival of the newest message
+        self._state_s = -math.inf  # arrival of the newest state, or of the first message after a pause
 
     def take(self, message: JointState, at_s: float) -> JointState | None:
         """The state that a message completes, which arrived at a time [s]; None where it completes
         none.
         """
-        if math.isnan(self._state_s):
+        if at_s - self._heard_s > self._patience_s:
             self._state_s = at_s
+        self._heard_s = at_s
         carried = _carried(message.names, self._names) if len(message.position) == len(message.names) else ()
         if not carried:
             return None

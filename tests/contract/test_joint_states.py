@@ -59,6 +59,8 @@ def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_
         assert states.take(STATE._replace(position=()), at_s) is None  # velocities only
         if k % 10 == 0:
             assert states.take(STATE, at_s) is STATE
+    for k in range(300, 500):
+        assert states.take(fingers, k / 1000) is None
     assert states.incomplete(fingers, 0.5) is fingers
 
 
@@ -95,6 +97,14 @@ def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> Non
     assert lacking is not None
     with pytest.raises(WireError, match=r"joints \['c'\] missing among 2, a, b"):
         measured(lacking, NAMES)
+
+
+def test_after_a_pause_nothing_is_missing_at_once() -> None:
+    states = JointStates(NAMES, 0.1)
+    assert states.take(STATE, 0.0) is STATE
+    for message in (part("xy", 2), part("a", 2)):
+        assert states.take(message, 5.0) is None
+        assert states.incomplete(message, 5.0) is None
 
 
 def test_parts_that_are_too_old_are_not_assembled() -> None:
