@@ -45,6 +45,10 @@ class Limits(Protocol):
     def names(self) -> tuple[str, ...]:
         """In the order of the chain."""
 
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+
 
 def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     """The settings of an arm with a URDF of its own, with what that says where they are silent.
@@ -60,6 +64,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         )
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
+    joints.setdefault("kinds", [joint.kind for joint in moving])
     for name in ("lower", "upper", "velocity"):
         joints.setdefault(name, [getattr(joint, name) for joint in moving])
     wanted = (("joints", joints, "acceleration"), ("joints", joints, "jerk"), ("arm", arm, "posture"))
@@ -81,6 +86,9 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
         raise SettingsError(
             f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
         )
+    kinds = tuple(joint.kind for joint in moving)
+    if joints.every_kind != kinds:
+        raise SettingsError(f"$.joints.kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
     wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (

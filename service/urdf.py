@@ -10,6 +10,9 @@ from xml.etree import ElementTree
 from service.contract.explain import ExplainedError
 from service.contract.messages import Quaternion, Transform, Vector3
 
+KINDS = ("revolute", "continuous", "prismatic")  # of joints that an arm may have
+CONTINUOUS_RAD = 6000.0  # limit of a continuous joint each way: 950 turns, so that positions keep their precision
+
 
 class UrdfError(ExplainedError, ValueError):
     """A robot description that cannot be used: says what is wrong with it and what would do."""
@@ -17,7 +20,7 @@ class UrdfError(ExplainedError, ValueError):
 
 class Joint(NamedTuple):
     """A joint: the links it connects, where it sits in the parent, and for a movable one its axis
-    and limits [rad, rad/s].
+    and limits [rad, rad/s], of a prismatic one [m, m/s].
     """
 
     name: str
@@ -30,6 +33,7 @@ class Joint(NamedTuple):
     lower: float
     upper: float
     velocity: float
+    mimics: str = ""  # the joint whose motion it follows
 
 
 class Shape(NamedTuple):
@@ -82,39 +86,78 @@ class Urdf:
         return self._above.get(link)
 
     def movable(self, tip: str) -> tuple[Joint, ...]:
-        """The revolute joints from the root to link `tip`, in order.
+        """The joints from the root to link `tip` that turn or slide, in order; those of continuous
+        ones have the limits ±CONTINUOUS_RAD.
 
-        Raises UrdfError where one has no limits or slides.
+        Raises UrdfError for a joint of another kind, without limits, or that follows another one.
         """
-        moving = tuple(joint for joint in self.chain(tip) if joint.kind != "fixed")
+        moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
-            if joint.kind != "revolute" or not joint.lower < joint.upper or not joint.velocity > 0:
-                raise UrdfError(
-                    f"{self.origin}: joint {joint.name!r} is {joint.kind}; revolute with limits and a velocity needed"
-                )
+            mistake = ""
+            if joint.kind not in KINDS:
+                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+            elif joint.mimics:
+                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+            elif not joint.lower < joint.upper or not joint.velocity > 0:
+                mistake = f"is {joint.kind}; a <limit> with lower below upper and a velocity above 0 needed"
+                if joint.kind == "continuous":
+                    mistake = "is continuous; a <limit> with a velocity above 0 needed"
+            if mistake:
+                raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
         return moving
 
     def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
-        """Each link in its parent link, for joint positions by name [rad]; others are at 0."""
-        return [
-            Transform(
-                joint.parent,
-                joint.child,
-                joint.translation,
-                multiply(joint.rotation, about(joint.axis, positions[joint.name]))
-                if joint.name in positions
-                else joint.rotation,
-            )
-            for joint in self.joints
-        ]
+        """Each link in its parent link, for joint positions by name [rad, m]; others are at 0."""
+        return [_moved(joint, positions.get(joint.name, 0.0)) for joint in self.joints]
+
+
+def _moved(joint: Joint, position: float) -> Transform:
+    """A joint's child link in its parent link."""
+    at, turn = joint.translation, joint.rotation
+    if position and joint.kind == "prismatic":
+        dx, dy, dz = rotated(turn, joint.axis)
+        at = (at[0] + position * dx, at[1] + position * dy, at[2] + position * dz)
+    elif position:
+        turn = multiply(turn, about(joint.axis, position))
+    return Transform(joint.parent, joint.child, at, turn)
+
+
+def _limited(joint: Joint) -> Joint:
+    """The joint with limits of its position, which a continuous one does not have."""
+    if joint.kind != "continuous":
+        return joint
+    return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD)
+
+
+def with_one_coordinate(text: str) -> str:
+    """The text of a description whose continuous joints are revolute ones with wide limits.
+
+    Libraries describe a continuous joint by cosine and sine, in which its turns are lost.
+    """
+    if "continuous" not in text:
+        return text
+    root = ElementTree.fromstring(text)
+    for joint in root.iter("joint"):
+        if joint.get("type") == "continuous":
+            joint.set("type", "revolute")
+            found = joint.find("limit")
+            limit = ElementTree.SubElement(joint, "limit") if found is None else found
+            limit.set("lower", str(-CONTINUOUS_RAD))
+            limit.set("upper", str(CONTINUOUS_RAD))
+            limit.set("velocity", limit.get("velocity", "0"))
+            limit.set("effort", limit.get("effort", "0"))
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _joint(element: ElementTree.Element) -> Joint:
-    origin, limit = element.find("origin"), element.find("limit")
+    origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
     x, y, z = _three(element.find("axis"), "xyz", "1 0 0")
     norm = math.sqrt(x * x + y * y + z * z) or math.nan
+    lower, upper, velocity = (
+        float("nan" if limit is None else limit.get(name, "nan")) for name in ("lower", "upper", "velocity")
+    )
     return Joint(
         element.get("name", ""),
         element.get("type", ""),
@@ -123,7 +166,10 @@ def _joint(element: ElementTree.Element) -> Joint:
         _three(origin, "xyz", "0 0 0"),
         _turn(origin),
         (x / norm, y / norm, z / norm),
-        *(float("nan" if limit is None else limit.get(name, "nan")) for name in ("lower", "upper", "velocity")),
+        lower,
+        upper,
+        velocity,
+        "" if mimic is None else mimic.get("joint", "another joint"),
     )
 
 
@@ -170,6 +216,13 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
         aw * bz + ax * by - ay * bx + az * bw,
         aw * bw - ax * bx - ay * by - az * bz,
     )
+
+
+def rotated(turn: Quaternion, vector: Sequence[float]) -> Vector3:
+    """A vector, rotated by a quaternion of norm 1."""
+    x, y, z, w = turn
+    product = multiply(multiply(turn, (vector[0], vector[1], vector[2], 0.0)), (-x, -y, -z, w))
+    return product[:3]
 
 
 def about(axis: Sequence[float], angle: float) -> Quaternion:

@@ -91,7 +91,7 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Excess | None = None  # of a joint from its command, at the fault
-    worst_joint: tuple[str, float] | None = None  # the one farthest from its command now [rad]
+    worst_joint: tuple[str, float, str] | None = None  # the one farthest from its command now, and the unit
     measured_speed: Excess | None = None  # of the tool [m/s]
     commanded_speed: Excess | None = None
     failure: str = ""  # of the service
@@ -191,8 +191,9 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
             remedy = "see what blocked or pushed it, then `thirdhand reset`"
             if seen.error_rad is not None and seen.worst_joint is not None:
-                found = "a joint was {:.3f} rad off, {:g} accepted; ".format(*seen.error_rad)
-                found += "now {} is off by {:.3f} rad".format(*seen.worst_joint)
+                found = "a joint was {:.3f} rad off, {:g} accepted".format(*seen.error_rad)
+                found += "; " if seen.worst_joint[2] == "rad" else ", half as many m for one that slides; "
+                found += "now {} is off by {:.3f} {}".format(*seen.worst_joint)
         case Reason.ARM_SILENT:
             about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen.sources.get("arm"))
             remedy = "look at its driver and the network, then `thirdhand reset`"
@@ -346,7 +347,7 @@ def _not_ready(seen: Evidence) -> str:
         return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
     at = "the arm has not told one posture for long enough"
     if out is not None:
-        at = f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+        at = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
     elif seen.inside is not None:
         at = "what {} moves is inside of {} by {:.3f} m".format(*seen.inside)
     return _silence(source) or at

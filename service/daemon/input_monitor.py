@@ -146,18 +146,31 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     except WireError as error:
         return seen._replace(mistake=str(error))
     if cause is Cause.JUMPED:
-        leaps = map(Jump, settings.joints.names, refused.joints, position)
-        return seen._replace(jump=max(leaps, key=lambda leap: abs(leap.after - leap.before)))
+        joints = settings.joints
+        leaps = [*map(Jump, joints.names, refused.joints, position, joints.units)]
+        sizes = [
+            abs(_turned(leap, kind) / per_rad)
+            for leap, kind, per_rad in zip(leaps, joints.every_kind, joints.per_rad, strict=True)
+        ]
+        return seen._replace(jump=leaps[sizes.index(max(sizes))])
     outside = [*_outside(settings.joints, position, velocity)]
     if cause is Cause.NOT_FINITE:
         outside = [one for one in outside if not math.isfinite(one.value)]
     return seen._replace(outside=outside[0] if outside else None)
 
 
+def _turned(leap: Jump, kind: str) -> float:
+    """How far a joint went; of a continuous one without its turns."""
+    far = leap.after - leap.before
+    return math.remainder(far, 2.0 * math.pi) if kind == "continuous" else far
+
+
 def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]) -> Iterator[Outside]:
     """Measured values that are outside of what is accepted."""
-    for name, at, speed, low, high in zip(joints.names, position, velocity, joints.lower, joints.upper, strict=True):
-        if not low - FARTHEST_OUTSIDE <= at <= high + FARTHEST_OUTSIDE:
-            yield Outside(name, at, low - FARTHEST_OUTSIDE, high + FARTHEST_OUTSIDE)
-        if abs(speed) > MAX_JOINT_SPEED:
-            yield Outside(name, speed, -MAX_JOINT_SPEED, MAX_JOINT_SPEED, "rad/s")
+    of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
+    for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
+        low, high = lower - FARTHEST_OUTSIDE * per_rad, upper + FARTHEST_OUTSIDE * per_rad
+        if not low <= at <= high:
+            yield Outside(name, at, low, high, unit)
+        if not abs(speed) <= (fastest := MAX_JOINT_SPEED * per_rad):
+            yield Outside(name, speed, -fastest, fastest, f"{unit}/s")

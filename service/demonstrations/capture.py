@@ -22,6 +22,7 @@ from service.contract.joint_states import JointStates, measured
 from service.contract.messages import BASE, PoseStamped, WireError, finite
 from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
+from service.core.intake.arm_samples import in_turn
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.demonstrations.dwells import REST_M
@@ -102,7 +103,10 @@ class Capture:
         if state is None:
             return None
         received = payload if state is message else cdr.encode_joints(state)
-        return Sample(arrived_ns, received, np.array(measured(state, self.settings.joints.names)[0]))
+        at = np.array(measured(state, self.settings.joints.names)[0])
+        if before := self.samples[key]:
+            at = in_turn(self.settings.joints, at, before[-1].at)
+        return Sample(arrived_ns, received, at)
 
     def _sample(self, key: str, arrived_ns: int, payload: bytes) -> Sample:
         return Sample(arrived_ns, payload, self._at(key, payload))

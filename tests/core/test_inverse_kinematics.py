@@ -51,7 +51,9 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     assert speed == pytest.approx(np.linalg.norm(tasks[:3] @ dq), rel=1e-12)
     assert coming == pytest.approx(max(speed, crest), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
-    error, fast = measured_error(parameters(measured=measured, measured_velocities=dq), here)
+    error, fast = measured_error(
+        parameters(measured=measured, measured_velocities=dq), here, parameters(per_rad=np.ones(len(dq)))
+    )
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
 
