@@ -25,7 +25,7 @@ from sim.closed_loop import hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript
 from support.in_process import LEFT, RIGHT
-from support.turning import ARMS, cell_in, sliding_cell
+from support.turning import ARMS, BEYOND, cell_in, sliding_cell
 
 
 @pytest.fixture(scope="module")
@@ -151,24 +151,6 @@ def test_a_rail_outside_its_limits_is_brought_back_or_refused(
         assert fastest <= 0.06
     else:
         assert int(frame["rejected"][cause]) == 1500
-
-
-BEYOND = "".join(
-    f'<link name="{name}"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>'
-    f'<joint name="{name}_joint" type="{kind}"><parent link="{parent}"/><child link="{name}"/>{more}</joint>'
-    for name, kind, parent, more in (
-        ("finger", "prismatic", "tool0", '<limit lower="0" upper="0.04" velocity="1" effort="1"/>'),
-        (
-            "thumb",
-            "prismatic",
-            "tool0",
-            '<limit lower="0" upper="0.04" velocity="1" effort="1"/><mimic joint="finger_joint"/>',
-        ),
-        ("wheel", "continuous", "tool0", ""),
-        ("cart", "floating", "base_link", '<origin xyz="0 0 -3"/>'),
-        ("sheet", "planar", "base_link", '<origin xyz="0 0 -3"/>'),
-    )
-)
 
 
 def test_joints_beyond_the_plate_change_nothing(tmp_path: Path) -> None:

@@ -13,6 +13,23 @@ ARMS = ROOT / "service" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
 NEAR_SEAM = math.pi - 0.02  # [rad] of the base's joint at the posture: the task takes it to both sides of pi
 BASE = '<origin xyz="0 0 0.089159"/>'
+# What no command moves: a gripper with <mimic>, a wheel, things that float.
+BEYOND = "".join(
+    f'<link name="{name}"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>'
+    f'<joint name="{name}_joint" type="{kind}"><parent link="{parent}"/><child link="{name}"/>{more}</joint>'
+    for name, kind, parent, more in (
+        ("finger", "prismatic", "tool0", '<limit lower="0" upper="0.04" velocity="1" effort="1"/>'),
+        (
+            "thumb",
+            "prismatic",
+            "tool0",
+            '<limit lower="0" upper="0.04" velocity="1" effort="1"/><mimic joint="finger_joint"/>',
+        ),
+        ("wheel", "continuous", "tool0", ""),
+        ("cart", "floating", "base_link", '<origin xyz="0 0 -3"/>'),
+        ("sheet", "planar", "base_link", '<origin xyz="0 0 -3"/>'),
+    )
+)
 
 
 def _kind(urdf: str, joint: str, kind: str) -> str:
