@@ -66,8 +66,14 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     joints.setdefault("names", [joint.name for joint in moving])
     joints.setdefault("kinds", [joint.kind for joint in moving])
     for name in ("lower", "upper", "velocity"):
-        joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    wanted = (("joints", joints, "acceleration"), ("joints", joints, "jerk"), ("arm", arm, "posture"))
+        if all(math.isfinite(getattr(joint, name)) for joint in moving):
+            joints.setdefault(name, [getattr(joint, name) for joint in moving])
+    wanted = (
+        ("joints", joints, "velocity"),
+        ("joints", joints, "acceleration"),
+        ("joints", joints, "jerk"),
+        ("arm", arm, "posture"),
+    )
     if missing := [f"$.{path}.{name}" for path, section, name in wanted if name not in section]:
         needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))

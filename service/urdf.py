@@ -86,8 +86,8 @@ class Urdf:
         return self._above.get(link)
 
     def movable(self, tip: str) -> tuple[Joint, ...]:
-        """The joints from the root to link `tip` that turn or slide, in order; those of continuous
-        ones have the limits ±CONTINUOUS_RAD.
+        """The joints from the root to link `tip` that turn or slide, in order; continuous ones have
+        the limits ±CONTINUOUS_RAD, and an infinite velocity where the description has none.
 
         Raises UrdfError for a joint of another kind, without limits, or that follows another one.
         """
@@ -101,7 +101,7 @@ class Urdf:
             elif not joint.lower < joint.upper or not joint.velocity > 0:
                 mistake = f"is {joint.kind}; a <limit> with lower below upper and a velocity above 0 needed"
                 if joint.kind == "continuous":
-                    mistake = "is continuous; a <limit> with a velocity above 0 needed"
+                    mistake = "is continuous; a <limit> with a velocity above 0, or none, needed"
             if mistake:
                 raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
         if not moving:
@@ -125,10 +125,13 @@ def _moved(joint: Joint, position: float) -> Transform:
 
 
 def _limited(joint: Joint) -> Joint:
-    """The joint with limits of its position, which a continuous one does not have."""
+    """The joint with limits of its position, which a continuous one does not have; its velocity
+    need not be limited either.
+    """
     if joint.kind != "continuous":
         return joint
-    return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD)
+    velocity = math.inf if math.isnan(joint.velocity) else joint.velocity
+    return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD, velocity=velocity)
 
 
 def with_one_coordinate(text: str) -> str:
