@@ -95,6 +95,7 @@ class Evidence(NamedTuple):
     measured_speed: Excess | None = None  # of the tool [m/s]
     commanded_speed: Excess | None = None
     failure: str = ""  # of the service
+    silent_ms: float = 0.0  # accepted between states of the arm
     # of a sample that was rejected:
     sample: PoseStamped | JointState | None = None
     newest_ns: int = 0  # stamp of the newest one accepted before
@@ -176,6 +177,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
             if (arm := seen.sources.get("arm")) is not None and arm.fresh:
                 remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
+            remedy = _of_rate(seen) or remedy
             if seen.inside is not None:
                 remedy = "bring the arm out by hand, or by `thirdhand reset`, which moves it out slowly; "
                 remedy += "where nothing is there mend [table], [obstacles] or the URDF"
@@ -195,8 +197,10 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
                 found += "; " if seen.worst_joint[2] == "rad" else ", half as many m for one that slides; "
                 found += "now {} is off by {:.3f} {}".format(*seen.worst_joint)
         case Reason.ARM_SILENT:
-            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen.sources.get("arm"))
+            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen)
             remedy = "look at its driver and the network, then `thirdhand reset`"
+            if advice := _of_rate(seen):
+                remedy = f"{advice}, then `thirdhand reset`"
         case Reason.TOOL_SPEED:
             about = "the tool was measured faster than `[tool] fault_speed` for 30 ms"
             remedy = "the arm does not do what it is told: check the driver before `thirdhand reset`"
@@ -331,8 +335,25 @@ def _contest(seen: Evidence) -> str:
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
 
 
-def _silence(source: Source | None) -> str:
-    """For how long the arm says nothing; empty where it does."""
+def _is_seldom(seen: Evidence) -> bool:
+    """Whether states of the arm go on coming, but not often enough to go by."""
+    source = seen.sources.get("arm")
+    if source is None or source.age_ms is None or _is_refused(source):
+        return False
+    goes_on = source.age_ms * source.rate_hz < 2000.0  # the next one is not overdue by a whole interval
+    return goes_on and 0.0 < source.rate_hz * seen.silent_ms < 1000.0
+
+
+def _of_rate(seen: Evidence) -> str:
+    """What to do about states that come too seldom; empty where they do not."""
+    return "publish `joints/state` more often, or raise `[arm] silent_ms`" if _is_seldom(seen) else ""
+
+
+def _silence(seen: Evidence) -> str:
+    """For how long the arm says nothing, or that it does so too seldom; empty where it does."""
+    source = seen.sources.get("arm")
+    if source is not None and _is_seldom(seen):
+        return f"joint states come at {source.rate_hz:.1f} Hz, {1000 / seen.silent_ms:g} Hz at least needed"
     if source is None or source.fresh:
         return ""
     return "no joint states came yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"
@@ -350,7 +371,7 @@ def _not_ready(seen: Evidence) -> str:
         at = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
     elif seen.inside is not None:
         at = "what {} moves is inside of {} by {:.3f} m".format(*seen.inside)
-    return _silence(source) or at
+    return _silence(seen) or at
 
 
 def _stuck(seen: Stuck | None) -> str:

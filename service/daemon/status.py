@@ -111,6 +111,7 @@ class CellStatus(NamedTuple):
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
+            silent_ms=settings.arm.silent_ms,
         )
 
     def _spare(self, name: str, source: Source) -> bool:

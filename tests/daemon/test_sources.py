@@ -129,6 +129,18 @@ def test_an_arm_that_measures_positions_only_is_ready_and_followed(skill: Skill,
     assert (told.mode, told.rejected) == ("follow", {})
 
 
+@pytest.mark.parametrize("rate_hz", [1, 5, 8])
+def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz: int) -> None:
+    cell = Cell(skill)
+    for k in range(1500):
+        cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
+        told = cell.status(k / 500)
+        if k > 1000:
+            assert re.fullmatch(r"joint states come at \d\.\d Hz, 10 Hz at least needed", told.because)
+            assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
+    assert told.reason == "arm_not_ready"
+
+
 class Clock:
     """Samples of the right hand at 100 Hz, each with its stamp and its delay [ns]."""
 
