@@ -28,8 +28,9 @@ below is a table of it; what is not given has its default. A file is checked who
 starts, and all that is wrong with it is told at once, with what would be accepted.
 
 Units stand in the names (`_ms`, `_hz`, `_mb`) or in brackets; positions are in frame `base` unless
-said otherwise. Quaternions are x y z w. Paths of files and folders may begin with `~`; those of
-`[arm] urdf` and `[network] certificate` lie beside the configuration where they are relative.
+said otherwise. Quaternions are x y z w. Paths of files and folders may begin with `~`. Relative
+paths of `[arm] urdf` and `packages`, `[network] certificate` and `zenoh_config` start from the
+folder of the configuration; those of `[files]` start from the folder where the command runs.
 
 ```toml
 cell = "hall/bench-1"

@@ -33,8 +33,9 @@ Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
 
-BESIDE = (("arm", "urdf"), ("network", "certificate"), ("network", "zenoh_config"))  # the configuration, if relative
-PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
+# Relative paths start from the folder of the configuration, or from the current folder.
+BESIDE = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
 FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -368,20 +369,31 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, value
 
 
-def _resolve_paths(given: Any, folder: Path | None) -> None:
-    """Puts what lies beside the configuration into its folder. Raises SettingsError."""
-    for section, name in PATHS:
+def _make_paths_absolute(given: Any, folder: Path | None) -> None:
+    """Makes every path absolute, so that its meaning no longer depends on a folder. Raises
+    SettingsError.
+    """
+    for section, name in (*BESIDE, *FROM_HERE):
         table = given.get(section) if isinstance(given, dict) else None
         value = table.get(name) if isinstance(table, dict) else None
+        base = folder if folder is not None and (section, name) in BESIDE else Path()
         if isinstance(table, dict) and isinstance(value, str):
-            if "\0" in value:
-                raise SettingsError(f"$.{section}.{name}: {value!r} given; a path holds no zero bytes")
-            try:
-                expanded = Path(value).expanduser()
-            except RuntimeError:
-                raise SettingsError(f"$.{section}.{name}: {value!r} given; there is no such user's folder") from None
-            if value and folder is not None and (section, name) in BESIDE:
-                table[name] = str(folder / expanded)
+            table[name] = _absolute(value, base, f"$.{section}.{name}")
+        elif isinstance(table, dict) and isinstance(value, list | tuple):
+            table[name] = [
+                _absolute(one, base, f"$.{section}.{name}[{i}]") if isinstance(one, str) else one
+                for i, one in enumerate(value)
+            ]
+
+
+def _absolute(value: str, base: Path, where: str) -> str:
+    """A path, from `base` where it is relative; none stays none. Raises SettingsError."""
+    if "\0" in value:
+        raise SettingsError(f"{where}: {value!r} given; a path holds no zero bytes")
+    try:
+        return str((base / Path(value).expanduser()).absolute()) if value else ""
+    except RuntimeError:
+        raise SettingsError(f"{where}: {value!r} given; there is no such user's folder") from None
 
 
 def _mistakes(given: Any) -> list[str]:
@@ -395,12 +407,12 @@ def _mistakes(given: Any) -> list[str]:
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
-    Where URDF, certificate and Zenoh configuration are no absolute paths they lie in `folder`. What
-    is not said of an arm with a URDF of its own is taken from there; no limit may be wider than the
-    URDF's.
+    Relative paths of URDF, packages, certificate and Zenoh configuration start from `folder`, those
+    of [files] from the current folder; all become absolute here. What is not said of an arm with a
+    URDF of its own is taken from there; no limit may be wider than the URDF's.
     """
     try:
-        _resolve_paths(given, folder)
+        _make_paths_absolute(given, folder)
         arm = given.get("arm") if isinstance(given, dict) else None
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             try:

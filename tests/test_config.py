@@ -8,8 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.config import WAM, Settings, SettingsError, load, parse
-from service.network_settings import is_local
+from service.config import WAM, Files, Settings, SettingsError, load, parse, robot_description
+from service.launch import described
+from service.network_settings import Network, is_local
+from service.shipped import cell_of
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
 
@@ -252,6 +254,28 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
     assert insecure.network.listen == ("tcp/0.0.0.0:1",)
     routed = parse("[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml")
     assert routed.network.connect == ("tcp/10.0.0.1:1",)
+
+
+def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my" / "share").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "my" / "arm.urdf").write_bytes(WAM.with_name("ur5.urdf").read_bytes())
+    cell = WAM.with_name("ur5.toml").read_text().replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
+    network = '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = "../zenoh.json5"'
+    files = '[files]\nrecord = "records"\nskills = ""\nstate = "~/state"'
+    (tmp_path / "my" / "cell.toml").write_text(f"{cell}\n{network}\n{files}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    read = cell_of("my/cell.toml", rate_hz=250)
+    assert read.arm.urdf == str(tmp_path / "my/arm.urdf")
+    assert read.arm.packages == (str(tmp_path / "my/share"),)
+    assert read.network.certificate == str(tmp_path / "my/secrets")
+    assert read.network.zenoh_config == str(tmp_path / "my/../zenoh.json5")
+    assert (read.files.record, read.files.skills, read.files.state) == (str(tmp_path / "records"), "", "/home/me/state")
+    again = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert again == msgspec.structs.replace(read, network=Network(), files=Files())
+    assert robot_description(again) == robot_description(read)
 
 
 def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from service import interrupt
 from service.cli import record_options
-from service.cli.usage import Parser, UsageError, option, reaching, within
+from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError
@@ -32,7 +32,6 @@ RUN_BY = {  # the modules that are not named as their command
     "bench": "timing.benchmark",
 }
 SIM = "The simulated bench: publishes hands and joint states, and follows commands."
-ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "play"),
@@ -82,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--engine", choices=("pybullet", "mujoco"), help="the physics (default: the first that is installed)"
     )
-    option(c, "--rate", "HZ", "of the loop", 500)
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
@@ -91,14 +90,14 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
     c.add_argument("arm", metavar="ARM", help="franka, or simulated: an ideal one, to try a cell without any")
-    option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
+    option(c, "--config", "CELL", f"the daemon's settings: {ARM}")
     option(c, "--robot", "ADDRESS", "of a Franka: name or IP address", "172.16.0.2")
     option(c, "--wait", "S", "for the daemon, and for its first command", 60.0)
     _reach(c)
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
     option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
-    option(c, "--rate", "HZ", "of the loop", 500)
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
     option(c, "--arm", "ARM", ARM, "wam")
     option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
@@ -109,18 +108,19 @@ def parser() -> argparse.ArgumentParser:
     other.add_argument("--soak", action="store_true", help="memory and open files instead, a sample each 5 s at most")
 
     c = command(
-        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
+        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --joints state"
     )
-    option(c, "--config", "FILE", "settings of the cell as TOML; options below go before it")
+    option(c, "--config", "CELL", f"{ARM}; the options below override it")
     option(c, "--cell", "NAME", "prefix of all keys (default: thirdhand)")
     listen = f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "Zenoh endpoint to connect to; may be repeated", action="append")
     option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
-    option(c, "--rate", "HZ", "of the loop (default: 500)")
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     option(c, "--skill", "FILE", "a skill made by `thirdhand learn` (default: the shipped soldering skill)")
-    arm = "wait for the arm's joint states, or assume its posture (default: state)"
-    c.add_argument("--arm", choices=("state", "assumed"), help=arm)
+    joints = "wait for the arm's joint states, or assume its posture (default: the settings', else state)"
+    c.add_argument("--joints", choices=("state", "assumed"), help=joints)
+    c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
     option(c, "--record", "DIR", "write .mcap and .rrd files there")
     live = "serve Rerun viewers on this loopback port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
@@ -185,7 +185,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--output", "FILE", "the skill, .npz", required=True)
     option(c, "--plot", "FILE", "a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
-    option(c, "--config", "FILE", "settings of the cell: the tracker's axes and unit, the arm")
+    option(c, "--config", "CELL", f"the tracker's axes and unit, the arm: {ARM}")
     places = (
         "where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
         "do not hold it: then the skill is learned between them, and holds wherever they are"

@@ -112,6 +112,7 @@ def rows(now: Status) -> dict[str, str]:
     )
     found = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
+        "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
         "what to do": now.remedy,
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",

@@ -15,7 +15,15 @@ from service.client.session import (
     endpoints,
     open_session,
 )
-from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, publisher
+from service.client.streams import (
+    BRAKE_AFTER_S,
+    ENCODINGS,
+    Command,
+    Follower,
+    Tracker,
+    no_room_to_brake,
+    publisher,
+)
 
 __all__ = [
     "AUTHORITY",
@@ -38,6 +46,7 @@ __all__ = [
     "client_settings",
     "endpoints",
     "living",
+    "no_room_to_brake",
     "open_session",
     "publisher",
     "why_silent",

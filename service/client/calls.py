@@ -80,11 +80,12 @@ class Client:
         answer: dict[str, Any] = json.loads(self._answer(suffix, request))
         return answer
 
-    def wait_until_ready(self, *, timeout_s: float | None = 15.0) -> Status:
+    def wait_until_ready(self, *, timeout_s: float | None = 15.0, silent: bool | None = None) -> Status:
         """The status, once a daemon is ready on this cell; it waits for `timeout_s` [s], and as
-        long as the daemon's start goes on. None: until Ctrl-C.
+        long as the daemon's start goes on. None: until Ctrl-C. Unless it is `silent`, as by default
+        where it ends by itself, that it waits is said once on standard error.
         """
-        return tried(self.status, timeout_s)
+        return tried(self.status, timeout_s, silent=silent)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
         try:

@@ -117,12 +117,13 @@ def _refused(endpoints: Sequence[str]) -> bool:
     return bool(endpoints)
 
 
-def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
+def tried(attempt: Callable[[], T], timeout_s: float | None, *, silent: bool | None = None) -> T:
     """What an attempt returns once it raises no UnreachableError, which is raised after `timeout_s`
-    [s] in which it said the same. None: it is tried until Ctrl-C, and that it waits is said once on
-    standard error.
+    [s] in which it said the same. None: it is tried until Ctrl-C. Unless it is `silent`, as by
+    default where it ends by itself, that it waits is said once on standard error.
     """
-    begun_s, silent, said = time.monotonic(), timeout_s is not None, ""
+    begun_s, said = time.monotonic(), ""
+    silent = timeout_s is not None if silent is None else silent
     while True:
         try:
             return attempt()
@@ -134,7 +135,8 @@ def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
             if timeout_s is not None and waited_s >= timeout_s:
                 raise
             if not silent and waited_s > ATTEMPT_S / 2:
-                print(f"waiting, until Ctrl-C: {error}", file=sys.stderr, flush=True)
+                until = "until Ctrl-C" if timeout_s is None else f"up to {timeout_s:g} s"
+                print(f"waiting, {until}: {error}", file=sys.stderr, flush=True)
                 silent = True
             time.sleep(RETRY_S)
 

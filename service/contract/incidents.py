@@ -19,6 +19,12 @@ SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
 MALFORMED: Final = "malformed"  # bytes that could not be decoded: counted beside the causes
 FAULTS = (Reason.ARM_ERROR, Reason.ARM_SILENT, Reason.TOOL_SPEED, Reason.SETPOINT, Reason.SERVICE)  # all others: holds
 LONGEST_NAME = 64  # of a frame
+OF_TIME = {  # reasons that a machine which is too busy causes as well, unless samples of these sources are refused
+    Reason.STALE_HAND: SIDES,
+    Reason.ARM_ERROR: ("arm",),
+    Reason.ARM_SILENT: ("arm",),
+}
+FREE_THE_MACHINE = "see what else runs on this machine, `thirdhand bench` measures it; or lower `rate_hz`"
 FULL_TURN_RAD = 7.0  # no joint is farther from its zero
 
 Excess: TypeAlias = tuple[float, float]  # a value, and the greatest that is accepted
@@ -96,6 +102,7 @@ class Evidence(NamedTuple):
     commanded_speed: Excess | None = None
     failure: str = ""  # of the service
     silent_ms: float = 0.0  # accepted between states of the arm
+    busy: str = ""  # how this machine was too busy when it began
     # of a sample that was rejected:
     sample: PoseStamped | JointState | None = None
     newest_ns: int = 0  # stamp of the newest one accepted before
@@ -216,6 +223,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy, found = "keep log and recording, report it, then `thirdhand reset`", seen.failure
         case _:
             assert_never(reason)
+    if seen.busy and reason in OF_TIME and not _of_rejected(seen, *OF_TIME[reason]):
+        found, remedy = f"this machine was too busy, {seen.busy}; {found or about}", f"{FREE_THE_MACHINE}; {remedy}"
     return Incident(about, remedy, found)
 
 

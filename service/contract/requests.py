@@ -224,6 +224,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     deviation_m: float | None = None  # of the hands from what the skill knows
     threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`
+    busy: str = ""  # how the daemon's machine is too busy, or was when the arm stopped; empty: it is not
 
     @property
     def needed(self) -> tuple[str, ...]:

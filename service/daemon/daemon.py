@@ -39,13 +39,14 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
+from service.daemon.machine import WINDOW_S, Machine
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, skill_of
 from service.daemon.start import Start
-from service.daemon.status import CellStatus, MeasuredArm
+from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.way_finder import WayFinder
 from service.learning.skill_file import SkillError, StoredSkill
 from service.recording.protocol import pack
@@ -95,7 +96,7 @@ class Daemon:
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
-        self._sources = InputMonitor(settings)
+        self._sources, self._machine = InputMonitor(settings), Machine()
         self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
@@ -317,9 +318,14 @@ class Daemon:
             if frame["tick"] == state["tick"]:
                 break
             time.sleep(0.2 * self._settings.period_s)
-        sources = self._sources.update(self._controller, state, time.monotonic())
+        now_s = time.monotonic()
+        sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)
-        return CellStatus(frame, self._controller, state, sources, self._settings, self._failure, inside).status(
+        late_ms = self._lateness.largest(round(WINDOW_S * self._settings.rate_hz)) / 1e3
+        machine = self._machine
+        machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
+        known = self._failure, inside, machine.at_stop
+        return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
@@ -331,6 +337,7 @@ class Daemon:
             latency_ms=self._latency.percentiles(),
             scribe=self._scribe.status(),
             command_heard=self._streams.is_followed,
+            busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,
             version=self._version,
             tool_measured_m=self._measured_arm.position(state),

@@ -40,6 +40,7 @@ class CellStatus(NamedTuple):
     settings: Settings
     failure: str = ""
     inside: Inside | None = None  # of an arm that is not ready
+    busy: str = ""  # how this machine was too busy when the arm stopped
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core knows nothing of."""
@@ -112,6 +113,7 @@ class CellStatus(NamedTuple):
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
             silent_ms=settings.arm.silent_ms,
+            busy=self.busy,
         )
 
     def _spare(self, name: str, source: Source) -> bool:

@@ -120,7 +120,8 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "needed", ("via-points", "add")),
         (2, "", ("via-points", "add", "here", *NOBODY)),
         (2, "", ("view", "live", "--time", "-1", *NOBODY)),
-        (2, "invalid choice", ("serve", "--arm", "left")),
+        *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
+        (1, "50 Hz is too slow: commands would come every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
         (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
     ],
@@ -213,7 +214,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
         ("thirdhand via-points l", {"list"}),
         ("thirdhand status --wat", {"--watch"}),
         ("thirdhand record --f", {"--folder"}),
-        ("thirdhand serve --arm a", {"assumed"}),
+        ("thirdhand serve --joints a", {"assumed"}),
     ],
 )
 def test_a_shell_completes_commands_options_and_choices(words: str, found: set[str], tmp_path: Path) -> None:

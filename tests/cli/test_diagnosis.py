@@ -236,14 +236,32 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
     assert "what to do: see what; if it has not moved since commands began: are the drives on?" in alone[0]
 
 
-@pytest.mark.parametrize("reason", ["arm_silent", "arm_error"])
-@pytest.mark.parametrize("late", [{"missed": 90}, {"lateness_us": Percentiles(1, 90, 60_000)}])
-def test_a_fault_of_the_arm_while_ticks_are_missed_is_told_as_the_machines(reason: str, late: dict[str, Any]) -> None:
-    told = [line for line in wrongs(diagnosed(mode="fault", reason=reason, **late)) if "mode" in line]
-    assert "this machine or the bench could not keep time" in told[0]
-    assert "thirdhand bench" in told[0]
-    other = wrongs(diagnosed(mode="fault", reason=reason))
-    assert not any("keep time" in line for line in other)
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"mode": "fault", "reason": "arm_silent"},
+        {"mode": "fault", "reason": "arm_error"},
+        {"sources": source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)},
+        {"sources": source("left", clock_ms=400.0)},
+        {"sources": source("right", rejected={"ahead": 90}, cause="ahead", refused="stamped 0.2 s after the newest")},
+    ],
+    ids=["silent", "error", "nothing comes", "clock", "ahead"],
+)
+def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(changed: dict[str, Any]) -> None:
+    words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
+    first, *others = wrongs(diagnosed(busy=words, **changed))
+    assert first.startswith(f"wrong  machine            too busy: {words}")
+    assert "thirdhand bench measures it" in first
+    assert others == wrongs(diagnosed(**changed))
+
+
+def test_a_machine_that_is_busy_while_nothing_is_wrong_is_a_note() -> None:
+    assert [finding.what for finding in diagnosed(busy="the loop was up to 60 ms late") if finding.level != "ok"] == [
+        "machine"
+    ]
+    assert rows(msgspec.structs.replace(HEALTHY, busy="the loop was up to 60 ms late"))["machine"].startswith(
+        "too busy"
+    )
 
 
 def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:

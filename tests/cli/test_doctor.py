@@ -40,7 +40,7 @@ fault_error_rad = 0.5
 frame = "optitrack"
 stale_ms = 500
 """
-OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
+OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 def template() -> ModuleType:
@@ -56,11 +56,9 @@ def template() -> ModuleType:
 @contextlib.contextmanager
 def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
     """The template's fake arm, driven on a session of its own."""
-    settings, stop = Settings(), threading.Event()
-    arm = own_arm.FakeArm(settings)
+    stop, arm = threading.Event(), own_arm.FakeArm(Settings())
     with open_session(connect=[endpoint]) as session:
-        options = {"tick_s": settings.period_s, "stop": stop}
-        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs=options)
+        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop})
         driver.start()
         try:
             yield arm

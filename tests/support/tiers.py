@@ -26,6 +26,7 @@ RESEARCH = (
     "sim/test_made_tasks.py",
     "sim/test_partners.py",
     "sim/test_people.py",
+    "sim/test_rates.py::test_the_demo_succeeds_at_every_rate_with_every_arm_in_every_engine",
     "test_replay.py::test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units",
 )
 UNCOMPILED = (  # what runs while the others wait for what is compiled, the longest first
@@ -57,6 +58,7 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_own_task.py",
     "sim/test_bench.py",
     "sim/test_arms.py",
+    "sim/test_rates.py",
     "sim/test_engines.py",
     "cli/test_interrupt.py",
     "daemon/test_fuzzed_daemon.py",
