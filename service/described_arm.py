@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from service.contract.explain import ExplainedError
 from service.robot_xml import readable
-from service.urdf import Urdf, UrdfError
+from service.urdf import Shape, Urdf, UrdfError
 
 ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] until the kinematics are known
 MAX_MB = 20  # of a URDF; a humanoid's has 0.1
@@ -59,6 +59,22 @@ class Limits(Protocol):
         """In the order of the chain."""
 
 
+def extent(shape: Shape) -> float:
+    """The length [m] of a shape; 0 of a mesh that is not covered."""
+    match shape.kind, shape.size:
+        case "box", size:
+            return math.hypot(*size)
+        case "sphere", (radius,):
+            return 2.0 * radius
+        case "cylinder", (radius, length):
+            return math.hypot(2.0 * radius, length)
+        case "capsule", (radius, length):
+            return length + 2.0 * radius
+        case "mesh", (*ends, radius):
+            return math.dist(ends[:3], ends[3:]) + 2.0 * radius
+    return 0.0
+
+
 def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     """The settings of an arm with a URDF of its own, with what that says where they are silent.
 
@@ -83,8 +99,18 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
 
 
 def check(joints: Limits, urdf: Urdf, plate: str) -> None:
-    """Raises SettingsError for joints the arm does not have, and limits wider than the URDF's."""
+    """Raises SettingsError for joints the arm does not have, limits wider than the URDF's, and
+    shapes larger than the arm.
+    """
     moving = urdf.movable(plate)
+    reach = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))
+    for shape in urdf.shapes:
+        if (size := extent(shape)) > reach:
+            raise SettingsError(
+                f"$.arm.urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and the arm {reach:.3g} m; "
+                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 0.001 0.001"; '
+                "tables and walls belong into [table] and [obstacles]"
+            )
     names = tuple(joint.name for joint in moving)
     if joints.names != names:
         raise SettingsError(

@@ -64,7 +64,7 @@ class Workspace:
         """
         flat, angles = self._flattened(points)
         distances, found = self._tree.query(flat, k=NEIGHBOURS, distance_upper_bound=SPACING * self.extent)
-        near = distances < math.inf
+        near = np.asarray(distances < math.inf)
         if not self._turns:
             return np.asarray(near.any(axis=1))
         lower, upper = self._first

@@ -129,7 +129,8 @@ def _lack(joint: Joint) -> str:
     if not any(joint.axis):
         return "axis 0 0 0 given; a direction needed"
     if not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
-        return f"limits {_or_none(joint.lower)} to {_or_none(joint.upper)} given; lower below upper, within {FARTHEST:g} rad, needed"
+        given = f"limits {_or_none(joint.lower)} to {_or_none(joint.upper)} given"
+        return f"{given}; lower below upper, within {FARTHEST:g} rad, needed"
     if not 0.0 < joint.velocity <= FARTHEST:
         return f"velocity {_or_none(joint.velocity)} given; above 0, up to {FARTHEST:g} rad/s, needed in its <limit>"
     return ""
