@@ -11,6 +11,7 @@ import io
 import math
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -76,6 +77,15 @@ def _capsule(
             raise
         raise UrdfError(f"{what} cannot be read: {' '.join(str(error).split())}") from None
     return known
+
+
+def found_meshes(
+    robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...]
+) -> Iterator[tuple[ElementTree.Element, Path]]:
+    """The meshes of a robot whose files are there."""
+    for mesh in robot.iter("mesh"):
+        with contextlib.suppress(UrdfError):
+            yield mesh, _found(mesh.get("filename", ""), urdf, packages, "")
 
 
 def _found(name: str, urdf: Path, packages: tuple[str, ...], what: str) -> Path:

@@ -113,7 +113,7 @@ class Arm:
 
     def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
         self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
-        plate = self._model.frames[self._model.getFrameId(settings.arm.plate)]
+        plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
         unit = np.array(quaternion) / math.hypot(*quaternion)
         plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
