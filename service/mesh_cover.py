@@ -9,7 +9,6 @@ import functools
 import hashlib
 import io
 import math
-import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from service.urdf import COVER, UrdfError
 Points = NDArray[np.float64]
 ROUNDED = 4  # digits of a capsule's ends [m]; its radius is that much larger
 TINY = 1e-12  # [m²]
+KEPT = Path("~/.cache/thirdhand/capsules")  # where capsules are kept, by a digest of mesh and scale
 EVALUATIONS = 100  # of the cost, for each principal axis
 SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))  # tilts; offsets by the size
 RADII = np.linspace(1.0, 1.5, 12)  # that are tried, times the least that holds the points
@@ -65,13 +65,12 @@ def _capsule(
         data = file.read_bytes()
         made_by = hashlib.sha256(Path(__file__).read_bytes())
         made_by.update(repr((file.suffix.lower(), factors.tolist())).encode() + data)
-        kept = _folder() / made_by.hexdigest()
-        if (known := _kept(kept)) is None:
+        if (known := _kept(made_by.hexdigest())) is None:
             points = _vertices(file, data) * factors
             if not len(points) or not np.isfinite(points).all():
                 raise ValueError("vertices with finite numbers needed")
             known = capsule_around(points)
-            _keep(kept, known)
+            _keep(made_by.hexdigest(), known)
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
@@ -136,27 +135,23 @@ def _unit_m(collada: bytes) -> float:
     return 1.0
 
 
-def _folder() -> Path:
-    """Where capsules are kept over a restart."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "thirdhand" / "capsules"
-
-
-def _kept(file: Path) -> tuple[float, ...] | None:
+def _kept(name: str) -> tuple[float, ...] | None:
     """A capsule that was found before; None where there is none, or the file is no capsule."""
-    try:
-        found = tuple(float(number) for number in file.read_text(encoding="ascii").split())
-    except (OSError, ValueError):
-        return None
-    return found if len(found) == 7 and all(map(math.isfinite, found)) and found[6] > 0.0 else None
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
+        found = tuple(float(number) for number in (KEPT.expanduser() / name).read_text(encoding="ascii").split())
+        if len(found) == 7 and all(map(math.isfinite, found)) and found[6] > 0.0:
+            return found
+    return None
 
 
-def _keep(file: Path, capsule: tuple[float, ...]) -> None:
+def _keep(name: str, capsule: tuple[float, ...]) -> None:
     """Keeps a capsule. Where nothing can be written it is found anew each time."""
-    with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=file.parent, delete=False) as new:
+    with contextlib.suppress(OSError, RuntimeError):
+        folder = KEPT.expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as new:
             new.write(" ".join(map(repr, map(float, capsule))))
-        os.replace(new.name, file)
+        Path(new.name).replace(folder / name)
 
 
 def capsule_around(points: Points) -> tuple[float, ...]:

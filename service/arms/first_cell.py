@@ -48,7 +48,8 @@ WELL_WITHIN = (0.4, 0.75)  # of the way from the inner to the outer end of the r
 TILTS = (0.2, 0.5, 0.785)  # [rad] of the tool from straight down, forward
 STARTS = 20  # postures from which the inverse kinematics start
 NEAR_M, NEAR_RAD = 0.01, 0.1  # errors of position and direction that weigh as much as ...
-MIDDLE_WEIGHT = 0.2  # ... a joint at 1 / 0.2 times half its range from the middle
+MIDDLE_WEIGHT = 0.2  # ... a joint at 1 / 0.2 times half its range from the middle ...
+END_WEIGHT = 10.0  # ... or 1 / 10 of it into the last fifth before its limit
 EDGE_RAD = 0.001  # kept from the limits, so that rounding does not pass them
 FAR_M, FAR_RAD = 0.02, 0.2  # a posture with more error is no solution
 ENOUGH_MARGIN, ENOUGH_M = 0.3, 0.08  # margins to limits and to things beyond which more is no better
@@ -330,7 +331,10 @@ def _posture(settings: Settings, robot: str, workspace: Workspace, shell: Shell)
     def errors(q: Vector, direction: Vector) -> Vector:
         here = arm.at(q)
         position, turn = (here.position - place) / NEAR_M, (here.rotation[:, 2] - direction) / NEAR_RAD
-        return np.concatenate((position, turn, MIDDLE_WEIGHT * (q - middle) / half))
+        shares = (q - middle) / half
+        return np.concatenate(
+            (position, turn, MIDDLE_WEIGHT * shares, END_WEIGHT * np.maximum(np.abs(shares) - 0.8, 0))
+        )
 
     for tilt in TILTS:
         direction = np.array([*(math.sin(tilt) * forward), -math.cos(tilt)])

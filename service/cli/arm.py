@@ -46,7 +46,7 @@ def arm(args: argparse.Namespace) -> int:
     draw(proposal, picture)
     print(text(proposal, args.urdf))
     print(f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}")
-    print(f"next:    thirdhand demo --arm {cell}")
+    print(f"next:    thirdhand {'serve --config' if proposal.unmet else 'demo --arm'} {cell}")
     return 0
 
 

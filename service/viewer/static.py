@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import rerun as rr
@@ -22,7 +23,7 @@ from service.config import Reach, Settings, robot_description, urdf_path
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
-from service.robot_xml import readable
+from service.robot_xml import element_of
 from service.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
@@ -49,10 +50,13 @@ class ArmModels:
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
         self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
         with tempfile.TemporaryDirectory() as folder:
-            file = _readable(urdf, Path(folder))
-            self.commanded = rr.urdf.UrdfTree.from_file_path(file, entity_path_prefix="arm")
+            try:
+                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+            except RuntimeError:
+                urdf = _plain(urdf, Path(folder))
+                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
             self.measured = rr.urdf.UrdfTree.from_file_path(
-                file,
+                urdf,
                 entity_path_prefix="measured",
                 frame_prefix=GHOST,
                 static_transform_entity_path="/measured/tf_static",
@@ -76,16 +80,16 @@ class ArmModels:
         return f"{said} {links}" if links else ""
 
 
-def _readable(urdf: Path, folder: Path) -> Path:
-    """The URDF, or a copy in a folder where it is written as Rerun cannot read it. Meshes are not
-    found from there: their capsules are drawn.
+def _plain(urdf: Path, folder: Path) -> Path:
+    """A copy of a URDF in a folder, without what Rerun does not accept: masses, prefixes, other
+    encodings than UTF-8. Meshes are not found from there: their capsules are drawn.
     """
-    data = urdf.read_bytes()
-    text = readable(data)
-    if text.encode() in data:
-        return urdf
+    robot = element_of(urdf.read_bytes())
+    for link in robot.findall("link"):
+        for inertial in link.findall("inertial"):
+            link.remove(inertial)
     copy = folder / urdf.name
-    copy.write_text(text, encoding="utf-8")
+    ElementTree.ElementTree(robot).write(copy, encoding="utf-8")
     return copy
 
 
