@@ -14,6 +14,7 @@ from xml.parsers import expat
 Element = ElementTree.Element
 MAX_DEPTH = 64  # of elements in each other; a URDF needs 6
 MAX_ELEMENTS = 100_000  # an arm with a hand has about 1000
+ANY_LIMIT = {"lower": "-1e4", "upper": "1e4", "velocity": "1e4", "effort": "0"}  # other readers need one
 LARGEST = 1e6  # of any number of a link or joint
 NUMERIC = {  # attributes with numbers, besides xyz and rpy, by element
     "box": ("size",),
@@ -123,23 +124,23 @@ def check_numbers(robot: Element) -> None:
 
 def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]]) -> str:
     """The links and joints of a robot alone, as a URDF: without shapes, masses and all else that
-    does not say where links are. Joints that are not `moving`, about these axes, are fixed.
+    does not say where links are. Joints that are not `moving`, about these axes, are fixed; those
+    that are have limits that mean nothing, and continuous ones are revolute.
     """
     out = Element("robot", name="arm")
     for link in robot.findall("link"):
         ElementTree.SubElement(out, "link", name=link.get("name", ""))
     for joint in robot.findall("joint"):
-        is_moving = joint.get("name") in moving
-        name, kind = joint.get("name", ""), joint.get("type", "") if is_moving else "fixed"
+        name, kind = joint.get("name", ""), "fixed"
+        if name in moving:
+            kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
         kept = ElementTree.SubElement(out, "joint", name=name, type=kind)
-        for tag in ("parent", "child", "origin", *(("limit",) if is_moving else ())):
-            if (given := joint.find(tag)) is None:
-                continue
-            part = ElementTree.SubElement(kept, tag, given.attrib)
-            for number in part.attrib.keys() & {"xyz", "rpy", "lower", "upper", "velocity"}:
-                part.set(number, " ".join(map(repr, numbers(given, number, ""))))
-            if tag == "limit":
-                part.set("effort", "0")  # other readers need one
-        if is_moving:
+        for tag in ("parent", "child", "origin"):
+            if (given := joint.find(tag)) is not None:
+                part = ElementTree.SubElement(kept, tag, given.attrib)
+                for number in part.attrib.keys() & {"xyz", "rpy"}:
+                    part.set(number, " ".join(map(repr, numbers(given, number, ""))))
+        if name in moving:
             ElementTree.SubElement(kept, "axis", xyz=" ".join(map(repr, moving[name])))
+            ElementTree.SubElement(kept, "limit", ANY_LIMIT)
     return ElementTree.tostring(out, encoding="unicode")

@@ -37,6 +37,7 @@ PLACES = {  # [m] the tool's in the demo, frame base: where the shipped skill be
 MARGIN_M = 0.011  # of a place within the reach
 STAND_STEP_M, STAND_STEPS = 0.05, 6  # where the arm stands, if not at the origin, along x
 
+UNKNOWN_VELOCITY = 1.5  # [rad/s], [m/s] of a joint of which the URDF does not say one
 RISE_S = 0.25  # acceleration = velocity / 0.25 s
 MAX_ACCELERATION = 15.0  # [rad/s²]
 JERK_RATE, MAX_JERK = 40.0, 500.0  # [1/s] jerk by acceleration; [rad/s³]
@@ -110,7 +111,7 @@ def plate_of(urdf: Urdf) -> str:
         best = max(ahead, key=lambda joint: depth[joint.child] + (joint.kind != "fixed"))
         beyond = depth[best.child] + (best.kind != "fixed")
         is_gripper = GRIPPER.search(best.name) or (beyond <= 3 and len(fingers) > 1)
-        if is_gripper or (best.kind == "prismatic" and last != urdf.root):
+        if is_gripper:
             break
         link = best.child
         if best.kind != "fixed":
@@ -177,7 +178,7 @@ def proposed(
             "packages": list(packages),
             "posture": [_middle(joint) for joint in moving],
         },
-        "joints": {"acceleration": acceleration, "jerk": jerk},
+        "joints": {"acceleration": acceleration, "jerk": jerk, **_velocities(moving)},
         "tool": {"plate_from_tool": [0.0, 0.0, 0.0, *turn_of_tool(urdf.chain(plate))]},
     }
     settings = converted(given, origin=str(path))
@@ -272,17 +273,34 @@ def rates(text: str, moving: Sequence[Joint]) -> tuple[list[float], list[float],
     """A guess of the joints' accelerations [rad/s²] and jerks [rad/s³]: from rest to full speed in
     `RISE_S`, and less where the URDF's efforts are small for its masses; whether it has both.
     """
-    wanted = np.array([min(joint.velocity / RISE_S, MAX_ACCELERATION) for joint in moving])
+    wanted = np.array([min(_known(joint.velocity) / RISE_S, MAX_ACCELERATION) for joint in moving])
     share = _torque_share(text, moving, wanted)
     acceleration = wanted * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
     jerk = np.minimum(JERK_RATE * acceleration, MAX_JERK)
     return [float(f"{a:.3g}") for a in acceleration], [float(f"{j:.3g}") for j in jerk], share is not None
 
 
+def _velocities(moving: Sequence[Joint]) -> dict[str, list[float]]:
+    """The joints' velocities, where the URDF does not say all of them."""
+    if all(math.isfinite(joint.velocity) for joint in moving):
+        return {}
+    return {"velocity": [_known(joint.velocity) for joint in moving]}
+
+
+def _known(velocity: float) -> float:
+    return velocity if math.isfinite(velocity) else UNKNOWN_VELOCITY
+
+
 def _torque_share(text: str, moving: Sequence[Joint], acceleration: Vector) -> float | None:
     """The share of accelerations (J,) that half of the efforts can give beyond gravity; None where
     the URDF has no masses or efforts.
     """
+    robot = ElementTree.fromstring(text)
+    limits = {joint.get("name"): joint.find("limit") for joint in robot.findall("joint")}
+    if robot.find("link/inertial/mass") is None or any(
+        (limit := limits[joint.name]) is None or "effort" not in limit.attrib for joint in moving
+    ):
+        return None
     try:
         model = pin.buildModelFromXML(text)
         numbers = [model.joints[model.getJointId(joint.name)].idx_v for joint in moving]
@@ -386,6 +404,8 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
     """The configuration, as TOML, with the URDF by this name."""
     settings, arm = proposal.settings, proposal.settings.arm
     offset = settings.tool.plate_from_tool
+    is_said = all(math.isfinite(joint.velocity) for joint in proposal.chain if joint.kind != "fixed")
+    velocity = "" if is_said else f"velocity = {list(settings.joints.velocity)}  # [rad/s]\n"
     tool = f"[tool]  # its +z leaves the plate\nplate_from_tool = {list(offset)}\n\n" if any(offset[3:6]) else ""
     basis = "the URDF's velocities, masses and efforts" if proposal.efforts else "the URDF's velocities"
     packages = f"packages = {json.dumps(list(arm.packages))}\n" if arm.packages else ""
@@ -400,6 +420,7 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"# A guess, from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
         "# The maker's data sheet knows better; begin with a tenth on a real arm.\n"
         "[joints]\n"
+        f"{velocity}"
         f"acceleration = {list(settings.joints.acceleration)}  # [rad/s²]\n"
         f"jerk = {list(settings.joints.jerk)}  # [rad/s³]\n"
         "\n"

@@ -11,6 +11,7 @@ from service.arms.first_cell import JERK_RATE, RISE_S, TORQUE_SHARE, Proposal, p
 from service.cli.usage import check_writable
 from service.config import load
 from service.contract.explain import ExplainedError
+from service.described_arm import SettingsError
 
 DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
 
@@ -42,7 +43,13 @@ def arm(args: argparse.Namespace) -> int:
         standing.write_text(proposal.text, encoding="utf-8")
     urdf = standing if proposal.text else args.urdf
     cell.write_text(written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8")
-    load(cell)
+    try:
+        load(cell)
+    except SettingsError:
+        cell.unlink()
+        if proposal.text:
+            standing.unlink()
+        raise
     draw(proposal, picture)
     print(text(proposal, args.urdf))
     print(f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}")
