@@ -21,6 +21,8 @@ from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
+REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
+SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Cell = Annotated[
     str,
@@ -413,7 +415,7 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
     """
     try:
         _make_paths_absolute(given, folder)
-        arm = given.get("arm") if isinstance(given, dict) else None
+        arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             try:
                 own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
@@ -422,12 +424,40 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
                 others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
                 raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
         settings = validated(given, Settings)
-        check(
-            settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate
-        )
+        urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
+        check(settings.joints, urdf, settings.arm.plate)
+        if settings.arm.urdf:
+            settings = _with_reach(settings, urdf, set(reach) if isinstance(reach, dict) else set())
     except (UrdfError, SettingsError, InvalidError) as error:
         raise SettingsError(f"{origin}: {error}") from None
     return settings
+
+
+def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
+    """The settings with the reach that follows from the arm's kinematics, but for what is `said`.
+
+    Raises SettingsError where the arm reaches too little of it.
+    """
+    from service.reachable import Shell, workspace_of  # heavy, and few arms need it
+
+    workspace = workspace_of(
+        urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
+    )
+    reach = settings.reach
+    found = workspace.shell(reach.min_x, reach.min_z)
+    outer = reach.outer if "outer" in said else min(found.outer, reach.outer)
+    inner = reach.inner if "inner" in said else min(found.inner, found.inner / found.outer * outer)
+    centre = reach.centre if "centre" in said else found.centre
+    reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
+    share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
+    needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
+    if share < needed:
+        raise SettingsError(
+            f"$.reach: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
+            f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
+            f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
+        )
+    return msgspec.structs.replace(settings, reach=reach)
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:

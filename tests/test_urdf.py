@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.urdf import Urdf, UrdfError, multiply, with_one_coordinate
+from service.urdf import Urdf, UrdfError, multiply
 from support.turning import continuous_urdf, sliding_urdf
 from support.wam import JOINT_NAMES, URDF
 
@@ -32,8 +32,10 @@ def test_link_frames_are_where_another_implementation_has_them() -> None:
 
 @pytest.mark.parametrize("description", [continuous_urdf(), sliding_urdf()])
 def test_links_of_turning_and_sliding_joints_are_where_another_implementation_has_them(description: str) -> None:
-    urdf, model = Urdf(description), pin.buildModelFromXML(with_one_coordinate(description))
-    data, names = model.createData(), [joint.name for joint in urdf.movable("tool0")]
+    urdf = Urdf(description)
+    names = [joint.name for joint in urdf.movable("tool0")]
+    model = pin.buildModelFromXML(urdf.kinematics(names))
+    data = model.createData()
     assert list(model.names)[1:] == names
     q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + (0.0 if "rail_joint" in names else 20.0)
     pin.framesForwardKinematics(model, data, q)

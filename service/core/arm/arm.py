@@ -15,7 +15,7 @@ from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe
 from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.separation import Separation
-from service.urdf import with_one_coordinate
+from service.urdf import Urdf
 
 REACH_M = 0.88  # of the WAM, on which the next four were chosen; they are scaled by the arm's own
 TURN_LEVER = 0.0115  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
@@ -113,8 +113,8 @@ class Arm:
     """
 
     def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
-        self._model = _chain(pin.buildModelFromXML(with_one_coordinate(urdf)), settings.joints.names)
-        plate = self._model.frames[self._model.getFrameId(settings.arm.plate)]
+        self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
+        plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
         unit = np.array(quaternion) / math.hypot(*quaternion)
         plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
@@ -252,12 +252,6 @@ class Arm:
 def _solution(found: Vector, flags: int) -> Solution:
     found.setflags(write=False)
     return Solution(found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
-
-
-def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
-    """The model with the named joints only, the others locked at 0."""
-    locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
-    return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
 
 
 def acceleration_rate(limits: JointSettings) -> float:
