@@ -106,13 +106,13 @@ class Urdf:
         """
         moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
-            mistake = (lack := _lack(joint)) and f"cannot move: {lack}"
+            mistake = (lack := _lack(joint)) and f": {lack}"
             if joint.kind not in KINDS:
-                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+                mistake = f" is {joint.kind}; {', '.join(KINDS)} or fixed needed"
             elif joint.mimics:
-                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+                mistake = f" follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
             if mistake:
-                raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
+                raise UrdfError(f"{self.origin}: joint {joint.name!r}{mistake}")
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
         return moving

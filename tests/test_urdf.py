@@ -70,7 +70,8 @@ def test_rotations_are_multiplied_as_quaternions() -> None:
 
 FOLLOWING = URDF.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><mimic joint="wam/elbow_pitch_joint"/>', 1)
 BARE = (
-    '<robot name="r"><joint name="a" type="{}"><parent link="base"/><child link="tool_plate"/><axis xyz="1 0 0"/>'
+    '<robot name="r"><link name="base"/><link name="tool_plate"/>'
+    '<joint name="a" type="{}"><parent link="base"/><child link="tool_plate"/><axis xyz="1 0 0"/>'
     "</joint></robot>"
 )
 
@@ -87,11 +88,11 @@ BARE = (
             FOLLOWING,
             "'wam/base_yaw_joint' follows 'wam/elbow_pitch_joint' by <mimic>; before 'tool_plate', joints that",
         ),
-        (BARE.format("revolute"), "joint 'a' is revolute; a <limit> with lower below upper and a velocity above 0"),
-        (BARE.format("prismatic"), "joint 'a' is prismatic; a <limit> with lower below upper and a velocity above 0"),
+        (BARE.format("revolute"), "joint 'a': limits none to none given; lower below upper, within 1000 rad, needed"),
+        (BARE.format("prismatic"), "joint 'a': limits none to none given; lower below upper, within 1000 m, needed"),
         (
             BARE.format("continuous").replace("<axis", '<limit velocity="0"/><axis'),
-            "joint 'a' is continuous; a <limit> with a velocity above 0, or none, needed",
+            "joint 'a': velocity 0 given; above 0, up to 1000 rad/s, needed in its <limit>",
         ),
     ],
 )
