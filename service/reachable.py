@@ -21,6 +21,7 @@ from service.urdf import Joint
 
 Vectors = NDArray[np.float64]
 POSTURES = 30_000  # with more the shell's radii change by less than 1 %
+SLIDES = 9  # positions of a rail at which its arm is looked at
 POINTS = 8_000  # of space that are tested
 SPACING = 0.03  # of the arm's extent: a point is reached when the tool is that near in one of the postures
 NEIGHBOURS = 12  # postures that are looked at for each point
@@ -52,6 +53,11 @@ class Workspace:
         self.shoulder = _shoulder(self._axes)
         self.extent = float(np.linalg.norm(self.positions - self.shoulder, axis=1).max())
         self._turns = moving[0].kind != "prismatic"
+        self._beyond: Workspace | None = None
+        if not self._turns and len(moving) > 1:  # the arm on a rail: its own workspace, along the rail
+            first = list(chain).index(moving[0])
+            self._turn = _rotation(chain[: first + 1])
+            self._beyond = Workspace(chain[first + 1 :], lower[1:], upper[1:], plate_from_tool)
         flat, angles = self._flattened(self.positions)
         self._tree, self._starts = cKDTree(flat), angles - self.postures[:, 0]
         self._first = ends[0]
@@ -62,6 +68,12 @@ class Workspace:
         The first joint turns the tool on a circle about its axis: so a point is near where one of
         the postures is on the point's circle, and the joint's limits include the angle between.
         """
+        if self._beyond is not None:
+            at, along = self._axes[0]
+            found_at = [
+                self._beyond.reaches((points - at - q * along) @ self._turn) for q in np.linspace(*self._first, SLIDES)
+            ]
+            return np.asarray(np.any(found_at, axis=0))
         flat, angles = self._flattened(points)
         distances, found = self._tree.query(flat, k=NEIGHBOURS, distance_upper_bound=SPACING * self.extent)
         near = np.asarray(distances < math.inf)
@@ -123,6 +135,14 @@ def _spread(count: int, dimensions: int) -> Vectors:
     for _ in range(50):
         g = (1.0 + g) ** (1.0 / (dimensions + 1))
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * g ** -np.arange(1.0, dimensions + 1)) % 1.0)
+
+
+def _rotation(chain: Sequence[Joint]) -> Vectors:
+    """The rotation (3, 3) of the last joint's frame, with all joints at 0."""
+    turn = np.eye(3)
+    for joint in chain:
+        turn = turn @ Rotation.from_quat(joint.rotation).as_matrix()
+    return turn
 
 
 def _turns(lower: float, upper: float) -> tuple[float, float]:
