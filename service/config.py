@@ -21,6 +21,8 @@ from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
+REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
+SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 _LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 Cell = Annotated[
@@ -40,6 +42,7 @@ FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
 FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+PRISMATIC_M = 0.5  # what a tolerance of 1 rad is for a prismatic joint: the tool moves as far on a lever of 0.5 m
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,7 +136,12 @@ class ArmSettings(Section, frozen=True):
 
 class JointSettings(Section, frozen=True):
     """The arm's joints in chain order, and the limits that no command ever leaves [rad, rad/s,
-    rad/s², rad/s³].
+    rad/s², rad/s³], for prismatic (sliding) joints [m, m/s, m/s², m/s³].
+
+    A continuous joint has the limits ±6000 rad unless narrower ones are given. It is commanded in
+    the turn in which `joints/state` reports it when the arm becomes ready, and onward from there;
+    states that wrap at ±pi and states that count turns are both accepted. Tolerances in rad that
+    the service applies to every joint are half as many metres for a prismatic one.
     """
 
     names: tuple[str, ...] = (  # as `joints/state` and `joints/command` name them
@@ -145,11 +153,27 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
+    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()  # from the URDF; empty: all revolute
     lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
     upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
     velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
     acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)  # [rad/s²]
     jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)  # [rad/s³]
+
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+        return self.kinds or ("revolute",) * len(self.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each joint's position."""
+        return tuple("m" if kind == "prismatic" else "rad" for kind in self.every_kind)
+
+    @property
+    def per_rad(self) -> tuple[float, ...]:
+        """How much of each joint's unit a tolerance of 1 rad stands for."""
+        return tuple(PRISMATIC_M if kind == "prismatic" else 1.0 for kind in self.every_kind)
 
 
 class Reach(Section, frozen=True):
@@ -291,12 +315,12 @@ class Settings(Section, frozen=True):
         if not count or len(set(self.joints.names)) < count:
             yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
             return
-        fields = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS} | {
-            "$.arm.posture": self.arm.posture
-        }
+        fields: dict[str, tuple[object, ...]] = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS}
+        fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
         uneven = {path: values for path, values in fields.items() if len(values) != count}
         for path, values in uneven.items():
-            yield f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names"
+            what = "kinds" if path == "$.joints.kinds" else "numbers"
+            yield f"{path}: {len(values)} {what}, {count} needed, one for each of $.joints.names"
         if uneven:
             return
         widest = self._widest()
@@ -392,7 +416,7 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
     """
     try:
         _make_paths_absolute(given, folder)
-        arm = given.get("arm") if isinstance(given, dict) else None
+        arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             try:
                 own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
@@ -401,12 +425,40 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
                 others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
                 raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
         settings = validated(given, Settings)
-        check(
-            settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate
-        )
+        urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
+        check(settings.joints, urdf, settings.arm.plate)
+        if settings.arm.urdf:
+            settings = _with_reach(settings, urdf, set(reach) if isinstance(reach, dict) else set())
     except (UrdfError, SettingsError, InvalidError) as error:
         raise SettingsError(f"{origin}: {error}") from None
     return settings
+
+
+def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
+    """The settings with the reach that follows from the arm's kinematics, but for what is `said`.
+
+    Raises SettingsError where the arm reaches too little of it.
+    """
+    from service.reachable import Shell, workspace_of  # heavy, and few arms need it
+
+    workspace = workspace_of(
+        urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
+    )
+    reach = settings.reach
+    found = workspace.shell(reach.min_x, reach.min_z)
+    outer = reach.outer if "outer" in said else min(found.outer, reach.outer)
+    inner = reach.inner if "inner" in said else min(found.inner, found.inner / found.outer * outer)
+    centre = reach.centre if "centre" in said else found.centre
+    reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
+    share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
+    needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
+    if share < needed:
+        raise SettingsError(
+            f"$.reach: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
+            f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
+            f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
+        )
+    return msgspec.structs.replace(settings, reach=reach)
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:

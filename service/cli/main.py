@@ -40,7 +40,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
-    "set up": ("certificates", "completion"),
+    "set up": ("arm", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 
@@ -249,6 +249,18 @@ def parser() -> argparse.ArgumentParser:
     c = command("cells", "The daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447")
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
     _reach(c, one=False)
+
+    c = command(
+        "arm",
+        "Reads an arm's URDF, prints what it understands, and writes a first cell: settings, and a picture of them.",
+        "thirdhand arm my-arm.urdf",
+    )
+    option(c, "urdf", "URDF", "the arm's description", type=Path)
+    option(c, "--plate", "LINK", "the link that carries the tool (default: the likely one)")
+    at = "where its root stands in frame base [m] (default: 0 0 0, or nearby where it reaches the demo's places)"
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=at)
+    option(c, "--packages", "DIR", "a folder with packages of ROS, for its meshes; may be repeated", action="append")
+    option(c, "--output", "FILE", "the cell's settings; the picture is beside it", Path("cell.toml"), type=Path)
 
     c = command(
         "certificates",
