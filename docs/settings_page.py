@@ -132,6 +132,8 @@ def _accepted(kind: Any) -> str:
         if isinstance(inner, types.StructType):
             fields = "; ".join(f"`{field.name}`: {_accepted(field.type)}" for field in inner.fields)
             return f"tables with {fields}"
+        if isinstance(inner, types.LiteralType):
+            return f"a list of {_accepted(inner)}"
         return f"a list of {'texts' if isinstance(inner, types.StrType) else f'numbers{_each(inner)}'}"
     return ", ".join(filter(None, ("whole number" if isinstance(kind, types.IntType) else "number", _range(kind))))
 

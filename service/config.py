@@ -40,6 +40,7 @@ PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
 FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+PRISMATIC_M = 0.5  # what a tolerance of 1 rad is for a prismatic joint: the tool moves as far on a lever of 0.5 m
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,7 +134,12 @@ class ArmSettings(Section, frozen=True):
 
 class JointSettings(Section, frozen=True):
     """The arm's joints in chain order, and the limits that no command ever leaves [rad, rad/s,
-    rad/s², rad/s³].
+    rad/s², rad/s³], for prismatic (sliding) joints [m, m/s, m/s², m/s³].
+
+    A continuous joint has the limits ±6000 rad unless narrower ones are given. It is commanded in
+    the turn in which `joints/state` reports it when the arm becomes ready, and onward from there;
+    states that wrap at ±pi and states that count turns are both accepted. Tolerances in rad that
+    the service applies to every joint are half as many metres for a prismatic one.
     """
 
     names: tuple[str, ...] = (  # as `joints/state` and `joints/command` name them
@@ -145,11 +151,27 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
+    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()  # from the URDF; empty: all revolute
     lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
     upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
     velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
     acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)  # [rad/s²]
     jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)  # [rad/s³]
+
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+        return self.kinds or ("revolute",) * len(self.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each joint's position."""
+        return tuple("m" if kind == "prismatic" else "rad" for kind in self.every_kind)
+
+    @property
+    def per_rad(self) -> tuple[float, ...]:
+        """How much of each joint's unit a tolerance of 1 rad stands for."""
+        return tuple(PRISMATIC_M if kind == "prismatic" else 1.0 for kind in self.every_kind)
 
 
 class Reach(Section, frozen=True):
@@ -291,12 +313,12 @@ class Settings(Section, frozen=True):
         if not count or len(set(self.joints.names)) < count:
             yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
             return
-        fields = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS} | {
-            "$.arm.posture": self.arm.posture
-        }
+        fields: dict[str, tuple[object, ...]] = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS}
+        fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
         uneven = {path: values for path, values in fields.items() if len(values) != count}
         for path, values in uneven.items():
-            yield f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names"
+            what = "kinds" if path == "$.joints.kinds" else "numbers"
+            yield f"{path}: {len(values)} {what}, {count} needed, one for each of $.joints.names"
         if uneven:
             return
         widest = self._widest()

@@ -58,6 +58,10 @@ class Limits(Protocol):
     def names(self) -> tuple[str, ...]:
         """In the order of the chain."""
 
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+
 
 def extent(shape: Shape) -> float:
     """The length [m] of a shape; 0 of a mesh that is not covered."""
@@ -89,9 +93,16 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         )
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
+    joints.setdefault("kinds", [joint.kind for joint in moving])
     for name in ("lower", "upper", "velocity"):
-        joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    wanted = (("joints", joints, "acceleration"), ("joints", joints, "jerk"), ("arm", arm, "posture"))
+        if all(math.isfinite(getattr(joint, name)) for joint in moving):
+            joints.setdefault(name, [getattr(joint, name) for joint in moving])
+    wanted = (
+        ("joints", joints, "velocity"),
+        ("joints", joints, "acceleration"),
+        ("joints", joints, "jerk"),
+        ("arm", arm, "posture"),
+    )
     if missing := [f"$.{path}.{name}" for path, section, name in wanted if name not in section]:
         needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
@@ -116,6 +127,9 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
         raise SettingsError(
             f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
         )
+    kinds = tuple(joint.kind for joint in moving)
+    if joints.every_kind != kinds:
+        raise SettingsError(f"$.joints.kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
     wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (

@@ -11,6 +11,9 @@ from service.contract.messages import Quaternion, Transform, Vector3
 from service.link_tree import root_of
 from service.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three
 
+KINDS = ("revolute", "continuous", "prismatic")  # of joints that an arm may have
+CONTINUOUS_RAD = 6000.0  # limit of a continuous joint each way: 950 turns, so that positions keep their precision
+
 
 class UrdfError(ExplainedError, ValueError):
     """A robot description that cannot be used: says what is wrong with it and what would do."""
@@ -18,7 +21,7 @@ class UrdfError(ExplainedError, ValueError):
 
 class Joint(NamedTuple):
     """A joint: the links it connects, where it sits in the parent, and for a movable one its axis
-    and limits [rad, rad/s].
+    and limits [rad, rad/s], of a prismatic one [m, m/s].
     """
 
     name: str
@@ -31,6 +34,7 @@ class Joint(NamedTuple):
     lower: float
     upper: float
     velocity: float
+    mimics: str = ""  # the joint whose motion it follows
 
 
 class Shape(NamedTuple):
@@ -93,46 +97,61 @@ class Urdf:
         return self._above.get(link)
 
     def movable(self, tip: str) -> tuple[Joint, ...]:
-        """The revolute joints from the root to link `tip`, in order.
+        """The joints from the root to link `tip` that turn or slide, in order; continuous ones have
+        the limits ±CONTINUOUS_RAD, and an infinite velocity where the description has none.
 
-        Raises UrdfError where one has no limits or slides.
+        Raises UrdfError for a joint of another kind, without limits, or that follows another one.
         """
-        moving = tuple(joint for joint in self.chain(tip) if joint.kind != "fixed")
+        moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
-            if joint.kind != "revolute":
-                raise UrdfError(
-                    f"{self.origin}: joint {joint.name!r} is {joint.kind}; revolute with limits and a velocity needed"
-                )
-            if lack := _lack(joint):
-                raise UrdfError(f"{self.origin}: joint {joint.name!r}: {lack}")
+            mistake = _lack(joint)
+            if joint.kind not in KINDS:
+                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+            elif joint.mimics:
+                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+            if mistake:
+                raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
         return moving
 
     def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
-        """Each link in its parent link, for joint positions by name [rad]; others are at 0."""
-        return [
-            Transform(
-                joint.parent,
-                joint.child,
-                joint.translation,
-                multiply(joint.rotation, about(joint.axis, positions[joint.name]))
-                if joint.name in positions
-                else joint.rotation,
-            )
-            for joint in self.joints
-        ]
+        """Each link in its parent link, for joint positions by name [rad, m]; others are at 0."""
+        return [_moved(joint, positions.get(joint.name, 0.0)) for joint in self.joints]
+
+
+def _moved(joint: Joint, position: float) -> Transform:
+    """A joint's child link in its parent link."""
+    at, turn = joint.translation, joint.rotation
+    if position and joint.kind == "prismatic":
+        dx, dy, dz = rotated(turn, joint.axis)
+        at = (at[0] + position * dx, at[1] + position * dy, at[2] + position * dz)
+    elif position:
+        turn = multiply(turn, about(joint.axis, position))
+    return Transform(joint.parent, joint.child, at, turn)
+
+
+def _limited(joint: Joint) -> Joint:
+    """The joint with limits of its position, which a continuous one does not have; its velocity
+    need not be limited either.
+    """
+    if joint.kind != "continuous":
+        return joint
+    velocity = math.inf if math.isnan(joint.velocity) else joint.velocity
+    return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD, velocity=velocity)
 
 
 def _lack(joint: Joint) -> str:
     """Why a joint of the chain cannot be moved; empty where it can."""
+    is_continuous, unit = joint.kind == "continuous", "m" if joint.kind == "prismatic" else "rad"
     if not any(joint.axis):
-        return "axis 0 0 0 given; a direction needed"
-    if not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
-        given = f"limits {_or_none(joint.lower)} to {_or_none(joint.upper)} given"
-        return f"{given}; lower below upper, within {FARTHEST:g} rad, needed"
-    if not 0.0 < joint.velocity <= FARTHEST:
-        return f"velocity {_or_none(joint.velocity)} given; above 0, up to {FARTHEST:g} rad/s, needed in its <limit>"
+        return "has the axis 0 0 0; a direction needed"
+    if not is_continuous and not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
+        given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
+        return f"{given}; lower below upper, within {FARTHEST:g} {unit}, needed in its <limit>"
+    if not 0.0 < joint.velocity <= FARTHEST and not (is_continuous and joint.velocity == math.inf):
+        given = f"has the velocity {_or_none(joint.velocity)}"
+        return f"{given}; above 0, up to {FARTHEST:g} {unit}/s, needed in its <limit>"
     return ""
 
 
@@ -142,7 +161,7 @@ def _or_none(number: float) -> str:
 
 def _joint(element: Element) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
-    origin, limit = element.find("origin"), element.find("limit")
+    origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
     try:
         x, y, z = three(element.find("axis"), "xyz", "1 0 0")
         norm = math.hypot(x, y, z) or 1.0  # a joint without an axis cannot move: `movable` refuses it
@@ -154,7 +173,10 @@ def _joint(element: Element) -> Joint:
             three(origin, "xyz", "0 0 0"),
             _turn(origin),
             (x / norm, y / norm, z / norm),
-            *(_limit(limit, which) for which in ("lower", "upper", "velocity")),
+            _limit(limit, "lower"),
+            _limit(limit, "upper"),
+            _limit(limit, "velocity"),
+            "" if mimic is None else mimic.get("joint", "another joint"),
         )
     except ValueError as error:
         raise ValueError(f"joint {name!r}: {error}") from None
@@ -214,6 +236,13 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
         aw * bz + ax * by - ay * bx + az * bw,
         aw * bw - ax * bx - ay * by - az * bz,
     )
+
+
+def rotated(turn: Quaternion, vector: Sequence[float]) -> Vector3:
+    """A vector, rotated by a quaternion of norm 1."""
+    x, y, z, w = turn
+    product = multiply(multiply(turn, (vector[0], vector[1], vector[2], 0.0)), (-x, -y, -z, w))
+    return product[:3]
 
 
 def about(axis: Sequence[float], angle: float) -> Quaternion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -9,6 +10,7 @@ import pytest
 
 from service.config import WAM, Settings, SettingsError, load, parse
 from service.network_settings import is_local
+from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
 
 def refusal(text: str) -> str:
@@ -255,3 +257,37 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
 def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:
     text = "[network]\nlisten = ['tls/0.0.0.0:1']\ncertificate = 'secrets/daemon'"
     assert parse(text, origin="cell.toml", folder=tmp_path).network.certificate == str(tmp_path / "secrets/daemon")
+
+
+def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
+    bare = re.sub(r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>', r"\1", continuous_urdf())
+    assert bare.count("<limit") == continuous_urdf().count("<limit") - 1
+    posture = (NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0)
+    cell = cell_in(tmp_path, bare, posture=posture)
+    assert cell.joints.velocity[5] == 2.0
+    assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
+    with pytest.raises(SettingsError, match=r"\$\.joints\.velocity: missing; a URDF does not say it, 6 numbers needed"):
+        load(tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('kinds = ["revolute"]', "$.joints.kinds: 1 kinds, 6 needed"),
+        (
+            f"kinds = {['revolute'] * 6}",
+            "$.joints.kinds: ['revolute', 'revolute', 'revolute', 'revolute', 'revolute', 're",
+        ),
+        ('kinds = ["floating"]', "$.joints.kinds[0]"),
+        (f"lower = {[-7000.0, *[-3.0] * 5]}", "$.joints.lower[0]: -7000.0 given; -6000.0 or more accepted by the URDF"),
+    ],
+)
+def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    continuous_cell(tmp_path)
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(text.replace("[joints]", f"[joints]\n{line}"), encoding="utf-8")
+    with pytest.raises(SettingsError) as caught:
+        load(tmp_path / "cell.toml")
+    assert message in str(caught.value)

@@ -83,7 +83,7 @@ def follow(
             measured = drive.read()
             passed_s += measured.elapsed_s
             if passed_s - told_s >= 0.9 * tick_s:
-                follower.tell(measured.position.tolist(), measured.velocity.tolist())
+                follower.tell(playback.in_turn(measured.position).tolist(), measured.velocity.tolist())
                 told_s = passed_s
             stopping = stop.is_set()
             moved = playback.step(

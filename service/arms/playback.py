@@ -17,6 +17,7 @@ from kmp.compiled import compiled
 from service.client import BRAKE_AFTER_S, Command
 from service.config import JointSettings
 from service.core.frame import Records, Vector, parameters
+from service.core.intake.arm_samples import in_turn
 from service.core.limiter.limiter import Limited, Limiter
 
 REJOIN_AFTER_S = 0.1  # without a command; then only one is followed that begins where the arm stands ...
@@ -70,6 +71,7 @@ class Playback:
     ) -> None:
         self.refused, self.reason = 0, ""  # commands that were not followed, and why the last one was not
         self._tick_s, self._period_s, self._speed_limits = tick_s, period_s, speed_limits
+        self._limits = limits
         self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
         self._max_velocity, max_jerk = np.array(limits.velocity), np.array(limits.jerk)
         self._parameters = parameters(
@@ -103,6 +105,12 @@ class Playback:
         """How many ticks behind the newest command the arm is led, when that comes."""
         return 0.0 if self._newest is None else (self._newest.time_s + self._offset - self._heard) / self._tick_s
 
+    def in_turn(self, position: Sequence[float] | Vector) -> Vector:
+        """Measured joints (J,) [rad], the continuous ones in the turn in which they are led, as a
+        drive may wrap them at ±pi.
+        """
+        return in_turn(self._limits, np.array(position), self._state[0])
+
     def step(
         self,
         commands: Iterable[Command] = (),
@@ -117,7 +125,7 @@ class Playback:
         the last step keeps the pace of a loop that is not punctual; else each is one period.
         """
         if measured is not None:
-            self._state[0] = measured
+            self._state[0] = self.in_turn(measured)
         if 0.0 <= elapsed_s <= MOST_ELAPSED_S:
             self._owed += elapsed_s - self._period_s
         self._paused = self._owed > PAUSE_S
@@ -157,7 +165,7 @@ class Playback:
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
         silent_s = self._now - self._heard
         if last is None or silent_s > REJOIN_AFTER_S or abs(tick - last.tick) > MOST_TICKS:
-            off = np.abs(position - at).max()
+            off = (np.abs(position - at) / np.array(self._limits.per_rad)).max()
             if self._state[1:].any() or off > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
                 return f"a new sequence that does not begin where the arm stands: {off:.3f} rad off, or moving"
             self._knots.clear()

@@ -174,7 +174,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     told = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
     told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     fine = source.fresh and source.rate_hz >= SLACK * least
-    advice = "" if source.fresh else _of_unit(source) or remedy(source.cause)
+    advice = "" if source.fresh else _of_unit(source) or source.advice or remedy(source.cause)
     rejected = list(_rejected(before, now, name))
     yield from rejected
     if source.age_ms is None and any(one.level == "wrong" for one in rejected):
@@ -197,7 +197,7 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         if rate and not (share > OFTEN and cause in ("older", "jumped")):  # said below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > OFTEN * came else "note"
-            advice = (_of_unit(source) if cause == source.cause else "") or remedy(cause)
+            advice = (_of_unit(source) or source.advice if cause == source.cause else "") or remedy(cause)
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
     noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM
     if share > OFTEN or noisy:

@@ -208,4 +208,5 @@ def _turned(now: Status) -> str:
 
 
 def _rejected(name: str, source: Source) -> str:
-    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items())
+    newest = f" (newest as {source.cause}: {source.refused})" if source.refused else ""
+    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items()) + newest

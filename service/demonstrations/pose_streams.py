@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
-from service.contract.messages import BASE, PoseStamped, WireError, in_order
+from service.contract.joint_states import JointStates, measured
+from service.contract.messages import BASE, PoseStamped, WireError
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
@@ -28,6 +29,7 @@ from service.recording.mcap_reader import FileFault, Messages, full_name
 SIDES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 JOINT_STATES, GRIPPER_STATE, PLACES = "joints/state", "gripper/state", "places"
+PATIENCE_S = 0.1  # between the parts of an arm's state that come in several messages
 OF_A_HAND = {"hand", "hands", "wrist", "palm", "glove"}
 WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
 MANY, TREE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
@@ -212,17 +214,23 @@ class Recorded:
 
     def _joint_states(self, topic: str, names: tuple[str, ...] = ()) -> Iterator[tuple[int, int, tuple[float, ...]]]:
         """Time of recording, stamp [ns], and position of each joint state, of the joints named if
-        there are names. Raises RecordingError.
+        there are names; they may be spread over several messages. Raises RecordingError.
         """
+        states, found = JointStates(names, PATIENCE_S), False
         for logged_ns, data in self._raw[topic]:
             try:
                 if self._is_ros_1:
                     raise WireError("joint states of ROS 1 are not read; a bag of ROS 2 needed, or --tool with poses")
-                state = cdr.decode_joints(data)
-                position = in_order(state, names)[0] if names else state.position
+                message = cdr.decode_joints(data)
+                state = states.take(message, logged_ns / 1e9) if names else message
             except WireError as error:
                 raise RecordingError(f"{self.path}: {topic}: {error}") from None
-            yield logged_ns, state.stamp_ns or logged_ns, position
+            if state is not None:
+                found = True
+                position = measured(state, names)[0] if names else state.position
+                yield logged_ns, state.stamp_ns or logged_ns, position
+        if names and not found:
+            raise RecordingError(f"{self.path}: {topic}: no state of all joints {', '.join(names)}")
 
     def joint_topic(self, settings: Settings) -> str:
         """The one topic with joint states of the arm's joints; empty: none, or several."""

@@ -17,6 +17,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from service.contract import cdr
+from service.contract.requests import Source
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
@@ -48,13 +49,14 @@ class InForce(NamedTuple):
 
 
 class Said(msgspec.Struct, frozen=True):
-    """What a status said at its tick of mode and reason."""
+    """What a status said at its tick of mode and reason, and of what came in."""
 
     tick: int
     mode: str
     reason: str
     because: str = ""
     remedy: str = ""
+    sources: dict[str, Source] = {}
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from service.contract.incidents import remedy, word
 from service.contract.records import Mode
-from service.report.report import Figure, Percentiles, Report, Span, differing_settings
+from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
 NOTHING_MISSING = "Nothing is missing in it."
@@ -106,8 +106,7 @@ def _tables(report: Report) -> Iterator[Table]:
         "Joints, at most",
         ("joint", "from a limit [rad]", "of its speed [%]", "of its acceleration [%]"),
         tuple(
-            (one.name, f"{one.margin_rad:.2f}", f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}")
-            for one in report.joints
+            (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
         ),
     )
     yield Table(
@@ -117,6 +116,16 @@ def _tables(report: Report) -> Iterator[Table]:
         tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
         numbers=0,
     )
+
+
+NO_LIMIT_RAD = 1000.0  # a continuous joint farther from its limits has none that matters
+
+
+def _margin(joint: Joint) -> str:
+    """How far a joint stayed from its limits [rad]; in metres where it slides."""
+    if joint.kind == "continuous" and joint.margin_rad > NO_LIMIT_RAD:
+        return "no limit"
+    return f"{joint.margin_rad:.2f}" + (" m" if joint.kind == "prismatic" else "")
 
 
 def _fault(fault: Span) -> tuple[str, str, str]:

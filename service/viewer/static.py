@@ -219,9 +219,14 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
 def _log_names(fix: Any, settings: Settings) -> None:
     """Logs names, units and colours of the curves, and the labels and colours of the modes."""
     joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
+    units = settings.joints.units
     series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
-        (f"/joints/{quantity}", [f"{joint} [{unit}]" for joint in joints], palette.JOINTS)
-        for quantity, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
+        (
+            f"/joints/{quantity}",
+            [f"{joint} [{unit}{per}]" for joint, unit in zip(joints, units, strict=True)],
+            palette.JOINTS,
+        )
+        for quantity, per in (("position", ""), ("velocity", "/s"), ("acceleration", "/s²"))
     ]
     series += [
         ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.JOINTS),
@@ -243,7 +248,7 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
-        ("/joints/error", "largest [rad]", palette.MEASURED),
+        ("/joints/error", "largest [rad]" if set(units) == {"rad"} else "largest [rad or m]", palette.MEASURED),
         ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),

@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 from service.config import Settings
 from service.contract import cdr
 from service.contract.explain import ExplainedError
-from service.contract.messages import SceneObject, WireError, in_order
+from service.contract.joint_states import measured
+from service.contract.messages import SceneObject, WireError
 from service.core.frame import Record
+from service.core.intake.arm_samples import in_turn
 from service.learning.demonstration import Demonstration
 from service.recording.recording import OBJECTS
 from service.shipped import skills_folder
@@ -311,7 +313,9 @@ class Viewer:
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):
-                    self._measured = np.array(in_order(cdr.decode_joints(payload), self._settings.joints.names)[0])
+                    joints = self._settings.joints
+                    position = np.array(measured(cdr.decode_joints(payload), joints.names)[0])
+                    self._measured = in_turn(joints, position, frame["joints"])
             elif kind == "skill":
                 self.learn(payload)
         if self._unread is not None:

@@ -193,6 +193,9 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert "±" in line(HEALTHY)
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
+    why = {"cause": "ahead", "refused": "stamped 2 s after the newest accepted one, which was held up for 2 s"}
+    named = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"ahead": 3}, **why))
+    assert rows(named)["rejected"] == f"right hand 3 ahead (newest as ahead: {why['refused']})"
 
 
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
@@ -303,3 +306,13 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: it needs the left hand"
     assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: it needs both hands"
+
+
+def test_a_rejected_sample_is_followed_by_what_to_do_about_that_one() -> None:
+    told = {"refused": "stamped 2 s after the newest accepted one, which was held up for 2 s on its way"}
+    advice = "see what holds samples up"
+    seen = source("left", rejected={"ahead": 90, "older": 4}, cause="ahead", advice=advice, **told)
+    (found,) = [line for line in wrongs(diagnosed(sources=seen)) if "rejected as ahead" in line]
+    assert told["refused"] in found
+    assert advice in found
+    assert "clock" not in found

@@ -94,10 +94,11 @@ class Told:
     def inbox(self, k: int) -> Iterable[Event]:
         late = k >= FAULT_AT
         if k % 5 == 0 and not (late and self.what == "left alone"):
-            yield hand("left", LEFT, k + 1)
-            yield hand("right", RIGHT, k + 1)
+            stamp_ns = k + 1 + (10**10 if k >= FAULT_AT - 20 and self.what == "stepped" else 0)
+            yield hand("left", LEFT, stamp_ns)
+            yield hand("right", RIGHT, stamp_ns)
         if k % 2 == 0 and not (
-            (self.what == "silent" and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+            (self.what in ("silent", "stepped") and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
         ):
             q, dq = list(self.joints), [0.0] * 7
             if late and self.what == "pushed":
@@ -245,6 +246,13 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
     missed = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
     assert str(reason.name).lower() in missed
     assert fault.why in missed
+
+
+def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path: Path) -> None:
+    Told(skill, tmp_path / "a.mcap", "stepped")
+    said = reported(tmp_path / "a.mcap").faults[0].before
+    words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
+    assert words in said
 
 
 def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: Path) -> None:

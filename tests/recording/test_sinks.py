@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from service.cli.main import main
 from service.cli.usage import UsageError
 from service.cli.view import convert, moment, screenshot
-from service.config import WAM, Settings
+from service.config import WAM, Settings, parse
 from service.contract import cdr
 from service.contract.messages import JointState, SceneObject
 from service.contract.records import Mode, Reason
@@ -33,6 +33,7 @@ from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
 from service.viewer.stream import Viewer, ViewerError
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
+from support.turning import sliding_cell
 from support.wam import JOINT_NAMES
 
 
@@ -152,6 +153,42 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
     assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
     assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
+
+
+def test_an_arm_that_slides_is_drawn_in_metres_where_it_is(tmp_path: Path) -> None:
+    cell = sliding_cell(tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"], frame["joints"][0] = 1, 0.002 * tick.index
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(frame["joints"] + 0.02), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    (names,) = values(rows["/joints/velocity"], "SeriesLines:names")
+    assert (names[0], names[1]) == ("rail [m/s]", "shoulder pan [rad/s]")
+    places = np.array(values(rows["/arm/joints/0"], "Transform3D:translation"), np.float64).reshape(-1, 3)
+    assert np.ptp(places[:, 1]) == pytest.approx(0.002 * 95, abs=1e-5)
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
+
+
+def test_turns_of_a_continuous_joint_are_no_error(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(WAM.read_text().replace('type="revolute"', 'type="continuous"', 1))
+    posture, limits = list(Settings().arm.posture), f"acceleration = {[5.0] * 7}\njerk = {[200.0] * 7}"
+    text = f'[arm]\nurdf = "arm.urdf"\nplate = "tool_plate"\nposture = {posture}\n[joints]\n{limits}\n'
+    cell = parse(text, origin="cell.toml", folder=tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"] = 1
+        frame["joints"][0] += 20.0
+        position = frame["joints"] + 0.02
+        position[0] = np.remainder(position[0] + np.pi, 2 * np.pi) - np.pi
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(position), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    found = values(drawn(tmp_path / "a.rrd")["/joints/error"], "Scalars:scalars")
+    assert np.ravel(found) == pytest.approx(np.full(100, 0.02))
 
 
 def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:

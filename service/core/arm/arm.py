@@ -34,6 +34,7 @@ TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward spee
 # Of the joints' speed, acceleration and jerk that a plan may use: closing in needs the rest.
 PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
 
+FARTHEST_RAD = 1e4  # beyond it a joint is not calculated with
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
@@ -151,6 +152,8 @@ class Arm:
             max_velocity=np.array(limits.velocity, np.float64),
             acceleration=acceleration,
             posture=np.array(settings.arm.posture, np.float64),
+            is_continuous=np.array([int(kind == "continuous") for kind in limits.every_kind]),
+            per_rad=np.array(limits.per_rad),
             scale=scale,
             spared=spared,
             planned_limits=PLANNED_SHARE[:, None]
@@ -181,8 +184,8 @@ class Arm:
         self._unseparated = Separation.constraints_for(joints, 0)
 
     def at(self, q: Vector) -> Kinematics:
-        """The arm at joints q (J,) [rad]."""
-        q = np.minimum(np.maximum(q, -1e3), 1e3)
+        """The arm at joints q (J,) [rad, m]."""
+        q = np.minimum(np.maximum(q, -FARTHEST_RAD), FARTHEST_RAD)
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)

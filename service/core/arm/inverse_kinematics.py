@@ -236,11 +236,14 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     said, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
-        if min(low, high) < NEAR_LIMIT:
+        if min(low, high) < NEAR_LIMIT * arm.per_rad[j]:
             said |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
-        home[j] = min(max(POSTURE_GAIN * (arm.posture[j] - here.joints[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
+        off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED * arm.per_rad[j]
+        if arm.is_continuous[j]:  # in whichever turn; 0 half a turn away, as no direction is shorter there
+            off = math.sin(off)
+        home[j] = min(max(POSTURE_GAIN * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
     rows, limits = np.empty((count, joints)), np.empty(count)
