@@ -57,6 +57,8 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_own_task.py",
     "sim/test_bench.py",
     "sim/test_arms.py",
+    "arms/test_first_cell.py",
+    "test_odd_urdfs.py",
     "sim/test_engines.py",
     "cli/test_interrupt.py",
     "daemon/test_fuzzed_daemon.py",
