@@ -8,6 +8,7 @@ For N postures, drawn evenly over the joints' limits: position of the tool
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,9 +22,9 @@ from service.urdf import Joint
 
 Vectors = NDArray[np.float64]
 POSTURES = 30_000  # with more the shell's radii change by less than 1 %
-SLIDES = 9  # positions of a rail at which its arm is looked at
 POINTS = 8_000  # of space that are tested
 SPACING = 0.03  # of the arm's extent: a point is reached when the tool is that near in one of the postures
+RAIL_STEPS = 9  # positions of a prismatic joint below the first one that turns
 NEIGHBOURS = 12  # postures that are looked at for each point
 REACHED = 0.95  # share of the points at a distance from the shoulder that the arm reaches there
 LAYERS = 40  # distances from the shoulder that are tested
@@ -49,33 +50,36 @@ class Workspace:
         ends = np.array([_turns(low, high) for low, high in zip(lower, upper, strict=True)])
         shares = _spread(POSTURES, len(moving))
         self.postures = ends[:, 0] + shares * (ends[:, 1] - ends[:, 0])
-        self.positions, self.directions, self._axes = _placed(chain, self.postures, plate_from_tool)
-        self.shoulder = _shoulder(self._axes)
+        rails = next((i for i, joint in enumerate(moving) if joint.kind != "prismatic"), 0)
+        unmoved = self.postures.copy()
+        unmoved[:, :rails] = 0.0
+        from_rails, self.directions, axes = _placed(chain, unmoved, plate_from_tool)
+        along = np.array([axis for _, axis in axes[:rails]]).reshape(rails, 3)
+        self.positions = from_rails + self.postures[:, :rails] @ along
+        self._turns, self._axis = moving[rails].kind != "prismatic", axes[rails][1]
+        self._centre, self._first = _shoulder(axes[rails:]), ends[rails]
+        self.shoulder = self._centre + ends[:rails].mean(axis=1) @ along
+        self._reach = float(np.linalg.norm(from_rails - self._centre, axis=1).max())
         self.extent = float(np.linalg.norm(self.positions - self.shoulder, axis=1).max())
-        self._turns = moving[0].kind != "prismatic"
-        self._beyond: Workspace | None = None
-        if not self._turns and len(moving) > 1:  # the arm on a rail: its own workspace, along the rail
-            first = list(chain).index(moving[0])
-            self._turn = _rotation(chain[: first + 1])
-            self._beyond = Workspace(chain[first + 1 :], lower[1:], upper[1:], plate_from_tool)
-        flat, angles = self._flattened(self.positions)
-        self._tree, self._starts = cKDTree(flat), angles - self.postures[:, 0]
-        self._first = ends[0]
+        steps = [np.linspace(low, high, RAIL_STEPS) for low, high in ends[:rails]]
+        self._stops = [np.array(stop) @ along for stop in itertools.product(*steps)] if rails else [np.zeros(3)]
+        flat, angles = self._flattened(from_rails)
+        self._tree, self._starts = cKDTree(flat), angles - self.postures[:, rails]
 
     def reaches(self, points: Vectors) -> NDArray[np.bool_]:
-        """For points (M, 3) whether the tool comes near (M,).
+        """For points (M, 3) whether the tool comes near (M,), with the rails below the first joint
+        that turns at any of their stops.
+        """
+        return np.asarray(np.any([self._reaches(points - stop) for stop in self._stops], axis=0))
+
+    def _reaches(self, points: Vectors) -> NDArray[np.bool_]:
+        """For points (M, 3) whether the tool comes near with the rails at 0.
 
         The first joint turns the tool on a circle about its axis: so a point is near where one of
         the postures is on the point's circle, and the joint's limits include the angle between.
         """
-        if self._beyond is not None:
-            at, along = self._axes[0]
-            found_at = [
-                self._beyond.reaches((points - at - q * along) @ self._turn) for q in np.linspace(*self._first, SLIDES)
-            ]
-            return np.asarray(np.any(found_at, axis=0))
         flat, angles = self._flattened(points)
-        distances, found = self._tree.query(flat, k=NEIGHBOURS, distance_upper_bound=SPACING * self.extent)
+        distances, found = self._tree.query(flat, k=NEIGHBOURS, distance_upper_bound=SPACING * self._reach)
         near = np.asarray(distances < math.inf)
         if not self._turns:
             return np.asarray(near.any(axis=1))
@@ -85,15 +89,14 @@ class Workspace:
 
     def _flattened(self, points: Vectors) -> tuple[Vectors, Vectors]:
         """Distances of points (M, 3) from the first axis and heights along it (M, 2), and angles
-        about it (M,); the points themselves and 0 where the first joint slides.
+        about it (M,); the points themselves and 0 where no joint turns.
         """
         if not self._turns:
             return points, np.zeros(len(points))
-        along = self._axes[0][1]
-        one = np.linalg.svd(along[None])[2][1]  # any direction across the axis
-        away = points - self.shoulder
-        x, y = away @ one, away @ np.cross(along, one)
-        return np.column_stack((np.hypot(x, y), away @ along)), np.arctan2(y, x)
+        one = np.linalg.svd(self._axis[None])[2][1]  # any direction across the axis
+        away = points - self._centre
+        x, y = away @ one, away @ np.cross(self._axis, one)
+        return np.column_stack((np.hypot(x, y), away @ self._axis)), np.arctan2(y, x)
 
     def shell(self, min_x: float, min_z: float) -> Shell:
         """The widest shell around the shoulder of which the arm reaches about all above `min_z` and
@@ -135,14 +138,6 @@ def _spread(count: int, dimensions: int) -> Vectors:
     for _ in range(50):
         g = (1.0 + g) ** (1.0 / (dimensions + 1))
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * g ** -np.arange(1.0, dimensions + 1)) % 1.0)
-
-
-def _rotation(chain: Sequence[Joint]) -> Vectors:
-    """The rotation (3, 3) of the last joint's frame, with all joints at 0."""
-    turn = np.eye(3)
-    for joint in chain:
-        turn = turn @ Rotation.from_quat(joint.rotation).as_matrix()
-    return turn
 
 
 def _turns(lower: float, upper: float) -> tuple[float, float]:

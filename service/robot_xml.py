@@ -49,7 +49,8 @@ def element_of(text: str | bytes) -> Element:
             raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_DEPTH} elements in each other")
         if count > MAX_ELEMENTS:
             raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_ELEMENTS} elements")
-        if tag.startswith("xacro:") or any("${" in value or "$(" in value for value in attributes.values()):
+        matters = len(open_tags) > 1 and open_tags[1] in ("link", "joint")
+        if tag.startswith("xacro:") or (matters and any("${" in one or "$(" in one for one in attributes.values())):
             raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
         if foreign or ":" in tag:
             foreign += 1

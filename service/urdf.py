@@ -89,9 +89,7 @@ class Urdf:
         return tuple(reversed(found))
 
     def kinematics(self, names: Sequence[str]) -> str:
-        """Links and joints alone, as a URDF in which the joints of these names move, each by one
-        coordinate.
-        """
+        """Links and joints alone, as a URDF in which the joints of these names move."""
         return kinematics(self._robot, {joint.name: joint.axis for joint in self.joints if joint.name in names})
 
     def above(self, link: str) -> Joint | None:
@@ -106,13 +104,13 @@ class Urdf:
         """
         moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
-            mistake = (lack := _lack(joint)) and f": {lack}"
+            mistake = _lack(joint)
             if joint.kind not in KINDS:
-                mistake = f" is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
             elif joint.mimics:
-                mistake = f" follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
             if mistake:
-                raise UrdfError(f"{self.origin}: joint {joint.name!r}{mistake}")
+                raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
         return moving
@@ -145,15 +143,15 @@ def _limited(joint: Joint) -> Joint:
 
 def _lack(joint: Joint) -> str:
     """Why a joint of the chain cannot be moved; empty where it can."""
+    is_continuous, unit = joint.kind == "continuous", "m" if joint.kind == "prismatic" else "rad"
     if not any(joint.axis):
-        return "axis 0 0 0 given; a direction needed"
-    unit, turns_on = "m" if joint.kind == "prismatic" else "rad", joint.kind == "continuous"
-    if not turns_on and not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
-        given = f"limits {_or_none(joint.lower)} to {_or_none(joint.upper)} given"
-        return f"{given}; lower below upper, within {FARTHEST:g} {unit}, needed"
-    if not 0.0 < joint.velocity <= (math.inf if turns_on else FARTHEST):
-        needed = f"above 0, up to {FARTHEST:g} {unit}/s, needed in its <limit>"
-        return f"velocity {_or_none(joint.velocity)} given; {needed}"
+        return "has the axis 0 0 0; a direction needed"
+    if not is_continuous and not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
+        given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
+        return f"{given}; lower below upper, within {FARTHEST:g} {unit}, needed in its <limit>"
+    if not 0.0 < joint.velocity <= FARTHEST and not (is_continuous and joint.velocity == math.inf):
+        given = f"has the velocity {_or_none(joint.velocity)}"
+        return f"{given}; above 0, up to {FARTHEST:g} {unit}/s, needed in its <limit>"
     return ""
 
 

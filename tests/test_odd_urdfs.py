@@ -63,10 +63,14 @@ def chain_of(count: int) -> str:
 
 
 def tried(folder: Path, text: str | bytes) -> Settings:
-    """The cell of an arm, whose core is built, too: with finite numbers alone."""
+    """The cell of an arm, read in bounded time, and its core, which has finite numbers alone."""
     (folder / "arm.urdf").write_bytes(text if isinstance(text, bytes) else text.encode())
     (folder / "cell.toml").write_text(CELL)
-    cell = load(folder / "cell.toml")
+    start = time.process_time()
+    try:
+        cell = load(folder / "cell.toml")
+    finally:
+        assert time.process_time() - start < BOUND_S
     robot = robot_description(cell)
     arm, body = Arm(cell, robot), body_of(cell, robot)
     here = arm.at(np.array(cell.arm.posture))
@@ -100,15 +104,15 @@ REFUSED = {
         "joint 'x' names no child link",
     ),
     "a link without a name": (more("<link/>" + fixed("tool0", "")), "a link without a name"),
-    "a velocity of 0": (every("velocity", "0"), "'shoulder_pan_joint': velocity 0 given; above 0"),
-    "a velocity of inf": (every("velocity", "inf"), "'shoulder_pan_joint': velocity inf given"),
-    "no velocity": (every("velocity", None), "'shoulder_pan_joint': velocity none given"),
-    "a velocity in words": (every("velocity", "fast"), "'shoulder_pan_joint': velocity none given"),
-    "no lower limit": (every("lower", None), "'shoulder_pan_joint': limits none to"),
-    "limits the other way round": (every("upper", "-9"), "'shoulder_pan_joint': limits -6.2832 to -9 given"),
+    "a velocity of 0": (every("velocity", "0"), "'shoulder_pan_joint' has the velocity 0; above 0"),
+    "a velocity of inf": (every("velocity", "inf"), "'shoulder_pan_joint' has the velocity inf"),
+    "no velocity": (every("velocity", None), "'shoulder_pan_joint' has the velocity none"),
+    "a velocity in words": (every("velocity", "fast"), "'shoulder_pan_joint' has the velocity none"),
+    "no lower limit": (every("lower", None), "'shoulder_pan_joint' has the limits none to"),
+    "limits the other way round": (every("upper", "-9"), "'shoulder_pan_joint' has the limits -6.2832 to -9"),
     "a limit without end": (every("upper", "1e300"), "within 1000 rad, needed"),
-    "no limits": (re.sub(r"<limit[^>]*/>", "", UR5), "'shoulder_pan_joint': limits none to none given"),
-    "an axis of 0": (every("xyz", "0 0 0"), "'shoulder_pan_joint': axis 0 0 0 given; a direction needed"),
+    "no limits": (re.sub(r"<limit[^>]*/>", "", UR5), "'shoulder_pan_joint' has the limits none to none"),
+    "an axis of 0": (every("xyz", "0 0 0"), "'shoulder_pan_joint' has the axis 0 0 0; a direction needed"),
     "an axis of NaN": (every("xyz", "nan 0 0"), "<axis xyz='nan 0 0'>: finite numbers"),
     "an axis of two numbers": (every("xyz", "0 1"), "<axis xyz='0 1'>: 2 numbers, 3 needed"),
     "an origin without end": (UR5.replace('xyz="0', 'xyz="inf', 1), "finite numbers up to"),
@@ -152,10 +156,8 @@ REFUSED = {
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.values(), ids=REFUSED)
 def test_what_is_no_arm_is_refused_in_one_sentence(text: str | bytes, said: str, tmp_path: Path) -> None:
-    start = time.monotonic()
     with pytest.raises(SettingsError) as error:
         tried(tmp_path, text)
-    assert time.monotonic() - start < BOUND_S
     message = str(error.value)
     assert said in message
     assert message.startswith(f"{tmp_path / 'cell.toml'}: ")
@@ -167,6 +169,7 @@ LATIN = '<?xml version="1.0" encoding="ISO-8859-1"?>' + UR5[UR5.index("<robot") 
 LOADED = {
     "no effort": re.sub(r' effort="[^"]*"', "", UR5),
     "an undeclared prefix": more('<gazebo><sensor:camera a:b="1"><x/></sensor:camera></gazebo>'),
+    "macros where nobody looks": more('<gazebo><plugin file="$(find arm)/x"/></gazebo>'),
     "non-ASCII names": UR5.replace("base_link", "Größe_底"),
     "ISO 8859-1": LATIN.encode("latin-1"),
     "UTF-16": UR5[UR5.index("<robot") :].encode("utf-16"),
@@ -186,9 +189,7 @@ LOADED = {
 
 @pytest.mark.parametrize("text", LOADED.values(), ids=LOADED)
 def test_what_others_accept_moves_as_the_plain_one(text: str | bytes, tmp_path: Path) -> None:
-    start = time.monotonic()
     cell = tried(tmp_path, text)
-    assert time.monotonic() - start < BOUND_S
     assert cell.joints.names[0] == "shoulder_pan_joint"
     ElementTree.fromstring(robot_description(cell))  # any reader of XML accepts it
     assert ArmModels(tmp_path / "arm.urdf", cell).body.capsules.shape
@@ -242,10 +243,8 @@ def spoilt(draw: st.DrawFn) -> bytes:
 def test_a_spoilt_description_is_refused_or_has_finite_numbers_alone(
     tmp_path_factory: pytest.TempPathFactory, text: bytes
 ) -> None:
-    start = time.monotonic()
     with contextlib.suppress(SettingsError):
         tried(tmp_path_factory.getbasetemp(), text)
-    assert time.monotonic() - start < BOUND_S
 
 
 def test_a_description_says_only_what_moves_to_the_kinematics() -> None:

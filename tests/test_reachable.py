@@ -17,6 +17,7 @@ from service.reachable import Shell, workspace_of
 from service.shipped import ARMS, cell_of
 from service.urdf import Urdf
 from support.paths import ROOT
+from support.turning import sliding_cell
 
 UR5 = (ROOT / "service" / "arms" / "ur5.urdf").read_text(encoding="utf-8")
 CELL = """
@@ -103,6 +104,18 @@ def test_the_shipped_cells_have_a_reach_about_as_their_kinematics_give(arm: str)
     assert found.centre == pytest.approx(reach.centre, abs=0.001)
     assert found.outer == pytest.approx(reach.outer, abs=0.07)
     assert workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z) > 0.99
+
+
+def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
+    cell = sliding_cell(tmp_path)
+    joints = cell.joints
+    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
+    workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
+    assert workspace.shoulder == pytest.approx((0.0, 0.0, 0.089), abs=1e-3)
+    assert 1.15 < workspace.extent < 0.95 + 0.31  # the rail is 0.3 m long each way
+    ends = np.array([(0.5, y, 0.2) for y in (-1.05, 1.05, -1.3, 1.3)])
+    assert workspace.reaches(ends).tolist() == [True, True, False, False]
+    assert reached(cell, targets(cell, 40)) >= 0.95
 
 
 def test_the_tool_belongs_to_the_reach(tmp_path: Path) -> None:

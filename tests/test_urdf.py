@@ -88,11 +88,11 @@ BARE = (
             FOLLOWING,
             "'wam/base_yaw_joint' follows 'wam/elbow_pitch_joint' by <mimic>; before 'tool_plate', joints that",
         ),
-        (BARE.format("revolute"), "joint 'a': limits none to none given; lower below upper, within 1000 rad, needed"),
-        (BARE.format("prismatic"), "joint 'a': limits none to none given; lower below upper, within 1000 m, needed"),
+        (BARE.format("revolute"), "joint 'a' has the limits none to none; lower below upper, within 1000 rad, needed"),
+        (BARE.format("prismatic"), "joint 'a' has the limits none to none; lower below upper, within 1000 m, needed"),
         (
             BARE.format("continuous").replace("<axis", '<limit velocity="0"/><axis'),
-            "joint 'a': velocity 0 given; above 0, up to 1000 rad/s, needed in its <limit>",
+            "joint 'a' has the velocity 0; above 0, up to 1000 rad/s, needed",
         ),
     ],
 )

@@ -12,7 +12,6 @@ from service.cli.usage import check_writable
 from service.config import load
 from service.contract.explain import ExplainedError
 from service.described_arm import SettingsError
-from service.urdf import CONTINUOUS_RAD
 
 DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
 
@@ -85,13 +84,15 @@ def text(proposal: Proposal, path: Path) -> str:
                 f"  {joint.name:<28} {joint.kind:<10} {limits.lower[i]:8.2f} {limits.upper[i]:8.2f} "
                 f"{limits.velocity[i]:9.2f} {limits.acceleration[i]:13.2f} {limits.jerk[i]:6.0f}"
             )
-    lines.append("  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: full speed in")
+    lines.append("  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: from rest to full speed in")
     basis = (
         f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts" if proposal.efforts else "no efforts in the URDF"
     )
-    lines.append(f"  {RISE_S:g} s at most, {basis}, jerk {JERK_RATE:g}/s of it. The data sheet knows better")
-    of_joints = zip(limits.names, limits.units, limits.upper, strict=True)
-    if wide := [name for name, unit, upper in of_joints if unit == "rad" and DEGREES < upper < CONTINUOUS_RAD]:
+    lines.append(f"  {RISE_S:g} s or more, {basis}, jerk {JERK_RATE:g}/s of it. The data sheet knows better")
+    revolute = {joint.name for joint in proposal.chain if joint.kind == "revolute"}
+    if wide := [
+        name for name, upper in zip(limits.names, limits.upper, strict=True) if name in revolute and upper > DEGREES
+    ]:
         lines.append(f"  limits of {', '.join(wide)} are more than a turn: a URDF has radians, not degrees")
     radii = body.capsules["radius"]
     bare = sorted(set(range(len(limits.names) + 1)) - {_link(proposal, shape.link) for shape in urdf.shapes})

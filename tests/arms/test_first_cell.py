@@ -51,6 +51,7 @@ ARMS: dict[str, tuple[Callable[[], Path], str]] = {
     "z1": (lambda: published("z1.urdf"), "gripperStator"),
     "ur3": (lambda: published("ur3_robot.urdf"), "tool0"),
     "ur10": (lambda: published("ur10_robot.urdf"), "tool0"),
+    "kinova": (lambda: published("kinova.urdf"), "j2s6s200_end_effector"),
     "panda": (lambda: published("panda.urdf"), "panda_hand_tcp"),
     "wam": (lambda: SHIPPED / "wam.urdf", "tool_plate"),
 }

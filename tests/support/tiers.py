@@ -60,6 +60,8 @@ SLOW = (  # the longest first: so they begin first
     "sim/test_bench.py",
     "sim/test_arms.py",
     "sim/test_rates.py",
+    "arms/test_first_cell.py",
+    "test_odd_urdfs.py",
     "sim/test_engines.py",
     "cli/test_interrupt.py",
     "daemon/test_fuzzed_daemon.py",
