@@ -22,6 +22,8 @@ from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
+from service.core.intake.intake import UNIT_M
+from service.demonstrations.motion_capture import FRAME, Captured, read_c3d, read_motive
 from service.demonstrations.tool_poses import tool_poses
 from service.demonstrations.track import Track, clock_parts
 from service.recording.mcap_file import RecordingError, existing
@@ -32,6 +34,14 @@ ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 JOINT_STATES, GRIPPER_STATE, PLACES = "joints/state", "gripper/state", "places"
 OF_A_HAND = {"hand", "hands", "wrist", "palm", "glove"}
 WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
+FROM_ARRAYS = "Arrays of any origin become a take in a few lines: docs/arrays.md"
+NOT_READ = {
+    **dict.fromkeys((".zst", ".zstd", ".lz4", ".gz", ".zip"), "decompress it first, or give the folder of the bag"),
+    **dict.fromkeys(
+        (".parquet", ".npz", ".npy", ".h5", ".hdf5", ".json", ".txt", ".tsv", ".trc", ".bvh", ".fbx", ".tak"),
+        FROM_ARRAYS,
+    ),
+}
 LARGEST_MESSAGE = 1 << 24  # [bytes]
 MANY, TREE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
 KINDS = (
@@ -68,7 +78,10 @@ class Recorded:
     """The messages of a recording from which poses can be read, by topic."""
 
     def __init__(self, path: str | Path) -> None:
-        """Reads an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
+        """Reads an MCAP file, a bag's folder, `.db3`, `.bag`, CSV of Motive or C3D.
+
+        Raises RecordingError.
+        """
         self.path = Path(path)
         self.topics: dict[str, str] = {}  # types by topic, of all topics
         self.faults: list[FileFault] = []
@@ -82,10 +95,28 @@ class Recorded:
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
         self._ros_1_topics: set[str] = set()
-        if self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
+        self.is_captured = False  # by a motion capture system: in metres, in the axes of that
+        if reader := {".csv": read_motive, ".c3d": read_c3d}.get(self.path.suffix.lower()):
+            self._read_captured(reader(self._existing()))
+        elif self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
             self._read_bag()
+        elif instead := NOT_READ.get(self.path.suffix.lower()):
+            raise RecordingError(f"{self._existing()} is not read: {instead}")
         else:
             self._read_mcap()
+
+    def _existing(self) -> Path:
+        if not self.path.is_file():
+            raise RecordingError(f"{self.path} is not there")
+        return self.path
+
+    def _read_captured(self, captured: Captured) -> None:
+        self.is_captured = True
+        for name, (stamps, poses) in captured.items():
+            topic, part = PoseTopic.parsed(name)
+            self.topics[topic] = POSE.type
+            rows = [tuple(row) for row in poses.tolist()]
+            self._read.setdefault(topic, {})[part] = (stamps, stamps, rows, FRAME)
 
     def _read_mcap(self) -> None:
         messages = Messages(existing(self.path))
@@ -133,6 +164,11 @@ class Recorded:
         from rosbags.rosbag1 import Reader as Ros1Reader  # heavy, and most recordings are MCAP files
         from rosbags.rosbag2 import Reader as Ros2Reader
 
+        if (self.path / "meta" / "info.json").exists():
+            raise RecordingError(
+                f"{self.path} is a data set of LeRobot: its columns do not say which are the hands and the tool. "
+                f"{FROM_ARRAYS}"
+            )
         if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
         try:
@@ -177,10 +213,14 @@ class Recorded:
                 poses.append(pose)
         return out
 
-    def track(self, name: str, source: PoseTopic) -> Track:
+    def track(self, name: str, source: PoseTopic, settings: Settings) -> Track:
         """One stream as arrays. Raises RecordingError."""
-        stamps, logged, poses, frame = self.tracks(source.topic)[source.part]
-        return Track(name, str(source), np.array(stamps), np.array(logged), np.array(poses), frame)
+        stamps, logged, rows, frame = self.tracks(source.topic)[source.part]
+        poses = np.array(rows, np.float64)
+        if self.is_captured:  # `settings` say where the system is, and the unit in which it publishes
+            poses[:, :3] /= UNIT_M[settings.hands.unit]
+            frame = frame if settings.hands.frame in ("", BASE) else settings.hands.frame
+        return Track(name, str(source), np.array(stamps, np.int64), np.array(logged, np.int64), poses, frame)
 
     def tool_by_joints(self, topic: str, settings: Settings, urdf: str) -> Track:
         """The tool in frame `base`, found from joint states by the URDF. Raises RecordingError."""
@@ -310,7 +350,7 @@ def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Setting
         (conducts,) = (name for name in get_args(Hands) if name in sources)
         hint = "" if conducts == recorded.conducts else f": no other is there (--{_other(conducts)} TOPIC names one)"
         guessed.append(f"the {conducts} hand conducts alone{hint}")
-    hands = [recorded.track(ENDINGS[name], source) for name, source in sources.items()]
+    hands = [recorded.track(ENDINGS[name], source, settings) for name, source in sources.items()]
     return Chosen([hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed)
 
 
@@ -344,7 +384,7 @@ def _tool(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Settings
         if source is None:
             raise _not_found(recorded, "tool", [])
         guessed.append(f"tool is {source}")
-    return recorded.track(ENDINGS["tool"], source)
+    return recorded.track(ENDINGS["tool"], source, settings)
 
 
 def _given(recorded: Recorded, name: str, wanted: PoseTopic) -> PoseTopic:
