@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.contract import cdr
+from service.contract.channels import JOINTS, POSE, STRING
+from service.contract.messages import JointState, PoseStamped
 from service.demonstrations.demonstration_files import summary
 from service.demonstrations.demonstration_reader import ENOUGH, read_demonstration, write_demonstration
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
-from service.recording.mcap_file import RecordingError
+from service.recording.mcap_file import McapFile, RecordingError
 from support import spoiled
 from support.circling import circling
 from support.paths import RECORDINGS
@@ -175,3 +178,24 @@ def test_what_is_learned_is_what_the_clean_rest_teaches(tmp_path: Path) -> None:
         assert skill.threshold == wanted.threshold
         assert np.linalg.norm(skill.mean(held_out.hands) - whole.mean(held_out.hands), axis=1).max() < 0.01
         assert skill.threshold == pytest.approx(whole.threshold, rel=0.25)
+
+
+def test_what_a_skill_does_not_use_never_refuses_a_take(clean: list[Demonstration], tmp_path: Path) -> None:
+    """Another stream in two frames, a gripper of NaN, and a topic `places` of somebody else."""
+    take, said, path = clean[1], list[str](), tmp_path / "a.mcap"
+    with McapFile(path, joints=1, attached=False) as file:
+        for i, stamp in enumerate((START_NS + take.stamps_ns).tolist()):
+            for side, key in spoiled.KEYS.items():
+                row = getattr(take, side)[i].tolist()
+                pose = PoseStamped(stamp, "base", tuple(row[:3]), tuple(row[3:]))
+                file.put(f"cell/{key}", POSE.type, cdr.encode_pose(pose), stamp, i)
+            other = PoseStamped(stamp, "ab"[i % 2], (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
+            file.put("camera/pose", POSE.type, cdr.encode_pose(other), stamp, i)
+            closure = cdr.encode_joints(JointState(stamp, ("gripper",), (float("nan"),), ()))
+            file.put("cell/gripper/state", JOINTS.type, closure, stamp, i)
+        file.put("shop/places", STRING.type, cdr.encode_string("Oslo, Rome"), START_NS, 0)
+    got = read_demonstration(path, say=said.append)
+    np.testing.assert_array_equal(got.hands, take.hands)
+    assert (got.gripper, got.places) == (None, ())
+    assert any("states of the gripper tell nothing" in line for line in said)
+    assert any("places are not understood, and not used" in line for line in said)
