@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
+from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import FARTHEST_M, LEVELS, NORMAL, REGION_95, Model, Regions
@@ -84,6 +85,9 @@ FARTHEST_TURN = 2.0 * np.pi  # [rad, half the angle] of an orientation from the 
 
 class SkillError(ExplainedError, ValueError):
     """A skill that cannot be read, learned or adapted."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable_lines(text))  # which may quote what a file holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +161,12 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
         turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
         skill = StoredSkill(
-            name=str(arrays["name"]),
+            name=printable(str(arrays["name"])),
             model=model.from_arrays(arrays, via_points),
             orientation=arrays["orientation"],
             workspace=arrays["box"],
             threshold=float(arrays["threshold"]),
-            learned_from=str(arrays["learned_from"]),
+            learned_from=printable(str(arrays["learned_from"])),
             components=int(arrays["components"]),
             via_points=via_points,
             tolerance=float(arrays["tolerance"]),
