@@ -173,7 +173,8 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
     )
     demonstrations = (
-        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder"
+        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder, "
+        ".bag, CSV of Motive, C3D"
     )
     option(c, "demonstrations", "DEMO", demonstrations, nargs="+", type=Path)
     for name in ("left", "right", "tool"):

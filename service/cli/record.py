@@ -72,6 +72,10 @@ def record(args: argparse.Namespace) -> int:
 
 def _list(folder: Path, settings: Settings | None) -> int:
     """Exit code 1 where one of the takes cannot be learned from."""
+    if not folder.is_dir():
+        raise DemonstrationNameError(
+            f"{folder} {'is no folder' if folder.exists() else 'does not exist'}: a folder of takes needed (--folder)"
+        )
     paths, unusable = demonstration_paths(folder), 0
     for path in paths:
         try:
