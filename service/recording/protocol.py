@@ -94,7 +94,8 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     """The setup of a scribe; the skill is sent along as a memory file.
 
     Without state it begins with the first message that has one. `recording` and `rrd` are explicit
-    paths instead of names in `folder`; `attempt` counts the scribes of one daemon.
+    paths instead of names in `folder`; `attempt` counts the scribes of one daemon; `unmarked` ticks
+    were lost with those before, and no recording marks them yet.
     """
 
     settings: Settings
@@ -104,6 +105,7 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     rrd: str | None
     live_port: int | None
     attempt: int
+    unmarked: int = 0
 
 
 class ScribeReport(msgspec.Struct, frozen=True):

@@ -30,11 +30,18 @@ class Segments:
     """Writes ticks and notes; `say` is called once with what fails, in words.
 
     `draw` is called with the path of the drawing beside a new recording. Of the ticks received,
-    `kept` are on disk and `lost` never will be; of the lost ones no recording marks `unmarked` yet.
+    `kept` are on disk and `lost` never will be. No recording on disk marks `unmarked` of the lost
+    ticks yet; it begins with those of others that went before.
     """
 
     def __init__(
-        self, settings: Settings, paths: RecordingPaths, *, say: Callable[[str], None], draw: Callable[[Path], None]
+        self,
+        settings: Settings,
+        paths: RecordingPaths,
+        *,
+        say: Callable[[str], None],
+        draw: Callable[[Path], None],
+        unmarked: int = 0,
     ) -> None:
         self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
         self._recorder: Recorder | None = None
@@ -42,7 +49,8 @@ class Segments:
         self._skill: bytes | None = None
         self._rrd: Path | None = None
         self._complete: Path | None = None
-        self._kept = self.lost = self.unmarked = 0
+        self._kept = self.lost = 0
+        self._unmarked = unmarked
         self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = self._drawn = False
@@ -52,6 +60,11 @@ class Segments:
     def kept(self) -> int:
         """Ticks on disk."""
         return self._kept + (self._recorder.kept if self._recorder is not None else 0)
+
+    @property
+    def unmarked(self) -> int:
+        """Lost ticks that no recording on disk marks yet."""
+        return self._unmarked + self._marked_pending
 
     @property
     def path(self) -> Path | None:
@@ -124,14 +137,14 @@ class Segments:
         if self._recorder is None:
             if self._wanted:
                 self.lost += 1
-                self.unmarked += 1 + received.lost
+                self._unmarked += 1 + received.lost
             else:
                 self._kept += 1  # drawing was all that was asked for
             return 0 if self._wanted else received.lost
-        missing = received.lost + self.unmarked
+        missing = received.lost + self._unmarked
         self._marked += missing
         self._marked_pending += missing
-        self.unmarked = 0
+        self._unmarked = 0
         self._safely(lambda recorder: _write_tick(recorder, received, missing))
         if self._recorder is not None and not self._recorder.pending:
             self._marked_pending = 0
@@ -181,7 +194,8 @@ class Segments:
         self._recorder = None
         self._kept += recorder.kept + recorder.pending - lost
         self.lost += lost
-        self.unmarked += lost + unmarked
+        self._unmarked += lost + unmarked
+        self._marked_pending = 0
         self._tried = time.monotonic() if self._full else -1e9
         if not recorder.kept:
             _discard(recorder.path)
