@@ -7,6 +7,7 @@ copies and solves nothing.
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import select
@@ -101,7 +102,7 @@ class SkillWorker:
                 poll = select.poll()
                 poll.register(working.socket, select.POLLIN)
                 while not poll.poll(1000 * POLL_S):
-                    if progress.is_hung(HUNG_S, busy_s=timeout_s):
+                    if progress.is_hung(HUNG_S, busy_s=math.inf):
                         raise TimeoutError(f"made no progress for {HUNG_S:g} s")
                     if time.monotonic() > end_s:
                         raise TimeoutError(f"did not answer within {timeout_s:g} s")

@@ -131,7 +131,7 @@ class Scribe:
             return
         if self._overflows or len(self._queue) >= self._most:
             self._drain()
-            self._overflows = bool(self._queue)  # one gap rather than many
+            self._overflows = bool(self._queue) or not self._most  # one gap rather than many
             if self._overflows:
                 self.skip()
                 return

@@ -148,6 +148,7 @@ def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
     one = Session(settings, **where)
     try:
         one.scribe.start(skill=SKILL, state=state_after(-1))
+        assert one.scribe.ready(60)
         yield one
     finally:
         one.missing = one.scribe.close(10)
