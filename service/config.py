@@ -201,6 +201,7 @@ class Files(Section, frozen=True):
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # with each recording an .rrd file
+    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # of .rrd at most, of fewer ticks; 0: of every tick
     segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
     segment_minutes: Positive = 10.0  # see `segment_mb`
     keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit

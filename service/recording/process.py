@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
 FLUSH_S = 0.5  # what a kill can lose
-DRAW_FLUSH_S = 2.0
+DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
 END_S = 60  # whole seconds for ending, after which it is killed
@@ -159,6 +159,8 @@ class ScribeProcess:
             unmarked=segments.unmarked,
             errors=tuple(self._errors),
             free_mb=segments.free_mb(),
+            mb_per_hour=segments.mb_per_hour(),
+            keep_mb_left=segments.keep_mb_left,
         )
         with contextlib.suppress(OSError):
             self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)
@@ -206,8 +208,14 @@ class ScribeProcess:
 def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
     from service.viewer.stream import Viewer  # its import takes half a second, and starts threads
 
-    urdf = urdf_path(setup.settings)
-    return Viewer(urdf=urdf, live_port=setup.live_port, settings=setup.settings, skill=skill)
+    settings = setup.settings
+    return Viewer(
+        urdf=urdf_path(settings),
+        live_port=setup.live_port,
+        settings=settings,
+        skill=skill,
+        mb_per_hour=settings.files.rerun_mb_per_hour,
+    )
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:

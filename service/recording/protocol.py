@@ -123,3 +123,5 @@ class ScribeReport(msgspec.Struct, frozen=True):
     unmarked: int = 0
     errors: tuple[str, ...] = ()  # new ones
     free_mb: float | None = None  # free space where it writes; None: it writes nothing
+    mb_per_hour: float | None = None  # of recordings and drawings lately; None: not known yet
+    keep_mb_left: float | None = None  # that they may grow by before the oldest are removed; None: they are not

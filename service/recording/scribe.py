@@ -238,6 +238,8 @@ class Scribe:
             "live": report.live,
             "errors": list(self._errors),
             "free_mb": report.free_mb,
+            "mb_per_hour": report.mb_per_hour,
+            "keep_mb_left": report.keep_mb_left,
         }
 
     def close(self, timeout_s: float = CLOSE_S) -> str:
