@@ -16,7 +16,7 @@ from typing import Any
 from service.client import endpoints
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
 from service.contract.records import Reason
@@ -306,7 +306,7 @@ class Daemon:
             try:
                 self._saved_stage.keep(self._controller.skill, status.stage, status.stage_belief)
             except OSError as error:
-                errors.append(f"the stage of the task cannot be kept over a restart: {error}")
+                errors.append(f"the stage of the task cannot be kept over a restart: {in_words(error)}")
             self._status.end(payload)
             if is_due:
                 due_s = time.monotonic() + STATUS_S
@@ -317,7 +317,7 @@ class Daemon:
                 try:
                     self._scribe.supervise()
                 except OSError as error:  # a lack of descriptors or memory may pass
-                    errors.append(f"the scribe cannot be supervised: {error}")
+                    errors.append(f"the scribe cannot be supervised: {in_words(error)}")
             else:
                 self._ended.wait(PAUSE_S)
             for error_text in errors:

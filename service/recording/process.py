@@ -25,6 +25,7 @@ import numpy as np
 
 from service import child
 from service.config import urdf_path
+from service.contract.explain import in_words
 from service.core.frame import state_layout
 from service.recording.paths import RecordingPaths
 from service.recording.protocol import LARGEST_MESSAGE, Note, ScribeReport, ScribeSetup, unpack
@@ -87,7 +88,7 @@ class DrawingThread:
         try:
             viewer = self.viewer = make()
         except Exception as error:  # without Rerun there is still a recording
-            self.problems.append(f"nothing is drawn: {error}")
+            self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
             return
         flushed = time.monotonic()

@@ -146,7 +146,7 @@ class Segments:
         cause = error.errno or str(error)
         if cause != self._failure:
             self._failure = cause
-            self._say(f"recording to {path} ended: {error}; it continues once that is repaired")
+            self._say(f"recording to {path} ended: {error.strerror or error}; it continues once that is repaired")
 
     def write(self, received: TickMessage) -> int:
         """Writes a tick; the number of missing ticks before it, if it is marked now, else 0."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from service.config import Settings
 from service.contract import cdr
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.messages import SceneObject, WireError, in_order
 from service.core.frame import Record
 from service.learning.demonstration import Demonstration
@@ -320,7 +320,7 @@ class Viewer:
         try:
             yield
         except Exception as error:
-            self.problems.append(f"{name} ended: {error}")
+            self.problems.append(f"{name} ended: {in_words(error)}")
             if destination in self._destinations:
                 self._destinations.remove(destination)
             if destination is not None and destination is self._file:
