@@ -34,11 +34,13 @@ from service.recording.segments import Segments
 if TYPE_CHECKING:
     from service.viewer.stream import Viewer
 
+RECORDING_NICE = -10  # 9 times the weight of an ordinary process, where that is granted; drawing has child.NICE
 QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
 FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
+BEHIND = 500  # messages that wait to be recorded, beyond which nothing is drawn
 END_S = 60  # whole seconds for ending, after which it is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
 # are dropped.
@@ -49,13 +51,14 @@ POLL_S = 0.02  # it polls, because waking a blocked reader would cost the sender
 class DrawingThread:
     """The viewer, made and used on a thread of its own.
 
-    Where it falls behind or hangs, the recording does not.
+    Where it falls behind or hangs, the recording does not. While the recording is behind,
+    `is_paused` is to be set, and nothing is drawn.
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
         self.viewer: Viewer | None = None
         self.problems: list[str] = []
-        self.dropped = 0
+        self.dropped, self.is_paused = 0, False
         self._wanted_file: Path | None = None
         self._waiting: deque[Callable[[Viewer], object] | Path] = deque()
         self._ended = threading.Event()
@@ -85,6 +88,8 @@ class DrawingThread:
         self._waiting.append(rrd)
 
     def _draw(self, make: Callable[[], Viewer]) -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), child.NICE)
+        self._wait()
         try:
             viewer = self.viewer = make()
         except Exception as error:  # without Rerun there is still a recording
@@ -94,6 +99,7 @@ class DrawingThread:
         flushed = time.monotonic()
         while not (self._ended.wait(POLL_S) and not self._waiting):
             while self._waiting:
+                self._wait()
                 next_ = self._waiting.popleft()
                 if isinstance(next_, Path):
                     viewer.draw_into(next_)
@@ -105,6 +111,10 @@ class DrawingThread:
                 viewer.flush()
                 flushed = time.monotonic()
         viewer.close()
+
+    def _wait(self) -> None:
+        while self.is_paused and not self._ended.wait(POLL_S):
+            pass
 
     def close(self) -> None:
         """Ends the file and the live view, within DRAW_END_S at most."""
@@ -192,6 +202,11 @@ class ScribeProcess:
         events = [(event.kind, event.payload) for event in received.tick.inbox]
         drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
 
+    def pause_drawing(self, *, is_behind: bool) -> None:
+        """Draws nothing while the recording is behind."""
+        if self._drawing is not None:
+            self._drawing.is_paused = is_behind
+
     def flush(self) -> None:
         """Hands what was recorded to the operating system, and reports it."""
         self._segments.flush()
@@ -257,6 +272,7 @@ def _work(source: socket.socket) -> None:
     while not over:
         over = ended.wait(0.05) and not waiting
         now = time.monotonic()
+        scribe.pause_drawing(is_behind=len(waiting) > BEHIND)
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
         scribe.report_kept()
@@ -273,4 +289,7 @@ def run(source: socket.socket) -> None:
     for name, value in RERUN_LOG.items():
         os.environ.setdefault(name, value)
     child.end_with_parent(END_S)
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, RECORDING_NICE)
+        Path("/proc/self/autogroup").write_text(str(RECORDING_NICE))  # else it counts among the children alone
     _work(source)
