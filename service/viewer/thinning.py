@@ -9,8 +9,8 @@ import numpy as np
 from service.core.frame import TIMING, Record
 from service.viewer.dynamic import DrawnFrame
 
-SHARE, LEAST_SHARE = 0.9, 0.2  # of the budget; what is left of it for frames at least
-FRAME_BYTES = 1200.0  # of a drawn frame, before the file shows how many it takes
+SHARE, LEAST_SHARE = 0.8, 0.2  # of the budget; what is left of it for frames at least
+FRAME_BYTES = 1800.0  # of a drawn frame, before the file shows how many it takes
 PEAKS = ("lateness_us", "work_us", "latency_us", "stages_us")
 
 
