@@ -35,6 +35,8 @@ PerJoint = tuple[float, ...]
 
 BESIDE = (("arm", "urdf"), ("network", "certificate"), ("network", "zenoh_config"))  # the configuration, if relative
 PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
+FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
@@ -63,8 +65,8 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # [m] the tool's point and turn, seen from the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] as a norm, of what leads it
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] likewise
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] as a norm; at most 12.5 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] as a norm; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
     orientation: Literal["direction", "full"] = "direction"  # what the arm follows: where the tool's +z points, or all
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] of the tool
@@ -75,14 +77,31 @@ class ToolSettings(Section, frozen=True):
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
 
     @property
+    def acceleration(self) -> float:
+        """Acceleration limit of the setpoint [m/s²], as a norm: `max_acceleration`, but at most
+        `max_speed` within 80 ms.
+
+        A tool that may move slowly but accelerate fast passes its speed limit in a stop: what its
+        joints add to the speed while they end their accelerations is a² / (2 jerk).
+        """
+        return min(self.max_acceleration, FASTEST_SPEED_UP * self.max_speed)
+
+    @property
+    def jerk(self) -> float:
+        """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most that acceleration
+        within 25 ms.
+        """
+        return min(self.max_jerk, FASTEST_JERK * self.max_speed)
+
+    @property
     def stop_acceleration(self) -> float:
-        """Of each axis in a stop [m/s²], in which the norm then never passes `max_acceleration`."""
-        return 0.4 * self.max_acceleration
+        """Acceleration of each axis in a stop [m/s²], with which the norm keeps `acceleration`."""
+        return 0.4 * self.acceleration
 
     @property
     def stop_jerk(self) -> float:
-        """Of each axis in a stop [m/s³], likewise."""
-        return self.max_jerk / math.sqrt(3.0)
+        """Jerk of each axis in a stop [m/s³], with which the norm keeps `jerk`."""
+        return self.jerk / math.sqrt(3.0)
 
 
 class ArmSettings(Section, frozen=True):

@@ -97,7 +97,7 @@ class _Chain:
     def __init__(self, skill: Skill, settings: Settings) -> None:
         self.skill, self.settings = skill, settings
         # Rivals plan no stop: nothing slows a tool that is far from its target.
-        eager = Closing(settings.tool.max_acceleration / 2, settings.tool.max_speed, far_damping=0.0)
+        eager = Closing(settings.tool.acceleration / 2, settings.tool.max_speed, far_damping=0.0)
         self.arm = Arm(settings, robot_description(settings), eager)
         self.limiter = Limiter(settings.joints, settings.period_s)
         self.orientation = skill.orientation
@@ -167,7 +167,7 @@ def chase(skill: Skill, settings: Settings, *, least_hz: float, beta: float) -> 
     def follow(hands: Moving) -> Followed:
         chain = _Chain(skill, settings)
         targets = chain.targets(one_euro(hands, least_hz, beta))[_newest(hands)]
-        limits = [axis_speed] * 3, [tool.max_acceleration] * 3, [tool.max_jerk] * 3
+        limits = [axis_speed] * 3, [tool.acceleration] * 3, [tool.jerk] * 3
         return chain.follow(_by_ruckig(targets, limits)[:, :2])
 
     return follow

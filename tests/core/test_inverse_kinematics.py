@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from service.core.arm.arm import DAMPING, TURN_LEVER
-from service.core.arm.inverse_kinematics import describe, tool_speeds
+from service.config import robot_description
+from service.core.arm.arm import DAMPING, TURN_LEVER, Arm
+from service.core.arm.inverse_kinematics import describe, tool_speed_after, tool_speeds
 from service.core.arm.least_squares import least_squares
 from service.core.decision.decision import measured_error
 from service.core.frame import parameters
 from service.core.setpoint.setpoint import GAP_FREE, GAP_SLOW, slow_down
+from service.shipped import cell_of
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -46,13 +48,25 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
     here = parameters(tasks=tasks, joints=q)
-    speed, coming = tool_speeds(here, dq, ddq, jerk)
+    speed, coming, total = tool_speeds(here, dq, ddq, jerk)
     crest = np.linalg.norm(tasks[:3] @ (dq + ddq * np.abs(ddq) / (2 * jerk)))
     assert speed == pytest.approx(np.linalg.norm(tasks[:3] @ dq), rel=1e-12)
     assert coming == pytest.approx(max(speed, crest), rel=1e-12)
+    columns = np.linalg.norm(tasks[:3], axis=0)
+    assert total == pytest.approx(columns @ (np.abs(dq) + ddq**2 / (2 * jerk)), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
     error, fast = measured_error(parameters(measured=measured, measured_velocities=dq), here)
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["wam", "franka", "ur5"])
+def test_the_tool_s_speed_after_a_way_of_the_joints_is_that_of_pinocchio(name: str) -> None:
+    random, settings = np.random.default_rng(3), cell_of(name)
+    arm, joints = Arm(settings, robot_description(settings)), len(settings.joints.names)
+    for _ in range(20):
+        q, way, dq = random.uniform(-1, 1, (3, joints))
+        speed = tool_speed_after(arm.at(q).record, way, dq)
+        assert speed == pytest.approx(np.linalg.norm(arm.at(q + way).tasks[:3] @ dq), rel=1e-9)
 
 
 def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:

@@ -39,10 +39,10 @@ def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings
     """Speed, acceleration, jerk, workspace, and the box around the last targets."""
     assert np.isfinite(states).all()
     assert np.linalg.norm(states[:, 1], axis=1).max() <= tool.max_speed + 1e-9
-    assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.max_acceleration + 1e-9
-    assert np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.max_jerk + 1e-6) * PERIOD_S
+    assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
+    assert np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
     trapezia = 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])  # of constant jerk: wrong by jerk period³ / 12
-    np.testing.assert_allclose(np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.max_jerk * PERIOD_S**3 / 12)
+    np.testing.assert_allclose(np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.jerk * PERIOD_S**3 / 12)
     assert (states[:, 0] >= BOX[0] - 1e-9).all()
     assert (states[:, 0] <= BOX[1] + 1e-9).all()
     positions = np.array([states[0, 0], *(target[0] for target in targets)])
@@ -115,6 +115,38 @@ def test_it_does_not_swing_by_itself() -> None:
     states, _ = driven([*jolt, *[at_rest(MIDDLE)] * 2000])
     assert np.abs(states[-200:, 0] - MIDDLE).max() < 1e-5
     assert np.abs(states[-200:, 1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_target_on_a_side_of_the_workspace_is_reached_and_the_setpoint_rests_there(seed: int) -> None:
+    """On a side, an edge or a corner, or a hair inside; at any rate, with any limits."""
+    random = np.random.default_rng(seed)
+    speed = 10 ** random.uniform(-1.5, -0.1)
+    tool = ToolSettings(
+        max_speed=speed,
+        max_acceleration=10 ** random.uniform(-0.3, 1.3),
+        max_jerk=10 ** random.uniform(0.7, 3),
+        jerk_weight=10 ** random.uniform(-11, -5),
+        stop_room=random.uniform(0, 3),
+    )
+    rate_hz = int(random.choice([50, 70, 100, 125, 250, 333, 500, 700, 1000]))
+    settings = Settings(rate_hz=rate_hz, tool=tool if seed % 3 else TOOL)
+    target, sides = random.uniform(*BOX), random.integers(0, 3, 3)
+    sides[random.integers(3)] = random.integers(2)
+    for axis, side in enumerate(sides):
+        if side < 2:
+            hair = random.choice([0.0, 1e-9, 1e-6, 1e-5, 1e-4])
+            target[axis] = BOX[side, axis] + hair * (1 - 2 * side)
+    start = target + random.uniform(0, 0.2) * (BOX.mean(axis=0) - target)
+    generator, state = SetpointGenerator(settings), blank(STATE)
+    generator.begin(state, at_rest(start))
+    slowest_s = max(tool.jerk_weight ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
+    accelerations = []
+    for _ in range(round((3.0 + 2.0 * np.linalg.norm(target - start) / speed + 30 * slowest_s) * rate_hz)):
+        generator.step(state, Target(*at_rest(target), clamped=True), BOX, FREE, 1.0)
+        accelerations.append(np.abs(state["setpoint"][2]).max())
+    assert max(accelerations[-rate_hz:]) <= 1e-6
+    np.testing.assert_allclose(state["setpoint"][0], target, atol=1e-6)
 
 
 def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:

@@ -27,7 +27,7 @@ def margin(tool: ToolSettings) -> float:
     """[m] by which a setpoint may pass what the targets explain."""
     back = RETURN_SHARE * tool.max_speed
     stop_s = (tool.max_speed + back) / tool.stop_acceleration
-    stop_s += (tool.max_acceleration + tool.stop_acceleration) / tool.stop_jerk
+    stop_s += (tool.acceleration + tool.stop_acceleration) / tool.stop_jerk
     return HULL_MARGIN + back * stop_s
 
 

@@ -203,8 +203,8 @@ class Arm:
         """Speed of the tool [m/s] at joint velocities and accelerations (J,) [rad/s, rad/s²]; and
         the most it comes to as these accelerations are brought to 0.
         """
-        found: tuple[float, float] = _tool_speeds(here.record, dq, ddq, self._jerk)
-        return found
+        now, crest, _ = _tool_speeds(here.record, dq, ddq, self._jerk)
+        return now, crest
 
     def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
         """Joint velocities that bring the tool to the state's setpoint, as `step` says."""

@@ -19,7 +19,7 @@ import ruckig
 from kmp.compiled import compiled
 from service.config import JointSettings, Settings
 from service.core.arm.arm import MARGIN, Arm, Kinematics, approach_gain
-from service.core.arm.inverse_kinematics import tool_speeds
+from service.core.arm.inverse_kinematics import tool_speed_after, tool_speeds
 from service.core.decision.decision import FAULT
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import quaternion_of
@@ -31,8 +31,7 @@ LARGEST = 1e6  # of any number of a state that is calculated with
 BOUNDED = 1  # flag of a step: the wanted velocity was cut
 CHASED = 2  # some joint cannot have it in a tick
 UNSAFE = 4  # some joint could not have stopped after it
-MOMENTS = 12  # of a stop, at which the tool's speed is asked for ...
-MOMENT_SHARE = 0.2  # ... so many times as far apart as a joint takes to come to its greatest acceleration
+STOP_SAMPLES = 16  # times along a stop at which the tool's speed is checked
 LEAST_CHANGE = 1e-12  # [rad/s] of a velocity: what is less is rounding
 INSIDE = 1.0 - 1e-9  # of limits, that rounding leaves them kept
 UNUSABLE = -1  # the state cannot be calculated with
@@ -67,7 +66,6 @@ class Limiter:
             max_acceleration=np.array(limits.acceleration, np.float64),
             max_jerk=np.array(limits.jerk, np.float64),
             approach_gain=approach_gain(limits),
-            moment_s=MOMENT_SHARE * float((np.array(limits.acceleration) / np.array(limits.jerk)).max()),
         )
         count = len(limits.velocity)
         self._ruckig = ruckig.Ruckig(count)
@@ -268,27 +266,26 @@ def is_usable(state: Vector) -> bool:
 
 @compiled
 def _speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) -> float:
-    """`Limiter.speed_in_stop`, by the tool's Jacobian and how that changes as the joints move."""
-    jacobian, given, joints = heres[0].jacobian, parameters[0], len(dq)
+    """Greatest speed [m/s] of the tool at STOP_SAMPLES times of a stop that lasts D, at
+
+        t_k = D (k / STOP_SAMPLES)²,    k = 1 ... STOP_SAMPLES - 1,
+
+    close together at its begin, where the joints end their accelerations.
+    """
+    given, joints = parameters[0], len(dq)
     braking, stop, way, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
     braking_together(dq, ddq, given.max_acceleration, given.max_jerk, braking)
-    most = 0.0
-    for moment in range(1, MOMENTS + 1):
+    duration = most = 0.0
+    for j in range(joints):
+        fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], 0.0, stop)
+        duration = max(duration, stop[5])
+    for sample in range(1, STOP_SAMPLES):
         for j in range(joints):
-            fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], moment * given.moment_s, stop)
+            time = duration * (sample / STOP_SAMPLES) ** 2
+            fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], time, stop)
             speed[j], way[j] = stop[0], stop[2]
-        x = y = z = 0.0
-        for j in range(joints):
-            x, y, z = x + jacobian[0, j] * speed[j], y + jacobian[1, j] * speed[j], z + jacobian[2, j] * speed[j]
-            for k in range(joints):  # the Jacobian's column j changes by the earlier axis times the later column
-                axis, column, moved = min(j, k), max(j, k), way[k] * speed[j]
-                wx, wy, wz = jacobian[3, axis], jacobian[4, axis], jacobian[5, axis]
-                vx, vy, vz = jacobian[0, column], jacobian[1, column], jacobian[2, column]
-                x += moved * (wy * vz - wz * vy)
-                y += moved * (wz * vx - wx * vz)
-                z += moved * (wx * vy - wy * vx)
-        most = max(most, x * x + y * y + z * z)
-    return math.sqrt(most)
+        most = max(most, tool_speed_after(heres, way, speed))
+    return most
 
 
 def _stuck(q: Vector) -> Limited:
@@ -300,7 +297,10 @@ def _frozen(moved: Vector, *, limited: bool) -> Limited:
     return Limited(moved[0], moved[1], moved[2], limited)
 
 
-NEAR_SPEED = 0.8  # of the tool's greatest; what the joints turn in a stop changes it by less than the rest
+NEAR_SPEED = 0.8  # share of the tool's speed limit; what the joints turn in a stop changes it by less than the rest
+# Joints end their accelerations at different times in a stop, so their motions cancel less of each
+# other: the tool gains at most this share of the sum of what they contribute (0.07 seen).
+CANCELLED_SHARE = 0.15
 STOP_SHARE = 0.99  # of that speed, from which it stops: what is left out in finding it adds to that in long ticks
 
 
@@ -359,27 +359,33 @@ class LimiterStage:
         return Moved(here, limited, separated, too_fast, moving)
 
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
-        """The joints one period on their way to rest, together; or each as it can, where that
-        approaches things less.
+        """Move the joints one period on their way to rest: all together, or each as fast as it can
+        where that approaches things less and does not bring the tool beyond its speed limit.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.stop(q, dq, ddq)
-        excess = separation.excess(*moved[1:3])
+        here, excess = self._arm.at(moved.position), separation.excess(*moved[1:3])
         if excess > 0.0:
             other = self._limiter.step(q, dq, ddq, self._still)
-            moved = other if separation.excess(*other[1:3]) < excess else moved
-        here = self._arm.at(moved.position)
+            if separation.excess(*other[1:3]) < excess:
+                there = self._arm.at(other.position)
+                speed = self._comes_to(other, there)
+                if speed <= self._max_speed or speed <= self._comes_to(moved, here):
+                    moved, here = other, there
         moving = _take(as_array(state), as_array(frame), here.record, *moved[:3])
         return Moved(here, limited=False, separated=False, too_fast=0.0, moving=moving)
 
     def _comes_to(self, moved: Limited, here: Kinematics) -> float:
-        """The greatest speed [m/s] that the tool comes to if the joints stop after a step; near the
-        limit also as the arm will stand then, for what joints do to the tool changes on the way.
+        """Greatest speed [m/s] of the tool if the joints stop after a step.
+
+        The stop is sampled only where it may pass the limit: near it, or where the joints move the
+        tool by much more than their sum shows.
         """
-        speed: float = tool_speeds(here.record, *moved[1:3], self._jerk)[1]
-        if NEAR_SPEED * self._max_speed < speed <= STOP_SHARE * self._max_speed:
-            return max(speed, self._limiter.speed_in_stop(moved, here))
-        return speed
+        _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
+        most = self._max_speed
+        if speed <= STOP_SHARE * most and (speed > NEAR_SPEED * most or speed + CANCELLED_SHARE * total > most):
+            return max(float(speed), self._limiter.speed_in_stop(moved, here))
+        return float(speed)
 
 
 @compiled

@@ -64,8 +64,8 @@ class SetpointGenerator:
             period_s=settings.period_s,
             gains=gains_for(settings),
             max_speed=float(tool.max_speed),
-            max_acceleration=float(tool.max_acceleration),
-            max_jerk=float(tool.max_jerk),
+            max_acceleration=tool.acceleration,
+            max_jerk=tool.jerk,
             stop_acceleration=tool.stop_acceleration,
             stop_jerk=tool.stop_jerk,
             stop_room=float(tool.stop_room),
@@ -129,7 +129,7 @@ def _lead(
     state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
     jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
     late_s = LATE_SHARE * max(0.0, state.response_s - PROMPT_S)
-    met = _track(setpoint, target, parameters, costs, slow, late_s, jerk)
+    met = _track(setpoint, target, parameters, costs, slow, late_s, box, jerk)
     for i in range(3):
         x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
@@ -145,7 +145,14 @@ def _lead(
 
 @compiled
 def _track(
-    setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, late_s: float, jerk: Vector
+    setpoint: Vector,
+    target: Vector,
+    parameters: Records,
+    costs: Vector,
+    slow: float,
+    late_s: float,
+    box: Vector,
+    jerk: Vector,
 ) -> int:
     """The tracker's jerk (3,), less of it along the motion where the stop, the target's speed or
     the greatest one asks for that. A stop of the hands is seen `late_s` later than by most.
@@ -160,6 +167,7 @@ def _track(
         if feasible == 1.0:  # what a target does beyond the speed limit is not followed
             jerk[i] += gains[2] * target[2, i]
         jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
+    _approach_sides(setpoint, parameters, box, jerk)
     _limit_jerk(jerk, setpoint[2], parameters, costs)
     if speed <= LEAST_SPEED:
         return 0
@@ -198,6 +206,26 @@ def _track(
         jerk[i] += (chosen - u) * along[i]
     _limit_jerk(jerk, setpoint[2], parameters, costs)
     return PLANNED
+
+
+@compiled
+def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Vector) -> None:
+    """Limit the jerk (3,) so that the setpoint approaches each side of the workspace without
+    passing it: with h the distance to the side, (d/dt + p)³ h >= 0, that is
+
+        jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = gains[0]^(1/3).
+
+    A setpoint whose target lies on a side then comes to rest there. Without this, the tracker
+    passes its target by a little, each time into the fastest stop, and swings for ever.
+    """
+    given = parameters[0]
+    p = given.gains[0] ** (1.0 / 3.0)
+    for i in range(3):
+        x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
+        damping = -3.0 * p * (p * v + a)
+        highest = max(p**3 * (box[1, i] - x) + damping, -given.stop_jerk)
+        lowest = min(p**3 * (max(box[0, i], given.lowest[i]) - x) + damping, given.stop_jerk)
+        jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
 
 
 @compiled

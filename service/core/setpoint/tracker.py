@@ -27,7 +27,7 @@ def gains_for(settings: Settings) -> Vector:
     the loop can follow.
     """
     tool = settings.tool
-    own = max(TRACKER_SHARE * tool.max_jerk / tool.max_acceleration, math.cbrt(STIFFEST * tool.max_jerk))
+    own = max(TRACKER_SHARE * tool.jerk / tool.acceleration, math.cbrt(STIFFEST * tool.jerk))
     quickest = min(TRACKER_SHARE * acceleration_rate(settings.joints), own, TRACKER_STEP * settings.rate_hz)
     return tracker_gains(max(tool.jerk_weight, max(quickest, SLOWEST) ** -6))
 
