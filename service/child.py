@@ -239,6 +239,7 @@ def start(name: str, module: str, kind: socket.SocketKind) -> Child:
 def _serve(control: socket.socket) -> None:
     """The fork server: imports modules and forks children until the other end closes."""
     _continue_with_parent()
+    _set_name("fork server")
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(NICE)
@@ -271,7 +272,7 @@ def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
         if os.fork() == 0:
             while os.getppid() == between:
                 time.sleep(0.0005)
-            ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
+            _set_name(name)
             channel.send(_PID.pack(os.getpid()))
             module.run(channel)
         code = 0
@@ -281,6 +282,11 @@ def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
         traceback.print_exc()
     finally:
         os._exit(code)
+
+
+def _set_name(name: str) -> None:
+    """Sets the name under which the operating system lists this process."""
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
 def _continue_with_parent() -> None:
