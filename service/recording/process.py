@@ -34,7 +34,7 @@ from service.recording.segments import Segments
 if TYPE_CHECKING:
     from service.viewer.stream import Viewer
 
-RECORDING_NICE = -10  # 9 times the weight of an ordinary process, where that is granted; drawing has child.NICE
+CATCH_UP_NICE = -10  # of a recording that is behind, where that is granted: 9 times an ordinary process's weight
 QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
 FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
@@ -58,7 +58,7 @@ class DrawingThread:
     def __init__(self, make: Callable[[], Viewer]) -> None:
         self.viewer: Viewer | None = None
         self.problems: list[str] = []
-        self.dropped, self.is_paused = 0, False
+        self.dropped, self.is_paused = 0, True
         self._wanted_file: Path | None = None
         self._waiting: deque[Callable[[Viewer], object] | Path] = deque()
         self._ended = threading.Event()
@@ -88,7 +88,6 @@ class DrawingThread:
         self._waiting.append(rrd)
 
     def _draw(self, make: Callable[[], Viewer]) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), child.NICE)
         self._wait()
         try:
             viewer = self.viewer = make()
@@ -134,6 +133,7 @@ class ScribeProcess:
         self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
         self._reported_dropped = self._reported_kept = 0
+        self._is_behind = True  # as it begins, so that it is there soon
         is_drawn = setup.rrd is not None or (setup.folder is not None and setup.settings.files.rerun)
         if is_drawn or setup.live_port is not None:
             self._drawing = DrawingThread(lambda: _viewer(setup, skill))
@@ -202,10 +202,15 @@ class ScribeProcess:
         events = [(event.kind, event.payload) for event in received.tick.inbox]
         drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
 
-    def pause_drawing(self, *, is_behind: bool) -> None:
-        """Draws nothing while the recording is behind."""
-        if self._drawing is not None:
-            self._drawing.is_paused = is_behind
+    def catch_up(self, waiting: int) -> None:
+        """While the recording is behind, it goes before drawing, and before other processes where
+        that is granted.
+        """
+        if waiting <= BEHIND / 10 if self._is_behind else waiting > BEHIND:
+            self._is_behind = not self._is_behind
+            _run_with(CATCH_UP_NICE if self._is_behind else child.NICE)
+            if self._drawing is not None:
+                self._drawing.is_paused = self._is_behind
 
     def flush(self) -> None:
         """Hands what was recorded to the operating system, and reports it."""
@@ -219,6 +224,13 @@ class ScribeProcess:
         if self._drawing is not None:
             self._drawing.close()
         self.report()
+
+
+def _run_with(nice: int) -> None:
+    """Sets the weight of this thread, and of the session of all children among others."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+        Path("/proc/self/autogroup").write_text(str(nice))
 
 
 def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
@@ -254,6 +266,8 @@ def _work(source: socket.socket) -> None:
     ended = threading.Event()
 
     def read() -> None:
+        with contextlib.suppress(OSError):  # it does little, and what it does not read cannot be known to wait
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
             while (received := _receive(source, buffer))[0]:
                 waiting.append(received)
@@ -272,7 +286,7 @@ def _work(source: socket.socket) -> None:
     while not over:
         over = ended.wait(0.05) and not waiting
         now = time.monotonic()
-        scribe.pause_drawing(is_behind=len(waiting) > BEHIND)
+        scribe.catch_up(len(waiting))
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
         scribe.report_kept()
@@ -289,7 +303,5 @@ def run(source: socket.socket) -> None:
     for name, value in RERUN_LOG.items():
         os.environ.setdefault(name, value)
     child.end_with_parent(END_S)
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, RECORDING_NICE)
-        Path("/proc/self/autogroup").write_text(str(RECORDING_NICE))  # else it counts among the children alone
+    _run_with(CATCH_UP_NICE)
     _work(source)
