@@ -22,11 +22,12 @@ from service.urdf import Urdf, UrdfError
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 Cell = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A[^/*$?#\s\0]+(/[^/*$?#\s\0]+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces and * $ ? #,"},
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
     ),
 ]
 Point = tuple[float, float, float]
@@ -47,34 +48,34 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class HandSettings(Section, frozen=True):
     """How a tracker's poses become hand positions in frame `base`."""
 
-    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` is taken too, as it is
-    unit: Literal["m", "cm", "mm"] = "m"  # of the tracker's positions
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
-    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # each axis; a start, it is estimated
-    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
-    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight
-    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is on its way
-    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # in which a hand comes to be still
-    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] off where it is expected: a hand has jumped ...
-    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] ... after a pause farther: reaches are so fast
-    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # until hands that changed places are believed
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
+    unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
+    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is in motion
+    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # a slow hand counts as still after this time
+    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
+    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
+    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
 
 
 class ToolSettings(Section, frozen=True):
     """The tool: where it sits on the tool plate, and how fast it may move."""
 
-    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # [m] the tool's point and turn, seen from the plate
-    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] as a norm; at most 12.5 * max_speed
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] as a norm; at most 500 * max_speed
-    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
-    orientation: Literal["direction", "full"] = "direction"  # what the arm follows: where the tool's +z points, or all
-    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] of the tool
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
+    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
+    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
+    orientation: Literal["direction", "full"] = "direction"  # follow the direction of the tool's +z, or all axes
+    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
-    radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
-    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk² beside error², at least
-    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # more of it lags less and passes a stop by more
-    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
+    radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
+    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
+    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
     @property
     def acceleration(self) -> float:
@@ -109,7 +110,7 @@ class ArmSettings(Section, frozen=True):
     following it is a fault.
     """
 
-    urdf: str = ""  # a file; empty: the shipped Barrett WAM
+    urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
     packages: tuple[
         str, ...
     ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
@@ -123,10 +124,10 @@ class ArmSettings(Section, frozen=True):
         -0.4273,
         -1.0823,
         0.0,
-    )  # [rad] the null space's and the assumed one
-    link_radius: Positive = 0.07  # [m] of links without a collision shape, from their joint to the next
-    fault_error_rad: Positive = 0.1  # between a joint as measured and as commanded
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without joint states: a fault while it moves
+    )  # [rad] preferred posture, and the start with `assumed`
+    link_radius: Positive = 0.07  # [m] radius of links without a collision shape
+    fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm without joint states is at fault
 
 
 class JointSettings(Section, frozen=True):
@@ -155,11 +156,11 @@ class Reach(Section, frozen=True):
     table [m].
     """
 
-    centre: Point = (0.0, 0.0, 0.346)  # of the shell: where the arm's first axes meet
-    inner: Positive = 0.35  # [m] radius of the shell
-    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] radius of the shell
-    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] in front of the base plate
-    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] above the table
+    centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
+    inner: Positive = 0.35  # [m] inner radius of the shell
+    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] outer radius of the shell
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] least x, in front of the base plate
+    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] least z, above the table
 
 
 class People(Section, frozen=True):
@@ -171,14 +172,14 @@ class People(Section, frozen=True):
     not seen for longer is taken to come ever faster, by 5 m/s², up to `unknown_speed`.
     """
 
-    radius: Positive = 0.04  # [m] of hand and forearm
-    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] from the tracked point toward the elbow
-    toward_elbow: Point = (1.0, 0.0, 0.0)  # frame base: the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] errors of tracker and arm are mm; fingers reach out
+    radius: Positive = 0.04  # [m] radius of hand and forearm
+    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
+    toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand; fingers reach out farther
     brake: Positive = 3.0  # [m/s²] the slowest joint of the shipped arm brakes its stretched tool by 5
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
-    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] of the tool to a hand that receives
-    unknown_speed: Positive = 1.6  # [m/s] of a hand that has only just been seen
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
+    unknown_speed: Positive = 1.6  # [m/s] assumed speed of a hand that was only just seen
     tremor_speed: Positive = 0.1  # [m/s] nothing is foreseen of a slower hand: it trembles; all of it at twice that
 
 
@@ -192,9 +193,9 @@ class Box(Section, frozen=True):
 class Obstacles(Section, frozen=True):
     """What the arm keeps away from besides people: the table, itself, and boxes."""
 
-    boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them; of itself 0.01 at most
-    brake: Positive = 2.0  # [m/s²] toward them
+    boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] least distance; from the arm itself at most 0.01
+    brake: Positive = 2.0  # [m/s²] deceleration that is assumed toward them
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
 
@@ -210,7 +211,7 @@ class Table(Section, frozen=True):
 class SkillSettings(Section, frozen=True):
     """How the skill is followed."""
 
-    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # [s] by which the tool is ahead of the teacher's
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # the tool is this far ahead of the teacher's timing
 
 
 class Files(Section, frozen=True):
@@ -219,19 +220,19 @@ class Files(Section, frozen=True):
     skills: str = ""  # a folder; empty: the shipped recordings
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
-    rerun: bool = True  # with each recording an .rrd file
-    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # of .rrd at most, of fewer ticks; 0: of every tick
-    segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
-    segment_minutes: Positive = 10.0  # see `segment_mb`
-    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit
-    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # 0: no limit
+    rerun: bool = True  # write an .rrd file beside each recording
+    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
+    segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
+    segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's recordings; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # recordings older than this are deleted; 0: no limit
 
 
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
-    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # of the loop
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)

@@ -24,6 +24,7 @@ from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.explain import in_words
 from service.contract.messages import WireError
+from service.contract.printable import printable_lines
 
 PROBE_S = 1.0
 PUBLISHED = ("**/hands/*", "**/joints/state")  # of whatever cell: a name may be wrong
@@ -35,7 +36,7 @@ def doctor(args: argparse.Namespace) -> int:
     for finding in _looked_at(args):
         found.append(finding)
         if not args.json:
-            print(finding.line(), flush=True)
+            print(printable_lines(finding.line()), flush=True)
     count = sum(finding.level == "wrong" for finding in found)
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())

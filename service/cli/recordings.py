@@ -17,6 +17,7 @@ from service.client import Client, Tracker
 from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
+from service.contract.printable import printable_lines
 from service.contract.requests import Status
 from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
 from service.demonstrations.pose_streams import SIDES, PoseTopic
@@ -121,7 +122,7 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(table(msgspec.structs.replace(figures, unsafe=())))  # what is unsafe is in the error
+    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))  # what is unsafe is in the error
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:

@@ -16,6 +16,7 @@ import msgspec
 from service import child
 from service.cli.usage import UsageError
 from service.config import Settings, converted
+from service.contract.printable import printable_lines
 from service.daemon.start import starting
 from service.described_arm import SettingsError
 from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
@@ -24,7 +25,9 @@ from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 def serve(args: argparse.Namespace) -> int:
     """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
     os.umask(0o077)  # its files are private to its user
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
     skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
@@ -52,6 +55,14 @@ def serve(args: argparse.Namespace) -> int:
     sys.stdout.flush()
     logging.shutdown()
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries
+
+
+class PrintableFormatter(logging.Formatter):
+    """Formats a record so that what it quotes has no effect on a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's line or lines."""
+        return printable_lines(super().format(record))
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:

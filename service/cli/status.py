@@ -15,7 +15,7 @@ from zenoh.handlers import RingChannel
 from service import interrupt
 from service.cli.clients import ask
 from service.cli.usage import reached
-from service.client import Client, UnreachableError, why_silent
+from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
@@ -66,7 +66,7 @@ def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
                 time.sleep(LOOK_S)
                 continue
             heard = time.monotonic()
-            yield msgspec.json.decode(sample.payload.to_bytes(), type=Status)
+            yield decoded(sample.payload.to_bytes(), Status)
     raise UnreachableError(f"nothing comes on {key}: {why_silent(session, cell)}")
 
 

@@ -5,6 +5,7 @@ on a network.
 from service.client.calls import Client
 from service.client.client_settings import CLIENT_FILE, ClientSettings, client_settings
 from service.client.presence import Cell, Overheard, cells, living, why_silent
+from service.client.replies import decoded
 from service.client.session import (
     AUTHORITY,
     CERTIFICATE,
@@ -36,6 +37,7 @@ __all__ = [
     "UnreachableError",
     "cells",
     "client_settings",
+    "decoded",
     "endpoints",
     "living",
     "open_session",

@@ -158,7 +158,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy += "`rejected` counts `older` and `jumped` meanwhile"
             found = _contest(seen)
         case Reason.OPERATOR:
-            about, remedy = "somebody asked for it", "`thirdhand resume`"
+            about, remedy = "a hold was requested, or the daemon was stopped", "`thirdhand resume`"
         case Reason.ARM_NOT_READY:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)

@@ -195,7 +195,7 @@ def draw(found: Summary, path: Path) -> None:
         for one in found.streams:
             if one.gap_s > GAP_S:
                 axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=COLOURS[one.name], alpha=0.15, lw=0)
-    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base")
+    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base", parse_math=False)
     axes[-1].set_xlabel("time [s]")
     above.set(title="from above; dots: the start", xlabel="x [m]", ylabel="y [m]")
     above.set_aspect("equal", adjustable="datalim")

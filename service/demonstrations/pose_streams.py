@@ -19,6 +19,7 @@ from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import BASE, PoseStamped, WireError, in_order
+from service.contract.printable import printable
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.demonstrations.tool_poses import tool_poses
@@ -55,7 +56,7 @@ class PoseTopic(NamedTuple):
         return cls(topic, part)
 
     def __str__(self) -> str:
-        return f"{self.topic}:{self.part}" if self.part else self.topic
+        return printable(f"{self.topic}:{self.part}" if self.part else self.topic)
 
 
 class Track(NamedTuple):

@@ -17,6 +17,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from service.contract import cdr
+from service.contract.printable import printable, printable_values
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
@@ -123,8 +124,8 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             progress(BLOCK * len(blocks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
     for _, text, _ in recording.notes("status"):
-        with contextlib.suppress(msgspec.DecodeError):  # of another version
-            found.statuses.append(msgspec.json.decode(text, type=Said))
+        with contextlib.suppress(msgspec.MsgspecError):  # of another version
+            found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
     found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
     if found.skills and len(found.frames):
         found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
@@ -140,7 +141,7 @@ def _take_events(found: Columns, step: Step) -> None:
         if kind == "skill":
             _take_skill(found, payload, step.tick)
         elif kind in ORDERS:
-            found.orders.append(Order(step.tick, kind, cdr.decode_string(payload)))
+            found.orders.append(Order(step.tick, kind, printable(cdr.decode_string(payload))))
 
 
 def _take_skill(found: Columns, file: bytes, tick: int) -> None:

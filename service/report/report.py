@@ -296,5 +296,5 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     if not hands_m:
         return f"no place {place!r} was taught"
     if best := found.best_m(place):
-        return f"the arm followed; with the hands where {place!r} was taught the tool came within {1000 * best:.0f} mm"
-    return f"the arm followed, but the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"
+        return f"with the hands where {place!r} was taught, the tool came only within {1000 * best:.0f} mm of it"
+    return f"the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"

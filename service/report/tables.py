@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from service.contract.incidents import remedy, word
+from service.contract.printable import printable
 from service.contract.records import Mode
 from service.report.report import Figure, Percentiles, Report, Span, differing_settings
 
@@ -199,7 +200,7 @@ def names_of(reports: Sequence[Report]) -> list[str]:
     seen: dict[str, int] = {}
     names = []
     for report in reports:
-        stem = report.path.stem
+        stem = printable(report.path.stem)
         seen[stem] = seen.get(stem, 0) + 1
         names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
     return names

@@ -27,6 +27,7 @@ from service.config import Settings
 from service.contract import cdr
 from service.contract.explain import ExplainedError, in_words
 from service.contract.messages import SceneObject, WireError, in_order
+from service.contract.printable import printable
 from service.core.frame import Record
 from service.learning.demonstration import Demonstration
 from service.recording.recording import OBJECTS
@@ -379,7 +380,8 @@ class Viewer:
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Shows a line in the log; level is INFO, WARN or ERROR."""
-        self._each(lambda destination: destination.log(text, level, time_ns))
+        shown = printable(text)
+        self._each(lambda destination: destination.log(shown, level, time_ns))
 
     def flush(self) -> None:
         """Sends what is pending, and waits until the file has it."""

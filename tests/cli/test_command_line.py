@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import signal
@@ -9,11 +10,12 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from service.cli.main import GROUPS
+from service.cli.main import GROUPS, parser
 from service.launch import free_port
 from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
@@ -194,6 +196,36 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
             assert process.wait(30) == code
 
 
+# --- help -----------------------------------------------------------------------------------------
+
+FRAGMENTARY = ("demo", "serve", "follow", "bench", "play", "record", "learn")  # not yet rewritten
+FRAGMENT = re.compile(r"(of|to|for|by|in|with|how|what|where|that|from|within) ")
+
+
+def options(sub: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """The options and arguments of a command and of the commands below it."""
+    for action in sub._actions:  # noqa: SLF001  (argparse has no other way)
+        if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
+            for below in action.choices.values():
+                yield from options(below)
+        else:
+            yield action
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {"sim", *FRAGMENTARY}))
+def test_the_help_of_an_option_says_what_it_is_without_the_name_before_it(command: str) -> None:
+    (commands,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))  # noqa: SLF001
+    assert [one.help for one in options(commands.choices[command]) if FRAGMENT.match(one.help or "")] == []
+
+
+def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
+    text = " ".join(told("view", "--help").stdout.split())
+    assert "FILE|live [FILE|live ...]" in text
+    assert "(default: the last moment in mode follow)" in text
+    assert "thirdhand view thirdhand-demo/*.rrd --screenshot scene.png" in text
+    assert "thirdhand view live --web" in text
+
+
 # --- completion -----------------------------------------------------------------------------------
 
 BASH = """
@@ -223,6 +255,9 @@ def test_a_shell_completes_commands_options_and_choices(words: str, found: set[s
     assert done.returncode == 0, done.stderr
     script.write_text(done.stdout)
     program = BASH.format(words=words, last=len(words.split()) - 1)
+    written = tmp_path / "missing" / "folders" / "thirdhand"
+    assert told("completion", "bash", "--output", str(written)).returncode == 0
+    assert written.read_text() == script.read_text().removesuffix("\n")
     asked = subprocess.run(
         ["bash", "-c", program, "bash", str(script)], capture_output=True, text=True, timeout=30, check=False
     )

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from service.cli.main import main
 from service.config import Settings
 from service.contract.records import Flag, Mode, Reason
 from service.contract.requests import Percentiles, Status, ViaPoint, encode_json
@@ -23,7 +24,7 @@ from service.core.frame import STAGES, Event, Tick, order, timed
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.status import CellStatus
-from service.learning.skill_file import with_file
+from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
@@ -33,6 +34,7 @@ from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
+from support.wicked import wicked_skill
 
 SETTINGS = Settings()
 PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
@@ -130,7 +132,8 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
     # made in process, without a status: what the first frame of each holds
     assert re.fullmatch(r"the left hand was last seen [23]\d\d ms ago", held[Reason.STALE_HAND].why)
-    assert (held[Reason.OPERATOR].why, held[Reason.OPERATOR].remedy) == ("somebody asked for it", "thirdhand resume")
+    asked = held[Reason.OPERATOR]
+    assert (asked.why, asked.remedy) == ("a hold was requested, or the daemon was stopped", "thirdhand resume")
     far = re.fullmatch(
         r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
@@ -317,6 +320,21 @@ def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Repo
     told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
     best_m = session.best_m("glass")
     assert best_m is not None
-    assert told.startswith("the arm followed; with the hands where 'glass' was taught the tool came within")
-    assert told.endswith(f" {1000 * best_m:.0f} mm")
+    assert told.startswith("with the hands where 'glass' was taught, the tool came only within")
+    assert told.endswith(f" {1000 * best_m:.0f} mm of it")
     assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
+
+
+def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "$\\frac$ <b>\x1b[31m.mcap"
+    Told(decoded(wicked_skill(), origin="wicked"), path)
+    html_path = tmp_path / "page.html"
+    assert main(["report", str(path), "--html", str(html_path)]) == 0
+    shown, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
+    for text in (shown, page):
+        assert all(line.isprintable() for line in text.splitlines())
+    assert r"skill a\nb\x1b[31mred" in shown
+    assert "<b>" not in page
+    assert r"$\frac$ &lt;b&gt;\x1b[31m" in page

@@ -406,6 +406,8 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
         (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
         (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
         (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["live", "a.rrd"], "live beside 1 files; either live alone or files needed"),
+        (["press.npz", "a.rrd"], "press.npz is neither"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
         (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),

@@ -37,6 +37,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
     "test_hand_sample.py",
     "test_architecture.py",
     "test_config.py",
+    "test_ci.py",
     "contract",
 )
 SLOW = (  # the longest first: so they begin first
@@ -69,6 +70,7 @@ SLOW = (  # the longest first: so they begin first
     "daemon/test_skill_worker.py",
     "cli/test_report_command.py",
     "test_examples.py",
+    "test_readme.py",
     "kmp/test_distribution.py",
     "kmp/test_compiled.py",
     "test_site.py",
@@ -86,6 +88,7 @@ SLOW = (  # the longest first: so they begin first
     "kmp/test_low_rank.py",
     "kmp/test_tutorial.py",
     "recording/test_sinks.py",
+    "recording/test_drawings.py::test_of_several_files_the_last_is_pictured_and_that_is_said",
     "recording/test_lerobot.py",
     "recording/test_damage.py",
     "daemon/test_via_point_requests.py",

@@ -252,6 +252,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     kept = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     if kept:
         said |= SEPARATED
+        damping += arm.kept_damping * _missing(scaled, wanted, velocity)
+        solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     near = _can_have(arms, goals, velocity)
     scaled[3:], wanted[3:] = 0.0, 0.0
     if not near:  # it turns as far as costs its position nothing
@@ -273,6 +275,20 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         for order in range(2):
             out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
     return said | SPEED if excess > 1.0 + ROUNDING else said
+
+
+@compiled
+def _missing(tasks: Vector, wanted: Vector, x: Vector) -> float:
+    """The square of the tool's velocity [m²/s²] that a solution x (J,) lacks: |wanted - tasks x|²,
+    over the first three rows of tasks (N, J).
+    """
+    total = 0.0
+    for i in range(3):
+        lacks = wanted[i]
+        for j in range(len(x)):
+            lacks -= tasks[i, j] * x[j]
+        total += lacks * lacks
+    return total
 
 
 @compiled
