@@ -246,6 +246,7 @@ class Files(Section, frozen=True):
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # write an .rrd file beside each recording
+    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
     segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
     segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
     keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's recordings; 0: no limit

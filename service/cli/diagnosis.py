@@ -22,7 +22,7 @@ SLACK = 0.9  # of the least rate
 OFTEN = 0.05  # share of what comes that is rejected, above which it is no accident
 NOISY_MM = 8.0  # of a hand's samples, each axis: no tracker that sees it well
 MOST_OTHERS = 4  # keys that are named
-ROOM_MB = 2000.0
+ROOM_MB, LASTS_H = 2000.0, 1.0  # of free space, and how long that is to last at least
 MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
 OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
 TOLD_RAD, STUCK = 0.03, 0.1  # what a joint is told to travel before it can be stuck, and the share that it did
@@ -291,8 +291,26 @@ def _privileges_and_recording(now: Status) -> Iterator[Finding]:
     advice = "see that the folder is there and has room; `thirdhand replay` says what is missing"
     yield judged(state != "interrupted" and not lost, "recording", told, "recording, none lost", advice)
     if free_mb is not None:
-        told, wanted = f"{free_mb / 1000:.1f} GB free where it records", f"more than {ROOM_MB / 1000:g} GB"
-        yield judged(free_mb > ROOM_MB, "disk", told, wanted, "make room, or lower [files] keep_mb")
+        yield _disk(free_mb, scribe.get("mb_per_hour"), scribe.get("keep_mb_left"))
+
+
+def _disk(free_mb: float, mb_per_hour: float | None, keep_mb_left: float | None) -> Finding:
+    """How long the disk lasts where the cell records."""
+    told, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
+    if mb_per_hour:
+        told += f", {mb_per_hour / 1000:.2g} GB an hour written"
+        if keep_mb_left is not None and keep_mb_left < free_mb:
+            told += f": in {_hours(keep_mb_left / mb_per_hour)} the oldest recordings begin to be removed"
+        else:
+            told += f": full in {_hours(free_mb / mb_per_hour)}"
+            lasts = free_mb / mb_per_hour > LASTS_H
+    wanted = f"more than {ROOM_MB / 1000:g} GB, and {LASTS_H:g} h"
+    advice = "make room, or lower [files] keep_mb, or rerun_mb_per_hour"
+    return judged(free_mb > ROOM_MB and lasts, "disk", told, wanted, advice)
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:.1f} h" if hours < 48 else f"{hours / 24:.0f} days"
 
 
 def _outside(at: Vector3, box: tuple[Vector3, Vector3]) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from service import child
 from service.cli.usage import UsageError
 from service.config import Settings, converted
 from service.contract.printable import printable_lines
@@ -36,6 +37,8 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
+    if folder is not None or args.live is not None:
+        child.preload("service.recording.process")  # beside this process, which imports as much
     with starting(settings) as start:
         gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
         from service.daemon import daemon  # heavy, while who asks is answered

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import re
 import socket
 import sys
 import time
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from service.contract.channels import lacking
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
@@ -151,7 +152,9 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
             + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
             "not expired?" * secured
         )
-    return f"cannot listen on {', '.join(listen)}: {reason}" if listen else f"no Zenoh session: {reason}"
+    found = re.search(r"\(os error (\d+)\)", reason)
+    words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
+    return f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
 
 
 def _zenoh_config(path: str | Path | None) -> zenoh.Config:

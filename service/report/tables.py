@@ -145,9 +145,12 @@ def verdict(report: Report) -> str:
     """The report in one sentence: how much it followed, how often it did not, and the worst."""
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
-    first_s = next((span.start_s for span in report.spans if span.mode is Mode.FOLLOW), -1.0)
-    waited = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s < first_s]
-    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in waited]
+    following = [span for span in report.spans if span.mode is Mode.FOLLOW]
+    first_s, last_s = (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
+    holds = [span for span in report.spans if span.mode is Mode.HOLD]
+    waited = [span for span in holds if span.start_s < first_s]
+    ended = [span for span in holds if span.start_s >= last_s]
+    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)]
     faults = len(report.faults)
     counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
     if stops:
@@ -155,9 +158,12 @@ def verdict(report: Report) -> str:
         most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
     else:
         most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+    lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
-    followed = 100 * report.seconds(Mode.FOLLOW) / report.lasts_s
-    return f"It followed {followed:.0f} % of {report.lasts_s:.1f} s{since}, with {counts}; the worst was {most}."
+    since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
+    end = f" It ended with {ended[0].doing}, {report.lasts_s - last_s:.1f} s before the end." if ended else ""
+    followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
+    return f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was {most}.{end}"
 
 
 def _times_of(count: int, what: str) -> str:

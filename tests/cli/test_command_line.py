@@ -263,3 +263,35 @@ def test_a_shell_completes_commands_options_and_choices(words: str, found: set[s
         ["bash", "-c", program, "bash", str(script)], capture_output=True, text=True, timeout=30, check=False
     )
     assert set(asked.stdout.split()) == found, asked.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["certificates /dev/full", "demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
+)
+def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> None:
+    done = told(*command.split())
+    assert done.returncode == 1
+    assert re.search(r"/dev/full: (File exists|Not a directory); a folder needed", done.stderr)
+    assert "rrno" not in done.stderr
+
+
+def test_that_the_output_is_full_is_said_in_words() -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "service", "completion", "bash"]
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=ROOT
+        )
+    assert done.returncode == 1
+    assert done.stderr == "thirdhand completion: No space left on device; room on that disk needed\n"
+
+
+def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = told("record", "take", "--folder", str(tmp_path), "--listen", endpoint)
+    assert done.returncode == 1
+    assert f"cannot listen on {endpoint}: Address already in use; another program has it; another port" in done.stderr
+    assert "os error" not in done.stderr

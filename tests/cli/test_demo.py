@@ -86,11 +86,7 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     while "taught while it runs" not in (tmp_path / "said").read_text():
         assert time.monotonic() < end
         time.sleep(0.1)
-    (scribe,) = (
-        process
-        for process in psutil.Process(demo.pid).children(recursive=True)
-        if "service.recording.process" in process.cmdline()
-    )
+    (scribe,) = (process for process in psutil.Process(demo.pid).children(recursive=True) if process.name() == "scribe")
     scribe.kill()
     out, _ = demo.communicate(timeout=100)
     assert demo.returncode == 1

@@ -159,6 +159,11 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
             ("7 ticks lost", "full"),
         ),
         ({"scribe": {"state": "recording", "free_mb": 300.0}}, "disk", ("0.3 GB free", "more than 2 GB", "keep_mb")),
+        (
+            {"scribe": {"state": "recording", "free_mb": 2400.0, "mb_per_hour": 3600.0, "keep_mb_left": 9000.0}},
+            "disk",
+            ("2.4 GB free", "3.6 GB an hour written: full in 0.7 h", "1 h", "rerun_mb_per_hour"),
+        ),
     ],
 )
 def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
@@ -168,6 +173,24 @@ def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     assert lines
     assert all(word in "\n".join(lines) for word in words), lines
     assert all(" | wanted: " in line and " | what to do: " in line and "\n" not in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("scribe", "told"),
+    [
+        ({"mb_per_hour": 1500.0, "keep_mb_left": None}, "1.5 GB an hour written: full in 33.3 h"),
+        ({"mb_per_hour": 200.0, "keep_mb_left": None}, "0.2 GB an hour written: full in 10 days"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "in 0.0 h the oldest recordings begin to be removed"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 3000.0}, "in 2.0 h the oldest recordings begin to be removed"),
+        ({"mb_per_hour": None, "keep_mb_left": None}, "50.0 GB free where it records |"),
+        ({}, "50.0 GB free where it records |"),  # of an older daemon
+    ],
+)
+def test_the_doctor_tells_how_long_the_disk_lasts(scribe: dict[str, Any], told: str) -> None:
+    recording = {"state": "recording", "free_mb": 50_000.0, **scribe}
+    (line,) = [one for one in diagnosed(scribe=recording) if one.what == "disk"]
+    assert line.level == "ok"
+    assert told in line.line() + " |"
 
 
 def test_what_need_not_be_mended_is_a_note() -> None:

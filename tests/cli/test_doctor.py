@@ -150,6 +150,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "set [hands] frame a")
             assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
             assert set(told["hands_m"]) == {"left", "right"}
+            time.sleep(1.5)  # for a line of the watch
             tracker.left = LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
             daemon.process.kill()

@@ -28,7 +28,7 @@ from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
-from service.report.report import Report, differing_settings, reported, why_missed
+from service.report.report import Report, Span, differing_settings, reported, why_missed
 from service.report.stages import LEAST_S
 from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
@@ -256,6 +256,36 @@ def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path
     said = reported(tmp_path / "a.mcap").faults[0].before
     words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
     assert words in said
+
+
+def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
+    def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
+        found, at_s = [], 0.0
+        for lasts_s, mode, reason in parts:
+            found.append(Span(at_s, lasts_s, mode, reason))
+            at_s += lasts_s
+        return tuple(found)
+
+    hold, follow, fault = Mode.HOLD, Mode.FOLLOW, Mode.FAULT
+    waits, ends = (6.0, hold, Reason.NO_HANDS), [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
+    moves, stops = (4.0, follow, Reason.NONE), (1.0, hold, Reason.STALE_HAND)
+    said = {
+        "a bench": (waits, moves, *ends),
+        "a stop": (waits, moves, stops, moves, *ends),
+        "a fault at the end": (moves, (1.0, fault, Reason.SERVICE)),
+        "never": (waits,),
+        "on": (waits, moves),
+    }
+    found, one = {}, reported(golden)
+    for name, parts in said.items():
+        one.spans, one.lasts_s = spans(*parts), sum(part[0] for part in parts)
+        found[name] = verdict(one)
+    assert found["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
+    assert found["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
+    assert found["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
+    assert "with no holds and 1 fault; the worst was fault: service" in found["a fault at the end"]
+    assert "It followed 0 % of 6.0 s, with 1 hold and no faults; the worst was hold: no_hands" in found["never"]
+    assert "It followed 40 % of 10.0 s, from 6.0 s on, with no holds and no faults" in found["on"]
 
 
 def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: Path) -> None:

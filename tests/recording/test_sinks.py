@@ -56,6 +56,43 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
     assert work == pytest.approx([timing["work_us"] for *_, timing in told])
 
 
+@pytest.mark.parametrize(("rate_hz", "mb_per_hour"), [(500, 200.0), (1000, 200.0), (500, 100.0)])
+def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
+    tmp_path: Path, rate_hz: int, mb_per_hour: float
+) -> None:
+    """One of 30 s with hands that tremble; every tick of it would take more than 1.7 GB an hour."""
+    settings, random = Settings(rate_hz=rate_hz), np.random.default_rng(1)
+    one = Viewer(urdf=WAM, settings=settings, mb_per_hour=mb_per_hour, rrd=tmp_path / "a.rrd")
+    period_ns = 1_000_000_000 // rate_hz
+    (_, frame, timing), *_ = list(ticks(600))[-1:]
+    changes, latest, sizes = [], 0.0, []
+    for i in range(30 * rate_hz):
+        shown, measured = frame.copy(), timing.copy()
+        shown["tick"], measured["tick"] = i, i
+        for name in ("joints", "joint_velocities", "joint_accelerations", "hands", "target", "tool", "setpoint"):
+            shown[name] += random.normal(0, 0.002, shown[name].shape)
+        if i % 7001 == 6000:  # for one tick
+            shown["mode"], shown["reason"] = Mode.HOLD, Reason.OPERATOR
+            changes.append(i)
+        measured["lateness_us"] = latest = 5000.0 if i == 8003 else 40.0
+        one.add(shown, i * period_ns, measured)
+        if i % (10 * rate_hz) == 10 * rate_hz - 1:
+            one.flush()
+            sizes.append((tmp_path / "a.rrd").stat().st_size)
+    one.close()
+    assert latest == 40.0
+    assert one.problems == []
+    begins, grows = sizes[0] / 1e6, (sizes[2] - sizes[1]) / 1e6
+    assert 6 * begins + 360 * grows < mb_per_hour  # an hour of files of ten minutes
+    assert 360 * grows > 0.5 * mb_per_hour  # and it is made use of
+    rows = drawn(tmp_path / "a.rrd")
+    at = [row["tick"] for row in rows["/joints/position"] if "tick" in row]
+    assert {*changes, *(i + 1 for i in changes)} <= set(at)
+    late = {row["tick"]: row["Scalars:scalars"][0] for row in rows["/timing/lateness"] if "tick" in row}
+    (peak,) = [tick for tick, value in late.items() if value > 4000]
+    assert 8003 <= peak < 8003 + rate_hz
+
+
 def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     told = list(ticks(600))
