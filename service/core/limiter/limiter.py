@@ -359,16 +359,19 @@ class LimiterStage:
         return Moved(here, limited, separated, too_fast, moving)
 
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
-        """The joints one period on their way to rest, together; or each as it can, where that
-        approaches things less.
+        """Move the joints one period on their way to rest: all together, or each as fast as it can
+        where that approaches things less and does not bring the tool beyond its speed limit.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.stop(q, dq, ddq)
-        excess = separation.excess(*moved[1:3])
+        here, excess = self._arm.at(moved.position), separation.excess(*moved[1:3])
         if excess > 0.0:
             other = self._limiter.step(q, dq, ddq, self._still)
-            moved = other if separation.excess(*other[1:3]) < excess else moved
-        here = self._arm.at(moved.position)
+            if separation.excess(*other[1:3]) < excess:
+                there = self._arm.at(other.position)
+                speed = self._comes_to(other, there)
+                if speed <= self._max_speed or speed <= self._comes_to(moved, here):
+                    moved, here = other, there
         moving = _take(as_array(state), as_array(frame), here.record, *moved[:3])
         return Moved(here, limited=False, separated=False, too_fast=0.0, moving=moving)
 
