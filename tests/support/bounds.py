@@ -35,7 +35,7 @@ MOVING_MPS = 0.005  # slower capsules are not looked at
 PASSED_M, WORSE_M = 0.005, 0.002  # depth in a clearance; increase of the depth at the start
 OWN_CLEARANCE_M = 0.01
 EVERY = 4  # frames: clearances change slowly
-SETTLED_S = 7.5  # after hands begin to come to rest, the arm is at rest
+SETTLED_S = 6.0  # with the hands at rest, in which an arm comes to rest
 LOOK_S, STUCK_S = 0.5, 2.5  # at the end: of accelerations; in which a stuck tool is reported
 AT_REST_RADPS2, AT_REST_NOISY_RADPS2, KEPT_BACK_RADPS2 = 0.05, 0.3, 0.5  # root mean square of all joints
 THERE_M, NET_MOTION_M = 0.01, 0.004
@@ -285,12 +285,13 @@ def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
     (speed, crest), following = session.tool_speeds, _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
     allowed = np.full(len(speed), limit)
-    at_rest = ~session.frames["joint_velocities"].any(axis=1)
+    is_over = ~session.frames["joint_velocities"].any(axis=1)
+    is_over |= session.frames["reason"] == Reason.BLOCKED  # or on a way out, which is no stop
     stop_limit = limit
     for k in range(len(speed)):
         if following[k]:
             stop_limit = STOP_RISE * max(speed[k], crest[k]) + STOP_RISE_MPS
-        elif at_rest[k]:
+        elif is_over[k]:
             stop_limit = limit
         allowed[k] = min(limit, stop_limit) if not following[k] else np.inf
     return speed - allowed
@@ -474,12 +475,19 @@ def _net_motion_m(session: Session) -> float:
 
 
 def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
-    """Root mean square of all joint accelerations in the last half second."""
-    if session.quiet_s < SETTLED_S or not _following(session)[-1]:
+    """Once the tool has been at its target for a while: the root mean square of all joint
+    accelerations. A tool that is kept back for as long hardly trembles.
+    """
+    settled = _last(session, SETTLED_S)
+    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any():
         return _at_the_end(session, 0.0)
-    allowed = AT_REST_RADPS2 if session.noise_m == 0.0 else AT_REST_NOISY_RADPS2
-    if _off_target_m(session) > THERE_M:
-        allowed = KEPT_BACK_RADPS2 if _net_motion_m(session) < NET_MOTION_M else np.inf
+    off = _norms(settled["tool"] - settled["target"])
+    if (off < THERE_M).all():
+        allowed = AT_REST_RADPS2 if session.noise_m == 0.0 else AT_REST_NOISY_RADPS2
+    elif (off > THERE_M).all() and np.ptp(settled["tool"], axis=0).max() < NET_MOTION_M:
+        allowed = KEPT_BACK_RADPS2
+    else:
+        return _at_the_end(session, 0.0)
     return _at_the_end(session, float(np.sqrt((_last(session, LOOK_S)["joint_accelerations"] ** 2).mean())) - allowed)
 
 

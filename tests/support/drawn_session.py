@@ -32,7 +32,7 @@ from support.arm_geometry import ArmGeometry
 from support.bounds import Session
 from support.drawn_arms import KINDS, ODD_STAMPS_NS, WELL, DrawnArm
 from support.drawn_cells import changes, drawn_cell
-from support.drawn_hands import MOTIONS, REPORTS, Surroundings, both, come_to_rest
+from support.drawn_hands import MOTIONS, REPORTS, Report, Surroundings, both, come_to_rest
 from support.explained import explained_controller
 from support.paths import RECORDINGS
 from support.starts import free_postures
@@ -169,7 +169,7 @@ class _Player:
         self.kept: list[tuple[int, Skill, Record]] = []
         self.way_out: WayOut | None = None
 
-    def _report(self) -> object:
+    def _report(self) -> Report:
         return REPORTS[self.random.integers(len(REPORTS))]
 
     def step(self) -> None:
