@@ -7,6 +7,7 @@ other ones, and longer; with `THIRDHAND_SEED=5000` that is the first of them.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -14,9 +15,11 @@ import pinocchio as pin
 import pytest
 
 from service.config import robot_description
+from service.contract.records import Mode, Reason
 from service.core.frame import Vector
+from support import bounds
 from support.arm_geometry import ArmGeometry, between_segments, points_to_box, segments_to_box
-from support.bounds import broken
+from support.bounds import Bound, Session, broken
 from support.drawn_cells import ARMS, drawn_cell
 from support.drawn_session import play
 
@@ -86,3 +89,56 @@ def _capsule(segment: Vector) -> tuple[coal.Capsule, coal.Transform3s]:
     along = way if way.any() else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
     return coal.Capsule(0.01, float(np.linalg.norm(way))), coal.Transform3s(turn, segment.mean(axis=0))
+
+
+@pytest.fixture(scope="module")
+def kept() -> Session:
+    """A session in which the arm follows at the end, and every bound is kept."""
+    session = play(12, "wam", wild_ticks=300, quiet_s=8.0, most_quiet_ticks=2000).session
+    assert broken(session) == []
+    assert (session.frames["mode"][-100:] == Mode.FOLLOW).all()
+    return session
+
+
+SPOILED: dict[Bound, dict[str, float]] = {  # what is added to fields of a late frame
+    bounds.every_number_is_finite: {"target": np.nan},
+    bounds.joints_are_within_limits_or_move_inwards: {"joints": 9.0},
+    bounds.joint_speeds_are_within_limits: {"joint_velocities": 9.0},
+    bounds.joint_accelerations_are_within_limits: {"joint_accelerations": 50.0},
+    bounds.joint_jerks_are_within_limits: {"joint_accelerations": 5.0},
+    bounds.joints_jump_only_at_rest_and_to_where_the_arm_is: {"joints": 1e-3},
+    bounds.joints_that_move_are_commanded: {"joint_velocities": 0.1, "commanded": 255},
+    bounds.setpoint_speed_is_within_its_limit: {"setpoint_velocity": 1.0},
+    bounds.setpoint_acceleration_is_within_its_limit: {"setpoint_acceleration": 20.0},
+    bounds.setpoint_jerk_is_within_its_limit: {"setpoint_acceleration": 5.0},
+    bounds.setpoint_does_not_jump: {"setpoint": 1e-3},
+    bounds.setpoint_turning_speed_is_within_its_limit: {"setpoint_turning": 3.0},
+    bounds.setpoint_turning_acceleration_is_within_its_limit: {"setpoint_turning": 0.5},
+    bounds.setpoint_passes_no_bound_of_its_own: {"reason": Reason.SETPOINT},
+    bounds.tool_leaves_the_workspace_by_little: {"tool": 2.0},
+    bounds.tool_is_near_its_setpoint: {"tool": 0.3},
+    bounds.tool_speed_is_within_its_limit_while_following: {"joint_velocities": 1.4},
+    bounds.tool_hardly_speeds_up_in_a_stop: {"joint_velocities": 1.4, "mode": 255},
+    bounds.service_causes_no_fault_of_its_own: {"mode": 1, "reason": Reason.TOOL_SPEED},
+}
+
+
+@pytest.mark.parametrize("bound", SPOILED, ids=lambda bound: bound.__name__)
+def test_a_bound_that_is_passed_is_found(kept: Session, bound: Bound) -> None:
+    frames = kept.frames.copy()
+    for name, added in SPOILED[bound].items():
+        frames[name][-100] += np.array(added, frames.dtype[name].base)
+    assert bound(replace(kept, frames=frames, arm_follows=True)).max() > 0.0
+
+
+def test_a_part_in_a_clearance_and_a_setpoint_that_leaves_are_found(kept: Session) -> None:
+    low, folded, frames = kept.placed.copy(), kept.placed.copy(), kept.frames.copy()
+    low[-100:, :, :, 2] -= 1.0
+    folded[-100:] = folded[-100:, :1]
+    for bound, placed in ((bounds.arm_keeps_clear_of_the_table, low), (bounds.arm_keeps_clear_of_itself, folded)):
+        spoiled = replace(kept)
+        spoiled.__dict__["placed"] = placed
+        assert bound(spoiled).max() > 0.0
+    frames["setpoint_velocity"] = 0.0  # it began at rest
+    frames["setpoint"][-100] += 2.0
+    assert bounds.setpoint_stays_in_the_workspace(replace(kept, frames=frames)).max() > 0.0

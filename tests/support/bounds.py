@@ -236,7 +236,7 @@ def _runs(session: Session) -> Iterator[slice]:
     same = np.concatenate([[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))])
     following = _following(session)
     begins = np.flatnonzero(following & ~(np.concatenate([[False], following[:-1]]) & same))
-    ends = np.concatenate([begins[1:], [len(following)]])
+    ends = np.append(begins, len(following))[1:]
     for begin, end in zip(begins, ends, strict=True):
         pauses = np.flatnonzero(~following[begin:end])
         yield slice(begin, begin + pauses[0] if len(pauses) else end)
