@@ -27,6 +27,7 @@ GROUPS = {
         "places",
         "pose",
         "recordings",
+        "arrays",
         "reports",
         "viewing",
         "hardware",

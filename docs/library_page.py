@@ -31,7 +31,7 @@ GROUPS = {
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
 }
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
-INSIDE = {"to_plot", "query", "compiled_query", "from_arrays", "to_arrays"}
+INSIDE = {"to_plot", "inner"}
 MADE_BY_THE_LIBRARY = {"KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"}
 
 
@@ -61,7 +61,7 @@ def _told(name: str, value: Any) -> Iterator[str]:
         ours = getattr(inspect.unwrap(getattr(one, "fget", getattr(one, "func", one))), "__module__", "") or ""
         if part.startswith("_") or not ours.startswith("kmp.") or part in INSIDE or not one.__doc__:
             continue
-        yield _called(f"{name}.{part}", one) if inspect.isroutine(one) else f"`{name}.{part}`:"
+        yield _called(f"{name}.{part}", one) if callable(one) else f"`{name}.{part}`:"
         yield inspect.cleandoc(one.__doc__)
 
 

@@ -1,5 +1,5 @@
-"""`python docs/settings_page.py` writes settings.md: every setting of `service/config.py`, with
-what is said beside it there.
+"""`python docs/settings_page.py` writes settings.md: every setting of `service/config.py` with its
+default, its accepted values and the comment beside it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,10 @@ HEAD = """# Settings
 
 <!-- Written by `python docs/settings_page.py` from service/config.py: change it there. -->
 
-The settings of a cell are one TOML file for `thirdhand serve --config cell.toml`. Each heading
-below is a table of it; what is not given has its default. A file is checked whole before anything
-starts, and all that is wrong with it is told at once, with what would be accepted.
-
-Units stand in the names (`_ms`, `_hz`, `_mb`) or in brackets; positions are in frame `base` unless
-said otherwise. Quaternions are x y z w. Paths of files and folders may begin with `~`; those of
-`[arm] urdf` and `[network] certificate` lie beside the configuration where they are relative.
+This page lists every setting of a cell, with its default and the values that are accepted. Write
+the settings that you want to change into a TOML file, and start the daemon with it: `thirdhand
+serve --config cell.toml`. Each heading below is a table of that file. Settings that the file does
+not name keep their defaults. Options of `thirdhand serve` override the file.
 
 ```toml
 cell = "hall/bench-1"
@@ -43,7 +40,15 @@ base_from_tracker = [0.80, 0.0, 0.02, 0.0, 0.0, 1.0, 0.0]
 max_speed = 0.5
 ```
 
-Options of `thirdhand serve` go before the file's.
+The whole file is checked before anything starts. All mistakes are listed at once, each with the
+values that would have been accepted.
+
+* Units are part of the name (`_ms`, `_hz`, `_mb`) or stand in brackets in the last column.
+* Positions are in frame `base`, unless the last column names another frame.
+* Quaternions are x y z w. A pose is x y z in metres, then a quaternion.
+* Paths may begin with `~`. Relative paths of `[arm] urdf` and `packages`, `[network] certificate`
+  and `zenoh_config` start from the folder of the file, those of `[files]` from the folder where the
+  command runs.
 """
 
 
@@ -66,7 +71,7 @@ def _section(kind: Any, name: str) -> Iterator[str]:
     comments = _comments(kind)
     if name:
         yield f"\n## [{name}]\n\n{_paragraphs(kind)}\n"
-    yield "\n| setting | default | accepted | what |\n|---|---|---|---|\n"
+    yield "\n| setting | default | accepted | meaning |\n|---|---|---|---|\n"
     for field in types.type_info(kind).fields:  # type: ignore[attr-defined]
         if not isinstance(field.type, types.StructType):
             cells = (f"`{field.name}`", _value(_default(field)), _accepted(field.type), comments.get(field.name, ""))
@@ -78,7 +83,7 @@ def _paragraphs(kind: Any) -> str:
 
 
 def _comments(kind: Any) -> dict[str, str]:
-    """What is said beside each field of a class, in its source."""
+    """The comment beside each field of a class, by the field's name."""
     source = textwrap.dedent(inspect.getsource(kind))
     told: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -98,7 +103,7 @@ def _default(field: types.Field) -> Any:
 
 
 def _value(value: Any) -> str:
-    """As TOML has it."""
+    """A default as TOML, or that there is none."""
     if value is msgspec.NODEFAULT:
         return "must be given"
     return f"`{_toml(value)}`"
@@ -115,7 +120,7 @@ def _toml(value: Any) -> str:
 
 
 def _accepted(kind: Any) -> str:
-    """In words, what a setting takes."""
+    """The accepted values of a setting, in words."""
     if isinstance(kind, types.Metadata):
         told = (kind.extra or {}).get("accepted")
         return str(told).rstrip(",") if told else _accepted(kind.type)
@@ -132,6 +137,8 @@ def _accepted(kind: Any) -> str:
         if isinstance(inner, types.StructType):
             fields = "; ".join(f"`{field.name}`: {_accepted(field.type)}" for field in inner.fields)
             return f"tables with {fields}"
+        if isinstance(inner, types.LiteralType):
+            return f"a list of {_accepted(inner)}"
         return f"a list of {'texts' if isinstance(inner, types.StrType) else f'numbers{_each(inner)}'}"
     return ", ".join(filter(None, ("whole number" if isinstance(kind, types.IntType) else "number", _range(kind))))
 

@@ -57,4 +57,4 @@ if __name__ == "__main__":
     client = client_settings(connect=args.connect, cell=settings.cell if args.config else None)
     with client.session(timeout_s=None) as session:
         signal.signal(signal.SIGINT, lambda *_: stop.set())  # from now on Ctrl-C brakes first
-        follow(FakeArm(settings), session, client.cell, tick_s=settings.period_s, stop=stop)
+        follow(FakeArm(settings), session, client.cell, stop=stop)

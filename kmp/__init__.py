@@ -11,6 +11,8 @@ kernel with parameter ell, K its matrix (N, N), lambda the weight of the penalty
 fitted weights.
 """
 
+import typing
+
 from kmp.affine_mean import AffineMean
 from kmp.checks import RankReached, ViaPointMissed
 from kmp.constraints import LinearConstraints
@@ -27,6 +29,9 @@ from kmp.references import CoordinateFrame, LocalKMP, superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
+
+if typing.TYPE_CHECKING:
+    from kmp.estimator import KMPRegressor as KMPRegressor
 
 __version__ = "0.1.0"
 
@@ -58,3 +63,16 @@ __all__ = [
     "save",
     "superposed",
 ]
+
+
+def __getattr__(name: str) -> typing.Any:
+    """`KMPRegressor`, imported when it is first needed, as scikit-learn loads slowly."""
+    if name == "KMPRegressor":
+        from kmp.estimator import KMPRegressor
+
+        return KMPRegressor
+    raise AttributeError(f"module 'kmp' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), "KMPRegressor"])

@@ -46,14 +46,30 @@ def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     return frozen(array)
 
 
+_LARGEST = 1e150  # of a number: sums of squares of larger ones may be infinite
+_SHOWN = 60  # characters of a value in a message
+
+
+def brief(value: object) -> str:
+    """The value as a message shows it: an array by its shape where it is long."""
+    text = " ".join(repr(value.tolist() if isinstance(value, np.ndarray) else value).split())
+    if len(text) <= _SHOWN:
+        return text
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    return text[: _SHOWN - 4] + " ..."
+
+
 def check_finite(name: str, array: Array, what: str = "") -> None:
-    """Raises ValueError unless every number is finite."""
+    """Raises ValueError unless every number is finite, and so is its square."""
     flat = array.ravel()
-    if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
-        return
-    for place in np.argwhere(~np.isfinite(array))[:1].tolist():
+    with np.errstate(over="ignore"):
+        if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
+            return
         of = f"{name}: {what} " if what else name
-        raise ValueError(f"{of}{place} is {array[tuple(place)]}, and every number must be finite.")
+        for place in np.argwhere(~(np.abs(array) <= _LARGEST))[:1].tolist():
+            needed = "finite" if not np.isfinite(array[tuple(place)]) else f"at most {_LARGEST:g} in size"
+            raise ValueError(f"{of}{place or ''} is {array[tuple(place)]:g}, and every number must be {needed}.")
 
 
 def check_shape(name: str, array: Array, *shape: int | str) -> None:
@@ -118,7 +134,7 @@ def parts_of(name: str, value: Any, kind: type | None = None, how: str = "") -> 
 def whole(name: str, value: object, *, least: int = 1, most: int = 2**31 - 1) -> int:
     """The value as an integer. Raises ValueError unless it is one, from the least to the most."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
-        raise ValueError(f"{name} is {value!r}, and must be a whole number.")
+        raise ValueError(f"{name} is {brief(value)}, and must be a whole number.")
     if value < least:
         raise ValueError(f"{name} is {value}, and must be at least {least}.")
     if value > most:
@@ -136,7 +152,7 @@ def one_of(name: str, value: object, words: Sequence[str]) -> None:
     """Raises ValueError unless the value is one of the words."""
     if not isinstance(value, str) or value not in words:
         *most, last = map(repr, words)
-        raise ValueError(f"{name}: {value!r} given, {', '.join(most)} or {last} needed.")
+        raise ValueError(f"{name}: {brief(value)} given, {', '.join(most)} or {last} needed.")
 
 
 def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:

@@ -21,7 +21,7 @@ from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
-from kmp.solution import mean_of
+from kmp.solution import ErrorBounds, mean_of
 
 _VIOLATION = 1e-9  # of a constraint [unit of the outputs], at most, where its normal has norm 1
 _ENOUGH = 1e-13  # at which the search ends, where rounding allows
@@ -87,7 +87,7 @@ class Constrained(Immutable):
     constraints: LinearConstraints
 
     representation: ClassVar[Literal["dense"]] = "dense"
-    error_bound: ClassVar[float] = 0.0
+    error_bounds: ClassVar[ErrorBounds] = ErrorBounds(0.0, 0.0)
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -152,6 +152,9 @@ class Constrained(Immutable):
 
     def adapted(self, changes: Changes) -> Constrained:
         return Constrained(self.solution.adapted(changes), self.constraints)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Constrained:
+        return Constrained(self.solution.with_hyperparameters(hyperparameters), self.constraints)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from kmp.checks import Array, ViaPointMissed
@@ -16,7 +17,9 @@ from kmp.gaussians import Gaussians
 from kmp.immutable import Immutable, frozen
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
+_PAIR = 2  # points, at least, have a distance
 _MISSED = 3.0  # of a via-point's deviations: more is a miss
+_NAMED = 5  # via-points in a message
 _WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
 
 
@@ -77,6 +80,18 @@ class Database(Immutable):
             Gaussians.concatenated([reference, changes.points]),
         )
 
+    def spacing(self, period: float | None) -> float:
+        """Median distance from a value to the nearest other one; 0 where there is none."""
+        values = np.unique(self.inputs[self.functionals.values], axis=0)
+        if len(values) < _PAIR:
+            return 0.0
+        if period is not None:
+            values = np.unique(values % period, axis=0)
+            gaps = np.diff(values[:, 0], append=values[0, 0] + period)
+            return float(np.median(np.minimum(gaps, np.roll(gaps, 1))))
+        distances, _ = cKDTree(values).query(values, k=[2])
+        return float(np.median(distances))
+
     def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
         """The indices, ascending, of the values nearest to those of via, if near enough.
 
@@ -119,8 +134,9 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
         for n in np.flatnonzero((distance[:, c] > _WORTH_SAYING) & (deviations > _MISSED)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
+        more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""
         warnings.warn(
-            f"Via-points missed [unit of the outputs]: {', '.join(missed)}. Another point near in the "
+            f"Via-points missed [unit of the outputs]: {', '.join(missed[:_NAMED])}{more}. Another point near in the "
             "inputs asks for something else, or lambda is large: give the via-point less variance, "
             "replace what is near by a larger tolerance, or take a larger ell.",
             ViaPointMissed,

@@ -22,7 +22,7 @@ from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.kernel import between
 from kmp.linear_algebra import kron_identity
-from kmp.solution import check_resolved
+from kmp.solution import ErrorBounds, check_resolved
 
 _SHARED = 0.75  # of the points: where fewer come before the first change, a border costs more than a fit
 _TAKEN = 0.125  # of the points: where more are taken out of the factor, that costs more than a fit
@@ -113,7 +113,7 @@ class Dense(Immutable):
     """The base's points that are not among these; None: those from the `same` on."""
 
     representation: ClassVar[Literal["dense"]] = "dense"
-    error_bound: ClassVar[float] = 0.0
+    error_bounds: ClassVar[ErrorBounds] = ErrorBounds(0.0, 0.0)
 
     @property
     def functionals(self) -> Functionals:
@@ -172,6 +172,9 @@ class Dense(Immutable):
         bordered = Dense(self.hyperparameters, database, self, len(self.database))
         factors = {"_mean_solver": bordered.mean_factor, "_covariance_solver": bordered.covariance_factor}
         return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
+        return Dense(hyperparameters, self.database)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)

@@ -1,6 +1,6 @@
 """The primitive as a scikit-learn estimator: for pipelines, searches and cross-validation.
 
-Imported on its own, `from kmp.estimator import KMPRegressor`: scikit-learn loads slowly.
+`kmp.KMPRegressor` imports this module when it is first used, as scikit-learn loads slowly.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from kmp.checks import Array, positive
+from kmp.checks import Array, brief, positive, squared, whole
 from kmp.gaussians import Gaussians
 from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
@@ -64,12 +64,13 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
         spread = outputs.var(axis=0)
         spread = np.where(spread > 0, spread, 1.0)  # an output that never changes
+        variance = squared("noise", self.noise) * np.diag(spread)
         if self.components is None:
-            variance = positive("noise", self.noise) ** 2 * np.diag(spread)
             reference = Gaussians(outputs, np.tile(variance, (len(inputs), 1, 1)))
         else:
             samples = np.hstack([inputs, outputs])
-            mixture = GaussianMixture.fit(samples, components=self.components, seed=self.random_state)
+            seed = whole("random_state", self.random_state, least=0, most=2**32 - 1)
+            mixture = GaussianMixture.fit(samples, components=self.components, seed=seed)
             reference = mixture.regress(inputs)
         unit = float(spread.mean())
         self.primitive_ = KMP.fit(
@@ -77,7 +78,9 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             reference,
             kernel=GaussianKernel(self._ell(inputs)),
             lambda_mean=positive("lambda_mean", self.lambda_mean) / unit,
-            lambda_covariance=self.lambda_covariance and self.lambda_covariance / unit,
+            lambda_covariance=None
+            if self.lambda_covariance is None
+            else positive("lambda_covariance", self.lambda_covariance) / unit,
             prior_mean=outputs.mean(axis=0),
         )
         return self
@@ -102,5 +105,5 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         if not isinstance(self.ell, str):
             return self.ell
         if self.ell != "scale":
-            raise ValueError(f'ell: {self.ell!r} given, a number, one for each input, or "scale" needed.')
+            raise ValueError(f'ell: {brief(self.ell)} given, a number, one for each input, or "scale" needed.')
         return 1.0 / (inputs.shape[1] * (float(inputs.var()) or 1.0))

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, check_kind, numbers, parts_of
+from kmp.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
 
 _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance meant to be symmetric
+_EXACT = 1e-200  # [unit^2] the variance that stands for an exact output
+_EXACT_BELOW = 1e-150  # [unit^2] a turned or scaled exact output's variance is below it too
 _MACHINE = float(np.finfo(np.float64).eps)
 
 
@@ -33,6 +35,34 @@ class Gaussians(Immutable):
         n, outputs = mean.shape
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "covariance", covariances("covariance", self.covariance, n, outputs))
+
+    @classmethod
+    def of(cls, mean: ArrayLike, *, deviation: ArrayLike) -> Gaussians:
+        """The normals of means (N, O), or of one (O,), with independent outputs.
+
+        deviation [unit of the outputs]: one number for all, or one for each output (O,), or for
+        each number (N, O). 0 stands for an exact output: whatever is fitted to it takes the least
+        variance that rounding does not hide.
+
+        Raises ValueError if a number is not finite, shapes do not agree, or a deviation is below 0.
+        """
+        given = real("mean", mean)
+        means = numbers("mean", given[None] if given.ndim == 1 else given, "N", "O")
+        deviations = real("deviation", deviation)
+        if deviations.shape not in {(), means.shape[1:], means.shape}:
+            wanted = f"(), {means.shape[1:]} or {means.shape}"
+            raise ValueError(f"deviation: shape {deviations.shape} given, {wanted} needed for a mean of {means.shape}.")
+        check_finite("deviation", deviations)
+        if (deviations < 0).any():
+            raise ValueError(f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact.")
+        variances = np.maximum(np.broadcast_to(deviations, means.shape) ** 2, _EXACT)
+        check_finite("deviation", variances, "too large for its square:")
+        return unchecked(means.copy(), variances[:, :, None] * np.eye(means.shape[1]))
+
+    @property
+    def exact(self) -> NDArray[np.bool_]:
+        """(N, O) which outputs are exact: of a deviation of 0 in `of`."""
+        return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) < _EXACT_BELOW)
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -130,7 +160,14 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
         fault = f"is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}"
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
-    smallest = np.linalg.eigvalsh(covariance)[:, 0]
+    own = np.diagonal(covariance, axis1=1, axis2=2)
+    alone = np.count_nonzero(covariance, axis=2) == 1
+    exact = alone & (own > 0) & (own < _EXACT_BELOW)  # `Gaussians.of` makes these, and others beside them
+    filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
+    try:
+        smallest = np.linalg.eigvalsh(filled)[:, 0]
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{name}: {brief(value)} given, and its eigenvalues cannot be found.") from None
     for n in np.flatnonzero(smallest <= covariance.shape[1] * _MACHINE * size)[:1]:
         raise ValueError(
             f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest[n]:.3g}, "

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, check_finite, check_some, numbers, positive, seeded, whole
+from kmp.checks import Array, brief, check_finite, check_some, numbers, positive, seeded, whole
 from kmp.gaussians import Gaussians, covariances
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
@@ -38,7 +38,7 @@ class GaussianMixture(Immutable):
     def __post_init__(self) -> None:
         weights = numbers("weights", self.weights, "K")
         if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
-            raise ValueError(f"weights: {weights} given; needed are numbers of sum 1, none below 0.")
+            raise ValueError(f"weights: {brief(weights)} given; needed are numbers of sum 1, none below 0.")
         means = numbers("means", self.means, len(weights), "I+O")
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "means", means)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_shape, numbers, positive
+from kmp.checks import Array, brief, check_shape, numbers, positive
 from kmp.functionals import Functionals
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel
@@ -52,7 +52,9 @@ class Hyperparameters(Immutable):
             values = outputs // kernel.channels
             own, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
             if not np.array_equal(rates := offset[values:], own) or np.any(of_rates):
-                raise ValueError(f"prior_mean: rates of {rates} given; the rate of the values' prior mean is {own}.")
+                raise ValueError(
+                    f"prior_mean: rates of {brief(rates)} given; the rate of the values' prior mean is {brief(own)}."
+                )
         return cls(kernel, penalty, other, offset, matrix)
 
     @property
@@ -90,5 +92,5 @@ class Hyperparameters(Immutable):
 def checked_kernel(kernel: Kernel) -> Kernel:
     """The kernel. Raises ValueError unless it is one."""
     if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
-        raise ValueError(f"kernel: {kernel!r} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
+        raise ValueError(f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
     return kernel

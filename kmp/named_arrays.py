@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.affine_mean import AffineMean
-from kmp.checks import check_kind, numbers, real
+from kmp.checks import brief, check_kind, check_shape, numbers, real
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database
 from kmp.dense import Dense
@@ -17,8 +17,10 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
+from kmp.inner import Inner
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.low_rank import LowRank
+from kmp.primitive import KMP
 from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
@@ -31,8 +33,9 @@ _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds
 _OF_LOW_RANK = ("pivots", "information", "features")
 
 
-def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str, NDArray[Any]]:
-    """The arrays of a base, its changes, and the solution with these."""
+def to_arrays(primitive: KMP) -> dict[str, NDArray[Any]]:
+    """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
+    base, changes, solution = primitive.base.inner.solution, primitive.inner.changes, primitive.inner.solution
     parameters = base.hyperparameters
     arrays = {
         "base_inputs": base.database.inputs,
@@ -64,8 +67,13 @@ def to_arrays(base: Solution, changes: Changes, solution: Solution) -> dict[str,
     return arrays | base.to_arrays()
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, Solution]:
-    """What `to_arrays` was given. Raises ValueError if arrays lack or do not go together."""
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> KMP:
+    """The primitive that `to_arrays` gave these arrays for, with its very weights.
+
+    Other names are left alone. The factors are made when `predict` or `adapt` first asks for them,
+    and come out the same bit for bit, given the same libraries and kind of processor. Raises
+    ValueError if an array is missing, or the arrays do not go together.
+    """
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
@@ -75,7 +83,10 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[Solution, Changes, 
     solution = base.adapted(changes) if len(changes.inputs) else base
     if any(name in arrays for name in _OF_CONSTRAINTS):
         solution = _constrained(solution, arrays)
-    return base, changes, solution if solution is base else _weighted(solution, "weights", arrays)
+    unadapted = KMP(Inner.of_base(base))
+    if solution is base:
+        return unadapted
+    return KMP(Inner(_weighted(solution, "weights", arrays), changes, unadapted.inner.count), unadapted)
 
 
 def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
@@ -92,7 +103,9 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
     reference = _normals("base", arrays)
     check_pairs("base_mean", inputs, reference, reference.outputs)
-    prior = np.asarray(arrays["prior_mean"])
+    prior = real("prior_mean", arrays["prior_mean"])
+    if prior.ndim == 2:
+        check_shape("prior_mean", prior, reference.outputs, 1 + inputs.shape[1])
     parameters = Hyperparameters.checked(
         _kernel(arrays),
         float(numbers("lambda_mean", arrays["lambda_mean"])),
@@ -113,7 +126,9 @@ def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
     check_pairs("via_mean", via, points, database.reference.outputs)
     replaced, n = real("replaced", arrays["replaced"]), len(database)
     if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
-        raise ValueError(f"replaced: {arrays['replaced']} given, ascending indices of the {n} base points needed.")
+        raise ValueError(
+            f"replaced: {brief(arrays['replaced'])} given, ascending indices of the {n} base points needed."
+        )
     return Changes(frozen(replaced.astype(np.intp)), Functionals.checked(via, arrays.get("via_directions")), points)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kmp.checks import Array, check_finite, not_negative, numbers, real
-from kmp.gaussians import Gaussians
+from kmp.gaussians import Gaussians, covariances, unchecked
 from kmp.immutable import Immutable, frozen
 from kmp.linear_algebra import symmetric
 from kmp.primitive import KMP, checked_primitive
@@ -146,30 +146,31 @@ class OrientationKMP(Immutable):
         quaternions: ArrayLike,
         covariance: ArrayLike,
         *,
-        tolerance: float,
+        tolerance: float | None = None,
         angular_velocities: ArrayLike | None = None,
         velocity_covariance: ArrayLike | None = None,
     ) -> OrientationKMP:
         """A new skill that also goes through orientations (V, 4) at inputs (V, I). x y z w.
 
         Of q and -q, the nearer is taken. `covariance` (3, 3) or (V, 3, 3) [rad^2] is of small
-        rotations. Skills over time take angular velocities too, (V, 3) [rad/s] with their
-        covariance [(rad/s)^2]; left out, they are free. `tolerance` [unit of the inputs] is that of
-        `KMP.adapt`.
+        rotations; 0 stands for the least that rounding does not hide. Skills over time take angular
+        velocities too, (V, 3) [rad/s] with their covariance [(rad/s)^2]; left out, they are free.
+        `tolerance` [unit of the inputs] is that of `KMP.adapt`.
 
         Raises ValueError as that does, if a quaternion is none, or if rates do not go with the
         skill.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
-        not_negative("tolerance", tolerance)
+        if tolerance is not None:
+            not_negative("tolerance", tolerance)
         q = _unit("quaternions", numbers("quaternions", quaternions, len(where), 4))
         zeta = self._nearest(where, q)
         back = np.array([np.linalg.inv(rotation_per_zeta(one)) for one in zeta]).reshape(-1, 3, 3)
-        turned = back @ _each("covariance", covariance, len(where)) @ back.transpose(0, 2, 1)
+        turned = self._turned("covariance", covariance, back, self.primitive.least_variance)
         if self.primitive.kernel.channels == 1:
             if angular_velocities is not None or velocity_covariance is not None:
                 raise ValueError("angular_velocities: the skill has no rates; fit it with a VelocityKernel.")
-            return self._adapted(where, Gaussians(zeta, symmetric(turned)), tolerance)
+            return self._adapted(where, unchecked(zeta, turned), tolerance)
         if (angular_velocities is None) != (velocity_covariance is None):
             raise ValueError("angular_velocities and velocity_covariance: give both, or none.")
         if angular_velocities is None or velocity_covariance is None:
@@ -179,13 +180,34 @@ class OrientationKMP(Immutable):
         else:
             omega = numbers("angular_velocities", angular_velocities, len(where), 3)
             rates = (back @ omega[:, :, None])[:, :, 0]
-            given = _each("velocity_covariance", velocity_covariance, len(where))
-            rate_covariance = back @ given @ back.transpose(0, 2, 1)
+            least = self.primitive.least_variance * float(self.primitive.kernel.prior_variance[1, 1])
+            rate_covariance = self._turned("velocity_covariance", velocity_covariance, back, least)
         whole = np.zeros((len(where), 6, 6))
         whole[:, :3, :3], whole[:, 3:, 3:] = turned, rate_covariance
-        return self._adapted(where, Gaussians(np.hstack([zeta, rates]), symmetric(whole)), tolerance)
+        return self._adapted(where, unchecked(np.hstack([zeta, rates]), symmetric(whole)), tolerance)
 
-    def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float) -> OrientationKMP:
+    @staticmethod
+    def _turned(name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
+        """Covariances (V, 3, 3) of zeta or its rate, of those given of rotations; 0 means exact.
+
+        `least` is the least variance of zeta that rounding does not hide. A rotation's is at most 4
+        times that of zeta. Raises ValueError where a covariance is none, or is too small.
+        """
+        count, given = len(back), real(name, covariance)
+        given = numbers(name, np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given, count, 3, 3)
+        exact = ~given.any(axis=(1, 2), keepdims=True)
+        checked = covariances(name, np.where(exact, np.eye(3), given), count, 3)
+        turned = symmetric(back @ checked @ back.transpose(0, 2, 1))
+        check_finite(name, turned, "too large:")
+        for n in np.flatnonzero(np.linalg.eigvalsh(turned)[:, 0] < least)[:1]:
+            smallest = np.linalg.eigvalsh(given[n])[0]
+            raise ValueError(
+                f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is {smallest:.3g}, and "
+                f"{4.1 * least:.2g} is enough. Give 0 for the least, or the primitive a larger lambda_covariance."
+            )
+        return np.where(exact, Gaussians.of(np.zeros(3), deviation=0).covariance, turned)
+
+    def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float | None) -> OrientationKMP:
         return OrientationKMP(self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary)
 
     def _nearest(self, inputs: Array, quaternions: Array) -> Array:
@@ -202,9 +224,3 @@ def _unit(name: str, quaternions: ArrayLike, *shape: int) -> Array:
         norm = f"{length.flat[n]:.4g}"
         raise ValueError(f"{name}{which} has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
     return np.asarray(q / length)
-
-
-def _each(name: str, covariance: ArrayLike, count: int) -> Array:
-    given = real(name, covariance)
-    each = np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given
-    return numbers(name, each, count, 3, 3)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, check_kind, numbers, parts_of, whole
+from kmp.checks import Array, brief, check_kind, numbers, parts_of, whole
 from kmp.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Plotted:
 
 def _two(plane: Sequence[int]) -> list[int]:
     if len(given := parts_of("plane", plane)) != 2:
-        raise ValueError(f"plane: {given} given, the numbers of two outputs needed.")
+        raise ValueError(f"plane: {brief(given)} given, the numbers of two outputs needed.")
     return given
 
 
@@ -193,4 +193,4 @@ def _add_legend(axes: Axes) -> None:
     named = dict(zip(reversed(labels), reversed(handles), strict=True))
     look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}
     order = sorted(named, key=labels.index)
-    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=6, **look)
+    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, **look)

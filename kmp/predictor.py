@@ -5,7 +5,6 @@ The paper, section II-B.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -15,17 +14,16 @@ from numpy.typing import ArrayLike
 
 from kmp.affine_mean import AffineMean
 from kmp.checks import Array, check_finite, check_shape, real, seeded, whole
-from kmp.compiled_query import CompiledQuery
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
 from kmp.immutable import Immutable, frozen
+from kmp.inner import Inner
 from kmp.kernel import Kernel, between
 from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.low_rank import Features
-from kmp.query import MotionPrediction, Query
-from kmp.solution import Solution, mean_at
+from kmp.query import MotionPrediction
+from kmp.solution import BLOCK, least_variances, mean_at
 
-_BATCH = 256  # queries at once, which bounds the memory of `predict`
 _RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
 
 
@@ -42,12 +40,8 @@ class Uncertainty(Immutable):
 class Predictor(Immutable):
     """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
 
-    solution: Solution
-
-    @property
-    @abstractmethod
-    def _count(self) -> int:
-        """N of the covariance."""
+    inner: Inner
+    """What is not for users of the package: its arrays and solutions, which may change."""
 
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
@@ -59,7 +53,9 @@ class Predictor(Immutable):
         if (found := self._compiled_mean(s)) is not None:
             return found[0]
         s = self._checked_many(s)
-        return self.query.mean(self.query.row(s[0]))[None] if len(s) == 1 else mean_at(self.solution, s)
+        return (
+            self.inner.query.mean(self.inner.query.row(s[0]))[None] if len(s) == 1 else mean_at(self.inner.solution, s)
+        )
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -70,17 +66,17 @@ class Predictor(Immutable):
         finite, or what was stored cannot be solved here.
         """
         s = real("queries", queries)
-        compiled = self.compiled_query if s.shape[:1] == (1,) else None
+        compiled = self.inner.compiled_query if s.shape[:1] == (1,) else None
         if compiled is not None and (found := self._compiled_mean(s)) is not None:
             return unchecked(found[0], compiled.covariance(found[1])[None])
         s = self._checked_many(s)
         if len(s) == 1:
-            row = self.query.row(s[0])
-            return unchecked(self.query.mean(row)[None], self.query.covariance(row.kernel)[None])
-        batches = [s[i : i + _BATCH] for i in range(0, len(s), _BATCH)]
-        posterior = [self.solution.posterior_covariance(self._rows(one)) for one in batches]
+            row = self.inner.query.row(s[0])
+            return unchecked(self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None])
+        batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
+        posterior = [self.inner.solution.posterior_covariance(self._rows(one)) for one in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
-        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.query.covariance_scale)
+        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale)
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -91,8 +87,8 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
-        posterior = self.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        covariance = nearest_positive_semidefinite(posterior[None]) * self.query.covariance_scale
+        posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
+        covariance = nearest_positive_semidefinite(posterior[None]) * self.inner.query.covariance_scale
         return unchecked(self.mean(s).reshape(1, -1), covariance)
 
     def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
@@ -125,38 +121,32 @@ class Predictor(Immutable):
         Raises ValueError if a shape is another or a number is not finite.
         """
         s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
-        compiled = self.compiled_query
+        compiled = self.inner.compiled_query
         if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
             found = compiled.motion(s, v, a, covariance=covariance)
             if found is not None:
                 return found
         checked = self._checked("velocity", v), self._checked("acceleration", a)
-        return self.query.motion(self._one_query(s), *checked, covariance=covariance)
+        return self.inner.query.motion(self._one_query(s), *checked, covariance=covariance)
 
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
 
         Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
         """
-        s, compiled = real("query", query), self.compiled_query
+        s, compiled = real("query", query), self.inner.compiled_query
         if compiled is not None and s.shape == (self._dimensions,) and (found := compiled.jacobian(s)) is not None:
             return found
-        return self.query.jacobian(self.query.row(self._one_query(s)))
+        return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). The numbers are `jacobian`'s, but for rounding.
 
         Raises ValueError if the shape is another or a number is not finite.
         """
-        s, i = self._checked_many(queries), self._dimensions
-        weights = self.weights.reshape(-1, self.outputs // self.kernel.channels)
-        slope = self.solution.hyperparameters.prior_matrix
-        found = np.empty((len(s), i, self.outputs))
-        for a in range(0, len(s), _BATCH):
-            each = np.repeat(s[a : a + _BATCH], i, axis=0)
-            rows = self._rows(each, np.tile(np.eye(i), (len(each) // i, 1)))
-            found[a : a + _BATCH] = (rows @ weights).reshape(-1, i, self.outputs)
-        return found.transpose(0, 2, 1) if slope is None else found.transpose(0, 2, 1) + slope
+        s = self._checked_many(queries)
+        batches = [self.inner.query.jacobians(s[a : a + BLOCK]) for a in range(0, len(s), BLOCK)]
+        return np.concatenate(batches) if batches else np.empty((0, self.outputs, self._dimensions))
 
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
@@ -166,7 +156,7 @@ class Predictor(Immutable):
         makes. Raises ValueError if a shape is another or a number is not finite.
         """
         s, v = self._one_query(query), self._checked("direction", direction)
-        return self.query.curvature(self.query.row(s), v)
+        return self.inner.query.curvature(self.inner.query.row(s), v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), split: how demonstrations vary, how far they are.
@@ -179,89 +169,99 @@ class Predictor(Immutable):
         c = self.kernel.channels
         z = self._spanned(Functionals(s)).T.reshape(len(s), c, len(self._spanned.pivots))
         residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
-        distance = nearest_positive_semidefinite(residual) * self.query.covariance_scale
+        distance = nearest_positive_semidefinite(residual) * self.inner.query.covariance_scale
         return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
 
     @property
     def kernel(self) -> Kernel:
         """The kernel k."""
-        return self.solution.hyperparameters.kernel
+        return self.inner.solution.hyperparameters.kernel
 
     @property
     def lambda_mean(self) -> float:
         """lambda of equation (9) [1 / (unit of the outputs)^2]."""
-        return self.solution.hyperparameters.lambda_mean
+        return self.inner.solution.hyperparameters.lambda_mean
 
     @property
     def lambda_covariance(self) -> float:
         """lambda of the covariance [1 / (unit of the outputs)^2]."""
-        return self.solution.hyperparameters.lambda_covariance
+        return self.inner.solution.hyperparameters.lambda_covariance
+
+    @property
+    def least_variance(self) -> float:
+        """Least variance of a via-point's values that rounding does not hide [unit of outputs^2].
+
+        A rate's, with a `VelocityKernel`, is 2 ell times that. `adapt` refuses smaller ones.
+        """
+        parameters, anywhere = self.inner.solution.hyperparameters, Functionals(np.zeros((1, self._dimensions)))
+        penalty = parameters.lambda_covariance
+        if self.representation == "low_rank":
+            penalty = min(penalty, parameters.lambda_mean)
+        return float(least_variances(parameters, anywhere, penalty)[0, 0])
 
     @property
     def prior_mean(self) -> Array | AffineMean:
         """(O,) [unit of the outputs] what the mean returns to off the inputs, or departs from."""
-        return self.solution.hyperparameters.prior_mean
+        return self.inner.solution.hyperparameters.prior_mean
 
     @property
     def prior_offset(self) -> Array:
         """(O,) [unit of the outputs] the prior mean at inputs of 0: all of a constant one."""
-        return self.solution.hyperparameters.prior_offset
+        return self.inner.solution.hyperparameters.prior_offset
 
     @property
     def outputs(self) -> int:
         """O, the number of outputs."""
-        return self.solution.hyperparameters.outputs
+        return self.inner.solution.hyperparameters.outputs
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
         """How the primitive is solved."""
-        return self.solution.representation
+        return self.inner.solution.representation
 
     @property
     def weights(self) -> Array:
         """Those of equation (8): alpha (N, O) of equation (9), or those of the low rank centres."""
-        return self.solution.weights
+        return self.inner.solution.weights
 
     @property
     def centres(self) -> Array:
         """(N, I) what the weights belong to: reference points that stay, and via-points."""
-        return self.solution.centres
+        return self.inner.solution.centres
 
     @property
     def error_bound(self) -> float:
-        """How far the mean can be from equation (9)'s at the points [unit of the outputs].
+        """Upper bound of the distance between the mean and equation (9)'s [unit of the outputs].
 
-        An upper bound: 0 for the dense solution; for the low rank one rigorous but for rounding,
-        and pessimistic by one to three orders.
+        It holds at any query, and is 0 for the dense solution. For the low rank it is 5 to 100
+        times the error itself. Far from the points the low rank errs most: where it predicts near
+        them, `error_bound_at_points` is the lower one.
         """
-        return self.solution.error_bound
+        return self.inner.solution.error_bounds.anywhere
 
-    @cached_property
-    def query(self) -> Query:
-        """What a single query reads, laid out for it."""
-        return Query.of(self.solution, self._count)
+    @property
+    def error_bound_at_points(self) -> float:
+        """As `error_bound`, at the reference points and via-points alone [unit of the outputs].
 
-    @cached_property
-    def compiled_query(self) -> CompiledQuery | None:
-        """The same as compiled loops, where Numba is installed and knows the kernel; else None."""
-        return CompiledQuery.of(self.query)
+        For the low rank it is 10 to 1000 times the error itself.
+        """
+        return self.inner.solution.error_bounds.at_points
 
     @cached_property
     def _spanned(self) -> Features:
-        known = self.solution.functionals
-        return Features.of(self.kernel, known, rank=len(known), tolerance=_RESIDUAL)[0]
+        return Features.spanning(self.kernel, self.inner.solution.functionals, tolerance=_RESIDUAL)
 
     @cached_property
     def _dimensions(self) -> int:
-        return int(self.solution.database.inputs.shape[1])
+        return int(self.inner.solution.database.inputs.shape[1])
 
     def _rows(self, queries: Array, directions: Array | None = None) -> Array:
         """k of M queries, or their derivatives, and what is known: (M C, R C)."""
-        return between(self.kernel, Functionals(queries, directions), self.solution.functionals)
+        return between(self.kernel, Functionals(queries, directions), self.inner.solution.functionals)
 
     def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
         """The mean (M, O) by compiled loops, and the last kernel row; None if they do not serve."""
-        compiled = self.compiled_query
+        compiled = self.inner.compiled_query
         if compiled is None or queries.ndim != 2 or queries.shape[1] != self._dimensions or len(queries) == 0:
             return None
         return compiled.mean(queries)

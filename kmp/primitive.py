@@ -5,16 +5,29 @@ The paper, sections II-B and II-C.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from kmp import named_arrays
 from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_kind, check_some, not_negative, numbers, one_of, positive, squared, whole
+from kmp.checks import (
+    Array,
+    brief,
+    check_kind,
+    check_some,
+    not_negative,
+    numbers,
+    one_of,
+    parts_of,
+    positive,
+    squared,
+    whole,
+)
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
@@ -22,25 +35,28 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import frozen
+from kmp.inner import Inner
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Predictor
-from kmp.solution import Solution, mean_of
-from kmp.solving import solved
+from kmp.solution import Solution, mean_of, resolved
+from kmp.solving import LARGE, solved
+
+_REACH_STEPS = 300  # distances at which a via-point's effect is looked at
+_FREE = 1e6  # [unit of the outputs / unit of the inputs] the deviation of a rate that may be any
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class KMP(Predictor, Plotted):
     """A skill: a reference database, the via-points in it, and its solution.
 
-    Made by `fit`, `adapt` and `from_arrays`. N points in all, I inputs, O outputs. Immutable, so
+    Made by `fit`, `adapt` and `load`. N points in all, I inputs, O outputs. Immutable, so
     that threads may share it. What is fitted depends on the database and the parameters alone, bit
     for bit, however the primitive came about; after `extended`, but for rounding.
     """
 
-    solution: Solution
-    changes: Changes
+    inner: Inner
     _base: KMP | None = None
 
     def __repr__(self) -> str:
@@ -75,9 +91,10 @@ class KMP(Predictor, Plotted):
 
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
         (4) on at most `rank` features of the kernel, which leave a share of at most
-        `rank_tolerance` of it at the inputs. "auto" is dense for few points or where the rank does
-        not suffice, and low rank for many. A rank that did not suffice is said in a `RankReached`
-        warning, with the accuracy lost.
+        `rank_tolerance` of it at the inputs. "auto" is low rank where that is the faster one: over
+        time from about 200 points on, for more inputs from 1500 numbers N O on, if the rank is low
+        and no digits are lost. A rank that did not suffice is said in a `RankReached` warning, with
+        the accuracy lost.
 
         Raises ValueError if there is no point, shapes do not agree, a number is not finite, a
         parameter is out of its range, or the equations cannot be solved to working precision.
@@ -99,24 +116,28 @@ class KMP(Predictor, Plotted):
         whole("rank", rank)
         if positive("rank_tolerance", rank_tolerance) >= 1:
             raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
-        database = Database(Functionals.checked(s, directions), reference)
-        return cls(solved(parameters, database, representation, rank, rank_tolerance), database.unchanged())
+        points = Functionals.checked(s, directions)
+        database = Database(points, resolved(parameters, points, reference))
+        return cls(Inner.of_base(solved(parameters, database, representation, rank, rank_tolerance)))
 
     def adapt(
         self,
         inputs: ArrayLike,
         desired: Gaussians,
         *,
-        tolerance: float,
+        tolerance: float | None = None,
         directions: ArrayLike | None = None,
     ) -> KMP:
         """A new primitive that also goes through desired points: inputs (V, I), V normals.
 
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
         point of the *base's* reference takes the place of its nearest one (of all, where several
-        are equally near); any other is inserted. The order of the desired points does not matter.
-        Earlier via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the
-        base's, so that teaching here changes nothing elsewhere.
+        are equally near); any other is inserted. None is `base.spacing / 2`: evenly spaced points
+        are then replaced one by one. The order of the desired points does not matter. Earlier
+        via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the base's,
+        so that teaching here changes nothing elsewhere.
+
+        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows.
 
         Where a row of `directions` (V, I) [unit of the inputs] is not zero, that normal is of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
@@ -132,10 +153,13 @@ class KMP(Predictor, Plotted):
         via = numbers("inputs", inputs, "V", self._dimensions)
         check_gaussians("desired", desired)
         check_pairs("desired", via, desired, self.outputs)
+        if tolerance is None:
+            tolerance = self.base.spacing / 2
         not_negative("tolerance", tolerance)
         points = Functionals.checked(via, directions)
+        desired = resolved(self.inner.solution.hyperparameters, points, desired)
         adapted = self._through(points, desired, tolerance)
-        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
@@ -155,7 +179,7 @@ class KMP(Predictor, Plotted):
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
         adapted = self._through(points, desired, 0.0)
-        warn_of_missed(desired, mean_of(adapted.solution, points), self.kernel.channels)
+        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
@@ -163,7 +187,8 @@ class KMP(Predictor, Plotted):
 
         They hold at the inputs that they are given at; between them the mean may cross a little, so
         give them closer than the kernel is long. Later via-points obey them, and `base` is without.
-        The covariance is as without. For the dense representation.
+        The covariance is as without. The constraints need the dense representation: a low rank
+        primitive of up to 6000 numbers N O is solved anew for them.
 
         Raises ValueError if shapes do not agree, or the constraints cannot be met together.
         """
@@ -174,23 +199,30 @@ class KMP(Predictor, Plotted):
         ):
             if given != needed:
                 raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
-        solution: Solution = self.solution
+        solution: Solution = self.inner.solution
         if isinstance(solution, Constrained):
             constraints = solution.constraints.joined(constraints)
             solution = solution.solution
         if not isinstance(solution, Dense):
-            raise ValueError('constraints: representation "low_rank" given, "dense" needed; fit the primitive so.')
-        return KMP(Constrained(solution, constraints).solved(), self.changes, self.base)
+            base = self.base.inner.solution.database
+            if (size := base.reference.mean.size) > LARGE:
+                raise ValueError(
+                    f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} or the dense "
+                    'representation needed. Fit fewer points, or with representation="dense".'
+                )
+            dense = KMP(Inner.of_base(Dense(solution.hyperparameters, base)))
+            return self._on(dense).constrained(constraints)
+        return self._changed(Constrained(solution, constraints), self.inner.changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        points = self.base.solution.database.functionals
+        points, parameters = self.base.inner.solution.database.functionals, self.inner.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
-        database, parameters = Database(points, reference), self.solution.hyperparameters
-        fitted = KMP(solved(parameters, database, self.representation, RANK, TOLERANCE), database.unchanged())
+        database = Database(points, resolved(parameters, points, reference))
+        fitted = KMP(Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE)))
         return self._on(fitted)
 
     def extended(self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None) -> KMP:
@@ -207,65 +239,145 @@ class KMP(Predictor, Plotted):
         check_some("inputs", added)
         check_gaussians("reference", reference)
         check_pairs("reference", added, reference, self.outputs)
-        more = Database(Functionals.checked(added, directions), reference)
-        before: Solution = self.base.solution
+        before: Solution = self.base.inner.solution
+        points = Functionals.checked(added, directions)
+        more = Database(points, resolved(before.hyperparameters, points, reference))
         database = before.database.joined(more)
         grown = (
             before.extended(database)
             if isinstance(before, Dense)
             else solved(before.hyperparameters, database, self.representation, RANK, TOLERANCE)
         )
-        return self._on(KMP(grown, database.unchanged()))
-
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
-        return named_arrays.to_arrays(self.base.solution, self.changes, self.solution)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> KMP:
-        """The primitive that `to_arrays` gave these arrays for, with its very weights.
-
-        Other names are left alone. The factors are made when `predict` or `adapt` first asks for
-        them, and come out the same bit for bit, given the same libraries and kind of processor.
-        Raises ValueError if an array is missing, or the arrays do not go together.
-        """
-        base, changes, solution = named_arrays.from_arrays(arrays)
-        unadapted = cls(base, base.database.unchanged())
-        return unadapted if solution is base else cls(solution, changes, unadapted)
+        return self._on(KMP(Inner.of_base(grown)))
 
     def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
         if len(points) == 0:
             return self
-        before = self.changes
-        nearest = self.base.solution.database.nearest(points, tolerance, self.kernel.period)
+        before = self.inner.changes
+        nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
         changes = Changes(
             frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
             Functionals.concatenated([before.functionals, points]),
             Gaussians.concatenated([before.points, desired]),
         )
-        return KMP(self.solution.adapted(changes).solved(), changes, self.base)
+        return self._changed(self.inner.solution.adapted(changes), changes, self.base)
 
     def _on(self, fitted: KMP) -> KMP:
         """This primitive's via-points and constraints on another base."""
         if self is self.base:
             return fitted
-        changed: Solution = fitted.solution.adapted(self.changes) if len(self.via_inputs) else fitted.solution
-        before: Solution = self.solution
+        return self._changed(self._solution_on(fitted), self.inner.changes, fitted)
+
+    def _solution_on(self, base: KMP) -> Solution:
+        """The solution of another base with this primitive's via-points and constraints."""
+        before: Solution = self.inner.solution
+        changed: Solution = base.inner.solution
+        if len(self.via_inputs):
+            changed = changed.adapted(self.inner.changes)
         if isinstance(before, Constrained) and isinstance(changed, Dense):
-            changed = Constrained(changed, before.constraints)
-        return KMP(changed.solved(), self.changes, fitted)
+            return Constrained(changed, before.constraints)
+        return changed
 
     def to_plot(self) -> Shown:
         """Its references and via-points that are values."""
-        known, count = self.solution.database, len(self.inputs) - len(self.via_inputs)
+        known, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
         values = known.functionals.values
         before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
         references, via = (Points(self.inputs[part], known.reference.take(part)) for part in (before, taught))
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
-    @property
-    def _count(self) -> int:
-        return len(self.base.inputs)
+    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
+        """Writes the primitive, and the units of its numbers, to an .npz file: as `kmp.save` does.
+
+        Raises OSError if the file cannot be written.
+        """
+        from kmp.storage import save
+
+        save(path, self, input_unit=input_unit, output_unit=output_unit)
+
+    @classmethod
+    def load(cls, path: str | Path) -> KMP:
+        """The primitive that `save` wrote; `kmp.load` gives its units too.
+
+        Raises OSError if the file cannot be read, and ValueError if it holds no primitive.
+        """
+        from kmp.storage import load
+
+        return load(path).primitive
+
+    @staticmethod
+    def _changed(solution: Solution, changes: Changes, base: KMP) -> KMP:
+        """The primitive of a base with these changes, solved."""
+        return KMP(Inner(solution.solved(), changes, base.inner.count), base)
+
+    def with_lambda_covariance(self, lambda_covariance: float) -> KMP:
+        """This primitive with another lambda of the covariance: the mean stays, bit for bit.
+
+        A larger lambda_covariance makes the predicted deviations smaller far from the points.
+        Raises ValueError if it is not above 0, or the equations cannot be solved with it.
+        """
+        other = positive("lambda_covariance", lambda_covariance)
+        parameters = replace(self.inner.solution.hyperparameters, lambda_covariance=other)
+        before = self.base.inner.solution
+        base = KMP(Inner.of_base(before.with_hyperparameters(parameters).with_weights(before.weights).solved()))
+        if self is self.base:
+            return base
+        weighted = self._solution_on(base).with_weights(self.inner.solution.weights)
+        return self._changed(weighted, self.inner.changes, base)
+
+    def adapt_many(
+        self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
+    ) -> tuple[KMP, ...]:
+        """A new primitive for each of several pairs of inputs (V, I) and V normals, as by `adapt`.
+
+        Each is adapted from this primitive, not from the one before it: several goals to choose
+        from, several people, several rollouts. Raises ValueError as `adapt` does.
+        """
+        pairs = parts_of("points", points)
+        for i, one in enumerate(pairs):
+            if not (isinstance(one, (tuple, list)) and len(one) == 2):
+                raise ValueError(f"points[{i}]: {brief(one)} given, a pair of inputs (V, I) and V normals needed.")
+        return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
+
+    def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
+        """Distances (I,) [unit of the inputs] up to which a via-point at `query` (I,) matters.
+
+        An exact via-point is inserted at the query (I,), some distance off the mean there. Along
+        each input, either way and within the range of the reference points, this is the largest
+        distance at which the mean moves by at least `share` of that. It depends on ell, on lambda
+        and on how certain the reference is.
+
+        Raises ValueError if the shape is another, a number is not finite, or the share is not
+        between 0 and 1.
+        """
+        s = self._one_query(query)
+        if not 0 < positive("share", share) < 1:
+            raise ValueError(f"share is {share:g}, and must be between 0 and 1.")
+        values = self.outputs // self.kernel.channels
+        desired = Gaussians.of(self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs])
+        point = Functionals(s[None])
+        adapted = self._through(point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0)
+        found = np.empty(len(s))
+        for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
+            r = np.linspace(0.0, farthest, _REACH_STEPS)
+            path = np.tile(s, (2, len(r), 1))
+            path[:, :, i] += [r, -r]
+            moved = np.linalg.norm(
+                (adapted.mean(flat := path.reshape(-1, len(s))) - self.mean(flat))[:, :values], axis=1
+            )
+            matters = moved.reshape(2, -1) >= share * moved[0]
+            if self.kernel.period is None:  # beyond the data the mean is an extrapolation
+                matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (path[:, :, i] <= self.inputs[:, i].max())
+            found[i] = r[matters.any(axis=0)].max(initial=0.0)
+        return found
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance from a point of the reference to its nearest other one [unit of inputs].
+
+        Points that are derivatives, or equal to another, are left out; 0 where there is one point.
+        """
+        return self.inner.solution.database.spacing(self.kernel.period)
 
     @property
     def base(self) -> KMP:
@@ -275,27 +387,35 @@ class KMP(Predictor, Plotted):
     @property
     def inputs(self) -> Array:
         """(N, I) the reference points: the base's that were not replaced, then the via-points."""
-        return self.solution.database.inputs
+        return self.inner.solution.database.inputs
 
     @property
     def reference(self) -> Gaussians:
         """The N reference points."""
-        return self.solution.database.reference
+        return self.inner.solution.database.reference
 
     @property
     def via_inputs(self) -> Array:
         """(V, I) where the via-points are."""
-        return self.changes.inputs
+        return self.inner.changes.inputs
 
     @property
     def via_directions(self) -> Array:
         """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
-        return self.changes.functionals.along
+        return self.inner.changes.functionals.along
 
     @property
     def via_points(self) -> Gaussians:
         """The V via-points."""
-        return self.changes.points
+        return self.inner.changes.points
+
+
+def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:
+    """Distances (I,) along each input, at which the kernel has fallen to exp(-9); half a period."""
+    if kernel.period is not None:
+        return np.full(inputs, kernel.period / 2)
+    scale, stretch = kernel.coordinates(inputs)
+    return np.asarray(3.0 / (np.sqrt(scale) * stretch))
 
 
 def checked_primitive(value: object, name: str = "primitive") -> KMP:

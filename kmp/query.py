@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kmp.checks import Array
-from kmp.functionals import Derivatives
+from kmp.functionals import Derivatives, Functionals
 from kmp.immutable import Immutable, frozen
-from kmp.kernel import Kernel
+from kmp.kernel import GaussianKernel, Kernel, between
 from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.solution import Solution
 
@@ -115,6 +115,33 @@ class Query(Immutable):
         found = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
         found = found if self.unstretched else found * self.stretch
         return found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:]
+
+    def jacobians(self, queries: Array) -> Array:
+        """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
+        functionals, kernel, i = self.solution.functionals, self.kernel, len(self.stretch)
+        if isinstance(kernel, GaussianKernel) and self.derivatives is None:
+            # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. Differences lose
+            # few digits, as the origin is in the midst of the centres.
+            found = between(kernel, Functionals(queries), functionals) @ self._moments
+            x = queries * self.stretch - self._origin
+            pulls, moments = found[:, : self.weights.shape[1], None], found[:, self.weights.shape[1] :]
+            slopes = (pulls * x[:, None, :] - moments.reshape(len(x), -1, i)) * (-2 * self.scale * self.stretch)
+        else:
+            along = Functionals(np.repeat(queries, i, axis=0), np.tile(np.eye(i), (len(queries), 1)))
+            found = between(kernel, along, functionals) @ self.weights
+            slopes = found.reshape(len(queries), i, -1).transpose(0, 2, 1)
+        return slopes if self.prior_mean.shape[1] == 1 else slopes + self.prior_mean[:, 1:]
+
+    @cached_property
+    def _origin(self) -> Array:
+        """(I,) the mean of the centres, in the kernel's coordinates."""
+        return frozen(np.asarray(self.centres.mean(axis=0)))
+
+    @cached_property
+    def _moments(self) -> Array:
+        """(R, O + O I) the weights, and their products with the centres, from the origin."""
+        products = self.weights[:, :, None] * (self.centres - self._origin)[:, None, :]
+        return frozen(np.hstack([self.weights, products.reshape(len(products), -1)]))
 
     def curvature(self, row: KernelRow, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_some, not_negative, numbers, pair, parts_of, real
+from kmp.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of, real
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, fused_mean
 from kmp.gmm import GaussianMixture
 from kmp.hyperparameters import checked_kernel
@@ -74,7 +74,7 @@ class CoordinateFrame(Immutable):
         check_some("offset", offset)
         matrix = numbers("matrix", self.matrix, len(offset), len(offset))
         if np.linalg.cond(matrix) > 1e12:
-            raise ValueError(f"matrix: {matrix.tolist()} given, and it must have an inverse.")
+            raise ValueError(f"matrix: {brief(matrix)} given, and it must have an inverse.")
         object.__setattr__(self, "offset", offset)
         object.__setattr__(self, "matrix", matrix)
 
@@ -147,7 +147,7 @@ class LocalKMP(Immutable, Plotted):
         _check_frames("frames", self.frames)
         needed = [primitive.outputs for primitive in self.primitives]
         if (given := [len(frame.offset) for frame in self.frames]) != needed:
-            raise ValueError(f"frames: over {given} outputs given, over {needed} needed.")
+            raise ValueError(f"frames: over {brief(given)} outputs given, over {brief(needed)} needed.")
 
     @classmethod
     def learn(
@@ -175,7 +175,7 @@ class LocalKMP(Immutable, Plotted):
         counts = [_check_frames(f"frames[{h}]", one) for h, one in enumerate(parts_of("frames", frames))]
         if len(counts) != len(demonstrations) or len(set(counts)) != 1:
             count = len(demonstrations)
-            raise ValueError(f"frames: {counts} given for {count} demonstrations, as many for each needed.")
+            raise ValueError(f"frames: {brief(counts)} given for {count} demonstrations, as many for each needed.")
         where = numbers("inputs", inputs, "N", "I")
         data = [pair(f"demonstrations[{h}]", one) for h, one in enumerate(demonstrations)]
         primitives = []
@@ -226,14 +226,15 @@ class LocalKMP(Immutable, Plotted):
         """The mean (M, O) [unit of the outputs] of `predict`. Raises ValueError as that does."""
         return self.predict(queries).mean
 
-    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float) -> LocalKMP:
+    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float | None = None) -> LocalKMP:
         """A new skill through desired points (V, I), V normals in the world's coordinates.
 
         They are mapped into each frame, where `tolerance` [unit of the inputs] is that of
         `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
-        not_negative("tolerance", tolerance)
+        if tolerance is not None:
+            not_negative("tolerance", tolerance)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
         pairs = zip(self.frames, self.primitives, strict=True)
         adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)

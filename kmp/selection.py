@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -30,6 +31,11 @@ _LAMBDAS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # over the mean variance of the refere
 _OF_MEAN = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3, 1e4, 1e5)  # lambda_c over lambda
 _STEP = 4.0  # of the search around the best
 _SWEEPS = 2
+_AS_GOOD = 1.03  # times the least RMSE: among these the shortest lengths are taken
+_AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with each of these
+_SHORTER = 2.0 ** np.arange(1, 9)  # times the best ell, that are tried for it, up to the last of _ELLS
+_ROUNDED = 1 + 1e-9
+_PLACES = 9  # reference points at which the reach of a via-point is measured
 _HELD_OUT = 200  # points of a demonstration that are predicted
 
 
@@ -49,7 +55,10 @@ class Score(Immutable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Learned(Immutable):
-    """A primitive, the mixture of its reference, and the scores of all that was tried."""
+    """A primitive, the mixture of its reference, and the scores of all that was tried.
+
+    The primitive's lengths are the shortest ones whose RMSE is within 3 % of the best score's.
+    """
 
     primitive: KMP
     mixture: GaussianMixture
@@ -58,15 +67,31 @@ class Learned(Immutable):
     regression_rmse: float
     """[unit of the outputs] of mixture regression without a kernel; nan if none was tried."""
 
+    @cached_property
+    def reach(self) -> Array:
+        """(I,) [unit of the inputs] how far a via-point matters, along each input.
+
+        The median of `KMP.via_point_reach` over some of the reference points: up to there, the mean
+        moves by at least a tenth of what it moves at the via-point. For another reach, give `learn`
+        a kernel: a larger ell makes it shorter.
+        """
+        base = self.primitive.base
+        places = base.inputs[np.linspace(0, len(base.inputs) - 1, _PLACES).round().astype(int)]
+        return frozen(np.median([base.via_point_reach(one) for one in np.unique(places, axis=0)], axis=0))
+
     def report(self, count: int = 10) -> str:
-        """The best `count` of the scores as a table."""
+        """The best `count` of the scores as a table, then what was chosen and its reach."""
         lines = [f"{'ell':>40} {'lambda':>10} {'lambda_c':>10} {'RMSE':>10} {'-log lik.':>10}"]
         for one in self.scores[: whole("count", count)]:
             ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(one.ell))
             other = "" if one.lambda_covariance is None else f"{one.lambda_covariance:.3g}"
             likelihood = "" if one.negative_log_likelihood is None else f"{one.negative_log_likelihood:.3f}"
             lines.append(f"{ell:>40} {one.lambda_mean:>10.3g} {other:>10} {one.rmse:>10.4g} {likelihood:>10}")
-        return "\n".join([*lines, f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}"])
+        lines.append(f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}")
+        kernel, penalty = self.primitive.kernel, self.primitive.lambda_mean
+        reach = " ".join(f"{one:.3g}" for one in self.reach)
+        lines.append(f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it")
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -165,8 +190,9 @@ def learn(
     where I is 1), or "shown", the demonstrations' own. "auto": drawn where I is 1; else those
     with the least RMSE on what is left out, or shown where nothing is left out.
 
-    A kernel and a lambda that are not given are chosen by the `criterion`. "left-out": those with
-    the least RMSE on the demonstration that is left out, over all of them; then a lambda of the
+    A kernel and a lambda that are not given are chosen by the `criterion`. "left-out": the shortest
+    lengths whose RMSE on the demonstration that is left out, over all of them, is within 3 % of the
+    least, so that a via-point changes little else (`Learned.reach`); then a lambda of the
     covariance that is not given is the one with the least negative log likelihood there.
     "likelihood": those of the greatest marginal likelihood of the reference (Rasmussen and Williams
     2006, section 5.4.1), for normals of the covariance s^2 (K + lambda Sigma), s^2 the likeliest;
@@ -270,7 +296,11 @@ class _Search:
     one_length: bool
 
     def best(self, choices: Sequence[_Folds]) -> tuple[_Folds, Kernel, float, list[Score]]:
-        """A grid for each choice of folds; for the best of them, steps along each parameter."""
+        """A grid for each choice of folds; for the best of them, steps along each parameter.
+
+        Of the lengths that predict as well as the best, the shortest are taken: a via-point then
+        changes no more of the skill than the demonstrations ask for.
+        """
         grids: list[list[Score]] = [[] for _ in choices]
         found = [self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)]
         i = min(range(len(choices)), key=lambda i: found[i])
@@ -283,16 +313,36 @@ class _Search:
                 for step in (np.log(_STEP), -np.log(_STEP)):
                     other = tuple(value + step * (n in some) for n, value in enumerate(best.parameters))
                     best = min(best, *self._tried(folds, other[:-1], [other[-1]], scores))
-        return folds, self._kernel(folds, best.parameters[:-1]), self._penalty(best.parameters[-1]), scores
+        chosen = self._shortest(folds, best, scores)
+        return folds, self._kernel(folds, chosen.parameters[:-1]), self._penalty(chosen.parameters[-1]), scores
+
+    def _shortest(self, folds: _Folds, best: _Tried, scores: list[Score]) -> _Tried:
+        """The parameters of the shortest lengths whose RMSE is within 3 % of the best."""
+        chosen = best
+        if self.kernel is not None:
+            return chosen
+        *lengths, penalty = best.parameters
+        last = max(_ELLS) * 0.5 / self._spread(folds)  # beyond it, a via-point is a spike
+        penalties = [0.0] if self.lambda_mean else [penalty + np.log(one) for one in _AROUND]
+        for factor in _SHORTER[(_SHORTER * np.exp(lengths)[:, None] <= _ROUNDED * last[:, None]).all(axis=0)]:
+            found = min(self._tried(folds, tuple(one + np.log(factor) for one in lengths), penalties, scores))
+            if found.rmse <= _AS_GOOD * best.rmse:
+                chosen = found
+        return chosen
 
     def _grid(self, folds: _Folds, scores: list[Score]) -> _Tried:
-        variances = _variances(np.concatenate([fold.held_inputs for fold in folds.each]))
+        variances = self._spread(folds)
         traces = [np.trace(fold.reference.covariance, axis1=1, axis2=2).mean() for fold in folds.each]
         variance = float(np.mean(traces)) / folds.each[0].reference.outputs
         lengths = [0.0] if self.kernel else np.log(_ELLS)
         penalties = [0.0] if self.lambda_mean else np.log(_LAMBDAS) - np.log(variance)
         start = np.log(0.5 / variances)
         return min(one for n in lengths for one in self._tried(folds, tuple(start + n), penalties, scores))
+
+    @staticmethod
+    def _spread(folds: _Folds) -> Array:
+        """The variances (I,) of the inputs."""
+        return _variances(np.concatenate([fold.held_inputs for fold in folds.each]))
 
     def _tried(
         self, folds: _Folds, lengths: tuple[float, ...], penalties: Sequence[float], scores: list[Score]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, Self
+from typing import Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,24 @@ from numpy.typing import NDArray
 from kmp.checks import Array
 from kmp.database import Changes, Database
 from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, unchecked
 from kmp.hyperparameters import Hyperparameters
 from kmp.kernel import between, variances
 
+BLOCK = 256  # queries at once
 _RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
+
+
+_ROUND_UP = 1.01  # what two digits in a message may lack
+
+
+class ErrorBounds(NamedTuple):
+    """Upper bounds of the distance between a mean and equation (9)'s [unit of the outputs]."""
+
+    at_points: float
+    """At the reference points."""
+    anywhere: float
+    """At any query. Of a kernel with rates, the largest of the two channels' units counts."""
 
 
 class Solution(Protocol):
@@ -47,8 +61,8 @@ class Solution(Protocol):
         """w_r (R, O)."""
 
     @property
-    def error_bound(self) -> float:
-        """How far the mean can be from equation (9)'s at the points [unit of the outputs]."""
+    def error_bounds(self) -> ErrorBounds:
+        """Upper bounds of the distance between the mean and equation (9)'s."""
 
     def solved(self) -> Self:
         """This solution, its weights and factors made. Raises ValueError if that fails."""
@@ -65,6 +79,9 @@ class Solution(Protocol):
     def adapted(self, changes: Changes) -> Solution:
         """The solution of the database as it was before any adaptation, with these changes."""
 
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Solution:
+        """The solution of this database with other parameters: of a base, and not yet solved."""
+
     def with_weights(self, weights: Array) -> Self:
         """This solution with weights (R, O) that were stored, so that they need not be made."""
 
@@ -78,11 +95,18 @@ def mean_at(solution: Solution, queries: Array) -> Array:
 
 
 def mean_of(solution: Solution, queries: Functionals) -> Array:
-    """Equation (8) for M queries, derived where a query is a derivative: (M, O)."""
+    """Equation (8) for M queries, derived where a query is a derivative: (M, O).
+
+    In blocks of queries, whose kernel rows stay in the processor's cache.
+    """
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
-    expansion = (between(parameters.kernel, queries, solution.functionals) @ weights).reshape(-1, parameters.outputs)
-    return np.asarray(expansion + parameters.prior_at(queries))
+    found = np.empty((len(queries) * parameters.kernel.channels, parameters.channel_outputs))
+    for a in range(0, len(queries), BLOCK):
+        some = queries.take(slice(a, a + BLOCK)) if len(queries) > BLOCK else queries
+        rows = between(parameters.kernel, some, solution.functionals)
+        found[a * parameters.kernel.channels :][: len(rows)] = rows @ weights
+    return np.asarray(found.reshape(-1, parameters.outputs) + parameters.prior_at(queries))
 
 
 def check_resolved(
@@ -91,19 +115,55 @@ def check_resolved(
     *,
     first: int = 0,
     name: Literal["lambda_mean", "lambda_covariance"] = "lambda_covariance",
+    both: bool = False,
 ) -> None:
     """Raises ValueError where rounding would hide what lambda Sigma adds to k(s, s).
 
-    The points are numbered from the `first` on; `name` says which lambda.
+    The points are numbered from the `first` on; `name` says which lambda. The least variance that
+    the message names is for that lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
-    scale = np.sqrt(variances(parameters.kernel, points.functionals)).repeat(parameters.channel_outputs, axis=1)
-    covariance = points.reference.covariance / (scale[:, :, None] * scale[:, None, :])
-    least = penalty * np.linalg.eigvalsh(covariance)[:, 0]
+    least = penalty * _least_shares(parameters, points)
     for n in np.flatnonzero(least < _RESOLVED)[:1]:
         enough = penalty * _RESOLVED / max(least[n], 1e-300)
+        smaller = min(parameters.lambda_mean, parameters.lambda_covariance) if both else penalty
+        accepted = least_variances(parameters, points.functionals.take(slice(n, n + 1)), smaller)[0]
+        of = ("",) if len(accepted) == 1 else (" of the values", " of their rates")
+        named = " and ".join(f"{one:.2g}{what}" for one, what in zip(accepted, of, strict=True))
         raise ValueError(
             f"The covariance at point {first + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} of "
-            f"k(s, s) there, at least {_RESOLVED:g} needed. Give the point a greater variance, or the primitive a "
-            f"{name} of at least {enough:.3g}."
+            f"k(s, s) there, at least {_RESOLVED:g} needed. Give the point a variance of at least {named} "
+            f"(Gaussians.of(mean, deviation=0) takes the least), or the primitive a {name} of at least {enough:.3g}."
         )
+
+
+def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
+    """Whether both lambda Sigma are above the rounding of k(s, s)."""
+    penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
+    return bool((penalty * _least_shares(parameters, points) >= _RESOLVED).all())
+
+
+def least_variances(parameters: Hyperparameters, points: Functionals, penalty: float) -> Array:
+    """The least variances (N, C) of each channel at N points that rounding does not hide."""
+    return np.asarray(variances(parameters.kernel, points) * (_RESOLVED / penalty) * _ROUND_UP)
+
+
+def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussians) -> Gaussians:
+    """The normals of N points, with the least variances in place of those that are exact."""
+    exact = normals.exact
+    if not exact.any():
+        return normals
+    penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
+    least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
+    covariance = normals.covariance.copy()
+    n, o = np.nonzero(exact)
+    covariance[n, o, :] = covariance[n, :, o] = 0.0
+    covariance[n, o, o] = least[n, o]
+    return unchecked(normals.mean, covariance)
+
+
+def _least_shares(parameters: Hyperparameters, points: Database) -> Array:
+    """The least eigenvalue (N,) of each Sigma, as a share of k(s, s) of its channel."""
+    scale = np.sqrt(variances(parameters.kernel, points.functionals)).repeat(parameters.channel_outputs, axis=1)
+    covariance = points.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+    return np.asarray(np.linalg.eigvalsh(covariance)[:, 0])

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import check_kind
+from kmp import named_arrays
+from kmp.checks import brief, check_kind
 from kmp.primitive import KMP
 from kmp.value_arrays import KIND, from_arrays, to_arrays
 
@@ -43,7 +44,7 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
     return sums.hexdigest()
 
 
-def save(path: str | Path, value: object, *, input_unit: str, output_unit: str) -> None:
+def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: str = "") -> None:
     """Writes a primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
 
     Or any other value of this package. The file has this very name. Raises OSError if the file
@@ -60,7 +61,7 @@ def save(path: str | Path, value: object, *, input_unit: str, output_unit: str) 
         "input_unit": np.array(input_unit),
         "output_unit": np.array(output_unit),
     }
-    arrays: dict[str, Any] = units | (value.to_arrays() if isinstance(value, KMP) else to_arrays(value))
+    arrays: dict[str, Any] = units | (named_arrays.to_arrays(value) if isinstance(value, KMP) else to_arrays(value))
     with Path(path).open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
@@ -82,11 +83,11 @@ def load(path: str | Path) -> Stored:
     if "kmp_format" not in arrays:
         raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged.")
     if (given := arrays["kmp_format"].tolist()) != _FORMAT:
-        raise ValueError(f"{path}: format {given} given, {_FORMAT} needed.")
+        raise ValueError(f"{path}: format {brief(given)} given, {_FORMAT} needed.")
     if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
         raise ValueError(f"{path}: the numbers are not those that were saved: their checksum is another.")
     try:
-        value = from_arrays(arrays) if KIND in arrays else KMP.from_arrays(arrays)
+        value = from_arrays(arrays) if KIND in arrays else named_arrays.from_arrays(arrays)
         return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

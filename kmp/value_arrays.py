@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kmp import named_arrays
 from kmp.affine_mean import AffineMean
 from kmp.constraints import LinearConstraints
 from kmp.correlation import Correlation, Improvement
@@ -45,7 +46,7 @@ def to_arrays(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
         raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
     arrays = {prefix + KIND: np.array(kind)}
     if isinstance(value, KMP):
-        return arrays | {prefix + name: array for name, array in value.to_arrays().items()}
+        return arrays | {prefix + name: array for name, array in named_arrays.to_arrays(value).items()}
     for name in _fields(value):
         arrays |= _of_field(getattr(value, name), prefix + name)
     return arrays
@@ -55,9 +56,11 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
     """The value that `to_arrays` gave these arrays for. Raises ValueError if there is none."""
     kind = _KINDS.get(str(arrays[prefix + KIND]))
     if kind is None:
-        raise ValueError(f"{prefix}{KIND}: {arrays[prefix + KIND]} given, one of {', '.join(_KINDS)} needed.")
+        raise ValueError(f"{prefix}{KIND}: {arrays[prefix + KIND]!s:.60} given, one of {', '.join(_KINDS)} needed.")
     if kind is KMP:
-        return KMP.from_arrays({name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)})
+        return named_arrays.from_arrays(
+            {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}
+        )
     return kind(**{name: _field(arrays, prefix + name) for name in _fields(kind)})
 
 

@@ -5,6 +5,12 @@ from __future__ import annotations
 from service import one_blas_thread  # noqa: F401
 
 # isort: split
+import signal
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback, until it is watched for
+
+# isort: split
 import sys
 
 from service import interrupt

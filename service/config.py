@@ -21,23 +21,28 @@ from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
+REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
+SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 Cell = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A[^/*$?#\s\0]+(/[^/*$?#\s\0]+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces and * $ ? #,"},
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
     ),
 ]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
 
-BESIDE = (("arm", "urdf"), ("network", "certificate"), ("network", "zenoh_config"))  # the configuration, if relative
-PATHS = (("files", "state"), ("files", "record"), ("files", "skills"), *BESIDE)
+# Relative paths start from the folder of the configuration, or from the current folder.
+BESIDE = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
 FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+PRISMATIC_M = 0.5  # what a tolerance of 1 rad is for a prismatic joint: the tool moves as far on a lever of 0.5 m
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,34 +52,34 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class HandSettings(Section, frozen=True):
     """How a tracker's poses become hand positions in frame `base`."""
 
-    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # the tracker's; `base` is taken too, as it is
-    unit: Literal["m", "cm", "mm"] = "m"  # of the tracker's positions
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # applied after the unit
-    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # each axis; a start, it is estimated
-    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without a sample of a hand it holds
-    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight
-    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is on its way
-    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # in which a hand comes to be still
-    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] off where it is expected: a hand has jumped ...
-    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] ... after a pause farther: reaches are so fast
-    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # until hands that changed places are believed
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
+    unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
+    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is in motion
+    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # a slow hand counts as still after this time
+    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
+    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
+    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
 
 
 class ToolSettings(Section, frozen=True):
     """The tool: where it sits on the tool plate, and how fast it may move."""
 
-    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # [m] the tool's point and turn, seen from the plate
-    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] as a norm
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] as a norm; at most 12.5 * max_speed
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] as a norm; at most 500 * max_speed
-    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] measured
-    orientation: Literal["direction", "full"] = "direction"  # what the arm follows: where the tool's +z points, or all
-    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] of the tool
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
+    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
+    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
+    orientation: Literal["direction", "full"] = "direction"  # follow the direction of the tool's +z, or all axes
+    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
-    radius: Positive = 0.02  # [m] of the tool between plate and tool point, where these are apart
-    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] of jerk² beside error², at least
-    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # more of it lags less and passes a stop by more
-    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # of the tool's way to the hands', between via-points
+    radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
+    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
+    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
     @property
     def acceleration(self) -> float:
@@ -109,7 +114,7 @@ class ArmSettings(Section, frozen=True):
     following it is a fault.
     """
 
-    urdf: str = ""  # a file; empty: the shipped Barrett WAM
+    urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
     packages: tuple[
         str, ...
     ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
@@ -123,15 +128,20 @@ class ArmSettings(Section, frozen=True):
         -0.4273,
         -1.0823,
         0.0,
-    )  # [rad] the null space's and the assumed one
-    link_radius: Positive = 0.07  # [m] of links without a collision shape, from their joint to the next
-    fault_error_rad: Positive = 0.1  # between a joint as measured and as commanded
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # without joint states: a fault while it moves
+    )  # [rad] preferred posture, and the start with `assumed`
+    link_radius: Positive = 0.07  # [m] radius of links without a collision shape
+    fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm without joint states is at fault
 
 
 class JointSettings(Section, frozen=True):
     """The arm's joints in chain order, and the limits that no command ever leaves [rad, rad/s,
-    rad/s², rad/s³].
+    rad/s², rad/s³], for prismatic (sliding) joints [m, m/s, m/s², m/s³].
+
+    A continuous joint has the limits ±6000 rad unless narrower ones are given. It is commanded in
+    the turn in which `joints/state` reports it when the arm becomes ready, and onward from there;
+    states that wrap at ±pi and states that count turns are both accepted. Tolerances in rad that
+    the service applies to every joint are half as many metres for a prismatic one.
     """
 
     names: tuple[str, ...] = (  # as `joints/state` and `joints/command` name them
@@ -143,11 +153,27 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
+    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()  # from the URDF; empty: all revolute
     lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
     upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
     velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
     acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)  # [rad/s²]
     jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)  # [rad/s³]
+
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+        return self.kinds or ("revolute",) * len(self.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each joint's position."""
+        return tuple("m" if kind == "prismatic" else "rad" for kind in self.every_kind)
+
+    @property
+    def per_rad(self) -> tuple[float, ...]:
+        """How much of each joint's unit a tolerance of 1 rad stands for."""
+        return tuple(PRISMATIC_M if kind == "prismatic" else 1.0 for kind in self.every_kind)
 
 
 class Reach(Section, frozen=True):
@@ -155,11 +181,11 @@ class Reach(Section, frozen=True):
     table [m].
     """
 
-    centre: Point = (0.0, 0.0, 0.346)  # of the shell: where the arm's first axes meet
-    inner: Positive = 0.35  # [m] radius of the shell
-    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] radius of the shell
-    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] in front of the base plate
-    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] above the table
+    centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
+    inner: Positive = 0.35  # [m] inner radius of the shell
+    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] outer radius of the shell
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] least x, in front of the base plate
+    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] least z, above the table
 
 
 class People(Section, frozen=True):
@@ -171,14 +197,14 @@ class People(Section, frozen=True):
     not seen for longer is taken to come ever faster, by 5 m/s², up to `unknown_speed`.
     """
 
-    radius: Positive = 0.04  # [m] of hand and forearm
-    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] from the tracked point toward the elbow
-    toward_elbow: Point = (1.0, 0.0, 0.0)  # frame base: the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] errors of tracker and arm are mm; fingers reach out
+    radius: Positive = 0.04  # [m] radius of hand and forearm
+    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
+    toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand; fingers reach out farther
     brake: Positive = 3.0  # [m/s²] the slowest joint of the shipped arm brakes its stretched tool by 5
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
-    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] of the tool to a hand that receives
-    unknown_speed: Positive = 1.6  # [m/s] of a hand that has only just been seen
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
+    unknown_speed: Positive = 1.6  # [m/s] assumed speed of a hand that was only just seen
     tremor_speed: Positive = 0.1  # [m/s] nothing is foreseen of a slower hand: it trembles; all of it at twice that
 
 
@@ -192,9 +218,9 @@ class Box(Section, frozen=True):
 class Obstacles(Section, frozen=True):
     """What the arm keeps away from besides people: the table, itself, and boxes."""
 
-    boxes: tuple[Box, ...] = ()  # [m] parallel to the axes of frame base
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] that is kept from them; of itself 0.01 at most
-    brake: Positive = 2.0  # [m/s²] toward them
+    boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] least distance; from the arm itself at most 0.01
+    brake: Positive = 2.0  # [m/s²] deceleration that is assumed toward them
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
 
 
@@ -210,7 +236,7 @@ class Table(Section, frozen=True):
 class SkillSettings(Section, frozen=True):
     """How the skill is followed."""
 
-    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # [s] by which the tool is ahead of the teacher's
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # the tool is this far ahead of the teacher's timing
 
 
 class Files(Section, frozen=True):
@@ -219,18 +245,19 @@ class Files(Section, frozen=True):
     skills: str = ""  # a folder; empty: the shipped recordings
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
-    rerun: bool = True  # with each recording an .rrd file
-    segment_mb: Positive = 200.0  # at this size or age a recording ends and the next begins, without a gap
-    segment_minutes: Positive = 10.0  # see `segment_mb`
-    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # of this cell's; the oldest go first; 0: no limit
-    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # 0: no limit
+    rerun: bool = True  # write an .rrd file beside each recording
+    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
+    segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
+    segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's recordings; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # recordings older than this are deleted; 0: no limit
 
 
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
-    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # of the loop
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
@@ -289,12 +316,12 @@ class Settings(Section, frozen=True):
         if not count or len(set(self.joints.names)) < count:
             yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
             return
-        fields = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS} | {
-            "$.arm.posture": self.arm.posture
-        }
+        fields: dict[str, tuple[object, ...]] = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS}
+        fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
         uneven = {path: values for path, values in fields.items() if len(values) != count}
         for path, values in uneven.items():
-            yield f"{path}: {len(values)} numbers, {count} needed, one for each of $.joints.names"
+            what = "kinds" if path == "$.joints.kinds" else "numbers"
+            yield f"{path}: {len(values)} {what}, {count} needed, one for each of $.joints.names"
         if uneven:
             return
         widest = self._widest()
@@ -346,20 +373,31 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, value
 
 
-def _resolve_paths(given: Any, folder: Path | None) -> None:
-    """Puts what lies beside the configuration into its folder. Raises SettingsError."""
-    for section, name in PATHS:
+def _make_paths_absolute(given: Any, folder: Path | None) -> None:
+    """Makes every path absolute, so that its meaning no longer depends on a folder. Raises
+    SettingsError.
+    """
+    for section, name in (*BESIDE, *FROM_HERE):
         table = given.get(section) if isinstance(given, dict) else None
         value = table.get(name) if isinstance(table, dict) else None
+        base = folder if folder is not None and (section, name) in BESIDE else Path()
         if isinstance(table, dict) and isinstance(value, str):
-            if "\0" in value:
-                raise SettingsError(f"$.{section}.{name}: {value!r} given; a path holds no zero bytes")
-            try:
-                expanded = Path(value).expanduser()
-            except RuntimeError:
-                raise SettingsError(f"$.{section}.{name}: {value!r} given; there is no such user's folder") from None
-            if value and folder is not None and (section, name) in BESIDE:
-                table[name] = str(folder / expanded)
+            table[name] = _absolute(value, base, f"$.{section}.{name}")
+        elif isinstance(table, dict) and isinstance(value, list | tuple):
+            table[name] = [
+                _absolute(one, base, f"$.{section}.{name}[{i}]") if isinstance(one, str) else one
+                for i, one in enumerate(value)
+            ]
+
+
+def _absolute(value: str, base: Path, where: str) -> str:
+    """A path, from `base` where it is relative; none stays none. Raises SettingsError."""
+    if "\0" in value:
+        raise SettingsError(f"{where}: {value!r} given; a path holds no zero bytes")
+    try:
+        return str((base / Path(value).expanduser()).absolute()) if value else ""
+    except RuntimeError:
+        raise SettingsError(f"{where}: {value!r} given; there is no such user's folder") from None
 
 
 def _mistakes(given: Any) -> list[str]:
@@ -373,13 +411,13 @@ def _mistakes(given: Any) -> list[str]:
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
 
-    Where URDF, certificate and Zenoh configuration are no absolute paths they lie in `folder`. What
-    is not said of an arm with a URDF of its own is taken from there; no limit may be wider than the
-    URDF's.
+    Relative paths of URDF, packages, certificate and Zenoh configuration start from `folder`, those
+    of [files] from the current folder; all become absolute here. What is not said of an arm with a
+    URDF of its own is taken from there; no limit may be wider than the URDF's.
     """
     try:
-        _resolve_paths(given, folder)
-        arm = given.get("arm") if isinstance(given, dict) else None
+        _make_paths_absolute(given, folder)
+        arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
             try:
                 own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
@@ -388,12 +426,40 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
                 others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
                 raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
         settings = validated(given, Settings)
-        check(
-            settings.joints, Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name), settings.arm.plate
-        )
+        urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
+        check(settings.joints, urdf, settings.arm.plate)
+        if settings.arm.urdf:
+            settings = _with_reach(settings, urdf, set(reach) if isinstance(reach, dict) else set())
     except (UrdfError, SettingsError, InvalidError) as error:
         raise SettingsError(f"{origin}: {error}") from None
     return settings
+
+
+def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
+    """The settings with the reach that follows from the arm's kinematics, but for what is `said`.
+
+    Raises SettingsError where the arm reaches too little of it.
+    """
+    from service.reachable import Shell, workspace_of  # heavy, and few arms need it
+
+    workspace = workspace_of(
+        urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
+    )
+    reach = settings.reach
+    found = workspace.shell(reach.min_x, reach.min_z)
+    outer = reach.outer if "outer" in said else min(found.outer, reach.outer)
+    inner = reach.inner if "inner" in said else min(found.inner, found.inner / found.outer * outer)
+    centre = reach.centre if "centre" in said else found.centre
+    reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
+    share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
+    needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
+    if share < needed:
+        raise SettingsError(
+            f"$.reach: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
+            f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
+            f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
+        )
+    return msgspec.structs.replace(settings, reach=reach)
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:

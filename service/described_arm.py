@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from service.contract.explain import ExplainedError
-from service.urdf import Urdf, UrdfError
+from service.robot_xml import readable
+from service.urdf import Shape, Urdf, UrdfError
 
-FARTHEST_POINT = 0.95  # of the chain's length: so far out a target may lie where the settings do not say it
-NEAREST_POINT = 0.4
+ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] until the kinematics are known
+MAX_MB = 20  # of a URDF; a humanoid's has 0.1
 
 
 class SettingsError(ExplainedError, ValueError):
@@ -26,16 +27,28 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
     `packages`, or near it. Raises SettingsError.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = _text(path)
         if not cover or "<mesh" not in text:
             return text
         from service.mesh_cover import covered  # heavy, and few arms need it
 
         return covered(text, path, packages)
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise SettingsError(f"$.arm.urdf: cannot read {path}: {error}") from None
     except UrdfError as error:
         raise SettingsError(f"$.arm.urdf: {error}") from None
+
+
+def _text(path: Path) -> str:
+    """The text of a URDF. Raises OSError, UrdfError."""
+    if path.exists() and not path.is_file():
+        raise UrdfError(f"{path} is no file; a URDF needed")
+    if (size := path.stat().st_size) > MAX_MB * 1_000_000:
+        raise UrdfError(f"{path} has {size / 1e6:.0f} MB; up to {MAX_MB} accepted")
+    try:
+        return readable(path.read_bytes())
+    except ValueError as error:
+        raise UrdfError(f"{path}: not a robot description: {error}") from None
 
 
 class Limits(Protocol):
@@ -44,6 +57,26 @@ class Limits(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """In the order of the chain."""
+
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+
+
+def extent(shape: Shape) -> float:
+    """The length [m] of a shape; 0 of a mesh that is not covered."""
+    match shape.kind, shape.size:
+        case "box", size:
+            return math.hypot(*size)
+        case "sphere", (radius,):
+            return 2.0 * radius
+        case "cylinder", (radius, length):
+            return math.hypot(2.0 * radius, length)
+        case "capsule", (radius, length):
+            return length + 2.0 * radius
+        case "mesh", (*ends, radius):
+            return math.dist(ends[:3], ends[3:]) + 2.0 * radius
+    return 0.0
 
 
 def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
@@ -60,27 +93,44 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         )
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
+    joints.setdefault("kinds", [joint.kind for joint in moving])
     for name in ("lower", "upper", "velocity"):
-        joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    wanted = (("joints", joints, "acceleration"), ("joints", joints, "jerk"), ("arm", arm, "posture"))
+        if all(math.isfinite(getattr(joint, name)) for joint in moving):
+            joints.setdefault(name, [getattr(joint, name) for joint in moving])
+    wanted = (
+        ("joints", joints, "velocity"),
+        ("joints", joints, "acceleration"),
+        ("joints", joints, "jerk"),
+        ("arm", arm, "posture"),
+    )
     if missing := [f"$.{path}.{name}" for path, section, name in wanted if name not in section]:
         needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
-    lengths = [math.hypot(*joint.translation) for joint in urdf.chain(str(arm["plate"]))]
-    reach.setdefault("centre", [0.0, 0.0, lengths[0]])
-    reach.setdefault("outer", FARTHEST_POINT * sum(lengths[1:]))
-    reach.setdefault("inner", NEAREST_POINT * float(reach["outer"]))
-    return {**given, "arm": arm, "joints": joints, "reach": reach}
+    return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
 
 
 def check(joints: Limits, urdf: Urdf, plate: str) -> None:
-    """Raises SettingsError for joints the arm does not have, and limits wider than the URDF's."""
+    """Raises SettingsError for joints the arm does not have, limits wider than the URDF's, and
+    shapes larger than the arm.
+    """
     moving = urdf.movable(plate)
+    reach = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))
+    reach += sum(max(abs(joint.lower), abs(joint.upper)) for joint in moving if joint.kind == "prismatic")
+    for shape in urdf.shapes:
+        if (size := extent(shape)) > reach:
+            raise SettingsError(
+                f"$.arm.urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and the arm {reach:.3g} m; "
+                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 0.001 0.001"; '
+                "tables and walls belong into [table] and [obstacles]"
+            )
     names = tuple(joint.name for joint in moving)
     if joints.names != names:
         raise SettingsError(
             f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
         )
+    kinds = tuple(joint.kind for joint in moving)
+    if joints.every_kind != kinds:
+        raise SettingsError(f"$.joints.kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
     wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (

@@ -28,7 +28,7 @@ def end_at_once() -> NoReturn:
 
 def watch() -> None:
     """Installs the handler of SIGINT; for the main thread, before all that takes time."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, signal.SIG_DFL):
         return  # ignored, as in the background of a terminal, or handled by another
     signals, wakeup = os.pipe()
     os.set_blocking(wakeup, False)

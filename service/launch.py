@@ -51,9 +51,10 @@ def engine_of(wanted: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class Launched:
-    """A running daemon: its process, where it listens, and its log."""
+    """A running daemon: its process, its configuration, where it listens, and its log."""
 
     process: subprocess.Popen[str]
+    config: Path
     endpoint: str
     log: Path
 
@@ -96,16 +97,15 @@ def launched(
     files = {"state": folder / "state", "record": record, "skills": skills}
     config.write_text(
         "# A cell with a free port and its own files.\n"
-        f"{network}[files]\nrerun = {json.dumps(rerun)}\n"
+        f"{described(settings or Settings())}{network}[files]\nrerun = {json.dumps(rerun)}\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
-        + described(settings or Settings())
     )
     command, environment = python(*program, "serve", "--config", str(config), *arguments)
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
     with process:
         try:
-            yield Launched(process, _endpoint(process, log, say), log)
+            yield Launched(process, config, _endpoint(process, log, say), log)
         finally:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -114,13 +114,14 @@ def launched(
 
 
 def described(settings: Settings) -> str:
-    """As TOML what settings say of a cell, but for its network and files."""
+    """As TOML what settings say of a cell, but for its name, network and files."""
     given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
-    sections = [name for name in given if isinstance(given[name], dict) and name not in ("network", "files")]
-    return "".join(
-        f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in given[name].items())
-        for name in sections
-        if given[name] != usual[name]
+    told = {name: given[name] for name in given if given[name] != usual[name]}
+    rate = f"rate_hz = {told['rate_hz']}\n" if "rate_hz" in told else ""
+    return rate + "".join(
+        f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in section.items())
+        for name, section in told.items()
+        if isinstance(section, dict) and name not in ("network", "files")
     )
 
 

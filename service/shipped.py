@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.config import WAM, Settings, load
+import msgspec
+
+from service.config import WAM, Settings, converted, load
 from service.described_arm import UnreadableError
 
 if TYPE_CHECKING:
@@ -35,11 +37,14 @@ def shipped_skill() -> StoredSkill:
     return decoded(path.read_bytes(), origin=str(path))
 
 
-def cell_of(arm: str) -> Settings:
-    """The settings of a shipped cell, by its arm, or those in a file.
+def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
+    """The settings of a shipped cell, by its arm, or those in a file; with `rate_hz`, at that rate.
 
     Raises SettingsError.
     """
+    if rate_hz is not None:
+        given = msgspec.to_builtins(cell_of(arm))
+        return converted(given | {"rate_hz": rate_hz}, origin="command line")
     if arm == "wam":
         return Settings()
     if arm in ARMS:

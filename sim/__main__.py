@@ -17,6 +17,7 @@ from service import interrupt
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.contract.printable import printable_lines
 from service.described_arm import SettingsError, UnreadableError
 from service.launch import ENGINES, LaunchError, engine_of
 from service.shipped import ARMS, cell_of
@@ -154,7 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
             engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
     except (SceneError, LaunchError, UnreadableError) as error:
-        print(f"thirdhand sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
         return 1
     except SettingsError as error:
         p.error(str(error))
@@ -220,7 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
     except (BenchError, OSError) as error:
-        print(f"thirdhand sim: {error}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
         return 1
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 

@@ -107,20 +107,19 @@ class Bench:
         *,
         settings: Settings | None = None,
         posture: Floats | None = None,
-        rate_hz: int = 500,
         world: type[World] | None = None,
     ) -> None:
-        """`settings` say which arm (or else the shipped one), at its posture unless at another;
-        `world` by which physics, or else by those that are installed.
+        """`settings` name the arm and the rate (or else the shipped cell's). The arm begins at its
+        posture unless another is given. `world` is the physics, or else the first installed.
         """
         self.script = script
         self.scene = script.scene
-        self.period_s = 1.0 / rate_hz
         settings = settings or Settings()
+        self.period_s = settings.period_s
         self.joint_names, self._plate = settings.joints.names, settings.arm.plate
         self.limits = settings.joints
         posture = posture or settings.arm.posture
-        self.world = (world or world_of())(self.scene, settings, posture=posture, rate_hz=rate_hz)
+        self.world = (world or world_of())(self.scene, settings, posture=posture)
         self.tick = 0
         self._ticks_since_begin = 0
         self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back

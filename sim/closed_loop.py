@@ -66,7 +66,7 @@ class ClosedLoop:
     def ticks(self) -> Iterator[Tick]:
         """A tick for each period, until the script is over."""
         bench = self._bench
-        every = round(1 / bench.period_s) // HANDS_HZ
+        every = max(1, round(1 / (HANDS_HZ * bench.period_s)))
         while True:
             self._direct(bench)
             if bench.finished:

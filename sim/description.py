@@ -11,6 +11,8 @@ from service.core.separation.body import body_of
 from service.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+UNKNOWN_KG = "1"  # of a link that a joint moves and of which the URDF does not say a mass: engines move none without
+UNKNOWN_INERTIA = {**NO_INERTIA, "ixx": "0.01", "iyy": "0.01", "izz": "0.01"}  # [kg m²]
 SHORTEST = 1e-3  # [m] of a capsule's axis; without one it is a sphere
 
 
@@ -26,11 +28,14 @@ def simulated(settings: Settings, **compiler: str) -> str:
         if joint.get("name") not in names:
             joint.set("type", "fixed")
     links = {link.get("name"): link for link in robot.findall("link")}
-    for link in links.values():
-        if link.find("inertial") is None:  # a frame only; PyBullet would give it 1 kg
-            inertial = SubElement(link, "inertial")
-            SubElement(inertial, "mass", value="0")
-            SubElement(inertial, "inertia", NO_INERTIA)
+    driven = {joint.child for joint in urdf.joints if joint.name in names}
+    for name, link in links.items():
+        if not _is_massive(link):
+            for without in link.findall("inertial"):
+                link.remove(without)
+            inertial = SubElement(link, "inertial")  # without one PyBullet gives 1 kg to mere frames, too
+            SubElement(inertial, "mass", value=UNKNOWN_KG if name in driven else "0")
+            SubElement(inertial, "inertia", UNKNOWN_INERTIA if name in driven else NO_INERTIA)
     if robot.find(".//mesh") is not None:
         for link in links.values():
             for shape in [*link.findall("visual"), *link.findall("collision")]:
@@ -43,6 +48,12 @@ def simulated(settings: Settings, **compiler: str) -> str:
     if compiler:
         SubElement(SubElement(robot, "mujoco"), "compiler", compiler)
     return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _is_massive(link: Element) -> bool:
+    """Whether a link has a mass and its moments of inertia."""
+    mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
+    return mass is not None and inertia is not None and float(mass.get("value", "0")) > 0.0
 
 
 def _cover(link: Element, ends: list[list[float]], radius: float) -> None:

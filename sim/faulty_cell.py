@@ -187,11 +187,10 @@ class FaultyCell:
         self.session.declare_subscriber(channels.key(CELL, "joints/command"), keep)
 
     def child(self, what: str) -> int:
-        """The process id of the service's `scribe` or `skill_worker`."""
-        module = {"scribe": b"service.recording.process", "skill worker": b"service.daemon.skill_worker"}[what]
+        """The process id of the service's `scribe` or `skill worker`."""
         for path in Path(f"/proc/{self.service.process.pid}/task").glob("*/children"):
             for pid in path.read_text().split():
-                if module in Path(f"/proc/{pid}/cmdline").read_bytes():
+                if Path(f"/proc/{pid}/comm").read_text().strip() == what:
                     return int(pid)
         raise FaultError(f"no {what} was found among the children of the service")
 

@@ -91,7 +91,7 @@ class Film:
 def filmed(scene: Scene) -> list[Image.Image]:
     """The pictures of one run of the scene, with its places taught."""
     settings = Settings()
-    with Bench(HandScript(scene, seed=scene.seed), rate_hz=settings.rate_hz) as bench:
+    with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
         film, loop = Film(bench), ClosedLoop(bench)
         skill = adapted(shipped_skill(), scene.via_points(), tolerance=TOLERANCE_M)
         controller = Controller(settings, skill.for_loop(), urdf=robot_description(settings))

@@ -161,7 +161,7 @@ def _time_ns(tick: Tick, settings: Settings) -> int:
 def make(path: Path, skill: StoredSkill) -> None:
     """Writes a new golden session."""
     settings, scene = Settings(), Scene()
-    with Bench(HandScript(scene, seed=scene.seed), rate_hz=settings.rate_hz) as bench:
+    with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
         session = Session(bench, skill)
         record(path, settings, skill, session.ticks(), follow=session.loop.follow)
 

@@ -49,7 +49,9 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     commands: int
     rejected: int
     largest_gap_ms: float  # between commands received
-    skipped: int  # periods that the bench itself missed
+    periods: int  # of the bench while the script ran
+    skipped: int  # of them the bench itself missed
+    longest_pause_ms: float  # of the bench
     begun_ns: int  # the system clock's time at which the script began
     seed: int
     scene: Scene
@@ -103,7 +105,8 @@ class Commands:
         """Keep one command. Only the first answer to each new hand stamp tells of latency."""
         now_ns, now = time.time_ns(), time.perf_counter_ns()
         try:
-            command = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), self._names)
+            message = cdr.decode_joints(sample.payload.to_bytes())
+            command = messages.in_order(message, self._names)
             attachment = cdr.decode_attachment(sample.attachment.to_bytes()) if sample.attachment else None
             if not messages.finite(command[0] + command[1]):
                 raise messages.WireError("a joint that is not finite")
@@ -114,7 +117,7 @@ class Commands:
             return
         with self._lock:
             self._newest = command
-            self._queue.append(Command(0, *command, *(attachment or (-1, 0, 0))))
+            self._queue.append(Command(message.stamp_ns, *command, *(attachment or (-1, 0, 0))))
             self.count += 1
             if self._last_ns:
                 self.largest_gap_ms = max(self.largest_gap_ms, (now - self._last_ns) / 1e6)
@@ -140,19 +143,23 @@ class Commands:
 class Led:
     """The bench's arm, led as `thirdhand follow` leads a real one."""
 
-    def __init__(self, bench: Bench, bridge: Bridge) -> None:
-        self._bench, self._bridge, self._period_s = bench, bridge, bench.period_s
+    def __init__(self, bench: Bench, commands: Commands, gripper: Gripper) -> None:
+        self._bench, self._commands, self._gripper = bench, commands, gripper
         names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
         more = {name: tuple(HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
         limits = msgspec.structs.replace(bench.limits, **more)
-        self._playback = Playback(limits, joints, tick_s=bench.period_s, period_s=bench.period_s)
+        self._playback = Playback(limits, joints, period_s=bench.period_s)
 
     def step(self, periods: int = 1) -> tuple[Observation, bool]:
-        """The bench a period later, of so many that passed, and whether commands came."""
-        commands = self._bridge.commands.queued()
-        moved = self._playback.step(commands, elapsed_s=periods * self._period_s)
+        """The bench a period later, of so many that passed, and whether commands came. Raises
+        BenchError where they come too slowly to be followed.
+        """
+        commands = self._commands.queued()
+        moved = self._playback.step(commands, elapsed_s=periods * self._bench.period_s)
+        if reason := self._playback.too_slow:
+            raise BenchError(f"the service: {reason}")
         position, velocity = tuple(moved.position.tolist()), tuple(moved.velocity.tolist())
-        return self._bench.step(position, velocity, gripper=self._bridge.gripper.newest), bool(commands)
+        return self._bench.step(position, velocity, gripper=self._gripper.newest), bool(commands)
 
 
 class Gripper:
@@ -268,11 +275,11 @@ def _play(
     rate_hz = round(1.0 / bench.period_s)
     hands_every = max(1, round(rate_hz / live.hands_hz))
     things_every = max(1, round(rate_hz / THINGS_HZ))
-    led = Led(bench, bridge)
+    led = Led(bench, commands, bridge.gripper)
     deadlines, before = Deadlines(rate_hz), -1
     ready_s: float | None = None  # since when commands come and the hands wait at their start
     running, spoke_s, quiet = False, 0.0, False
-    said = missed_before = sent_before = begun_ns = 0
+    said = missed_before = sent_before = begun_ns = begun_index = longest = 0
     say(
         f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
     )
@@ -281,6 +288,7 @@ def _play(
         now_s = index * bench.period_s
         if now_s >= live.duration_s:
             return
+        longest = max(longest, index - before)
         (seen, commanded), before = led.step(index - before), index
         bridge.publish_joints(seen)
         if commanded:
@@ -314,7 +322,7 @@ def _play(
                 bench.begin()
                 commands.restart()
                 running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent
-                begun_ns = time.time_ns()
+                begun_ns, begun_index, longest = time.time_ns(), index, 0
                 say("the script begins")
         else:
             for name in TaskEvents.__struct_fields__[said : bench.closed]:
@@ -326,7 +334,9 @@ def _play(
                         bench,
                         commands,
                         hands=bridge.hands_sent - sent_before,
+                        periods=index - begun_index,
                         skipped=deadlines.missed - missed_before,
+                        longest_pause_ms=1000 * longest * bench.period_s,
                         begun_ns=begun_ns,
                     )
                 )
@@ -347,7 +357,16 @@ def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> N
         bridge.publish_joints(led.step()[0])
 
 
-def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun_ns: int) -> RunReport:
+def _report(
+    bench: Bench,
+    commands: Commands,
+    *,
+    hands: int,
+    periods: int,
+    skipped: int,
+    longest_pause_ms: float,
+    begun_ns: int,
+) -> RunReport:
     events = bench.events()
     latencies = list(commands.latencies_ms)
     percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
@@ -360,7 +379,9 @@ def _report(bench: Bench, commands: Commands, *, hands: int, skipped: int, begun
         commands=commands.count,
         rejected=commands.rejected,
         largest_gap_ms=round(commands.largest_gap_ms, 3),
+        periods=periods,
         skipped=skipped,
+        longest_pause_ms=round(longest_pause_ms, 1),
         begun_ns=begun_ns,
         seed=bench.script.seed,
         scene=bench.scene,

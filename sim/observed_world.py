@@ -4,6 +4,7 @@ tell. Only hands and things are here.
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import zenoh
 
 from service.config import Settings, robot_description
 from service.contract import cdr, messages
+from service.contract.joint_states import JointStates, measured
 from service.core.arm.arm import Arm
 from service.core.geometry import between_segments, place, quaternion_of
 from service.core.separation.body import body_of
@@ -27,11 +29,15 @@ class ObservedWorld(World):
         description = robot_description(settings)
         self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies
         self._newest: tuple[Floats, Floats] = posture, (0.0,) * len(posture)
+        self._states = JointStates(self._names, settings.arm.silent_ms / 1000)
 
     def receive(self, sample: zenoh.Sample) -> None:
         """Keep one joint state; what is none is let pass, as the service tells. In any thread."""
         try:
-            state = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), self._names)
+            found = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
+            if found is None:
+                return
+            state = measured(found, self._names)
         except messages.WireError:
             return
         if messages.finite(state[0] + state[1]):

@@ -161,9 +161,17 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
                 places[name] = _add(getattr(self, name), (moved[0], moved[1], 0.0))
                 said.append(f"{name} moved by {100 * abs(wanted - out):.0f} cm into the arm's reach")
         try:
-            return Scene(**places), tuple(said)
+            scene = Scene(**places)
         except ValueError as error:
             raise SceneError(f"out of the arm's reach: {error}") from None
+        for name, tool in (("handover", scene.offer), ("glass", scene.glass), ("soldering", scene.carry)):
+            away = math.dist(tool, centre)
+            if not (reach.inner <= away <= reach.outer and tool[0] >= reach.min_x and tool[2] >= reach.min_z):
+                raise SceneError(
+                    f"out of the arm's reach: {name}: the tool at {list(tool)} m; {reach.inner:g} to {reach.outer:g} m "
+                    f"from {list(centre)}, x from {reach.min_x:g} and z from {reach.min_z:g} m accepted"
+                )
+        return scene, tuple(said)
 
     @staticmethod
     def load(path: Path) -> Scene:

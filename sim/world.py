@@ -77,8 +77,8 @@ class World(abc.ABC):
     arm, board, glass, iron, solder, left, right = "arm", "board", "glass", "iron", "solder", "left", "right"
     things: dict[str, Look]  # what lies on the bench and can be taken
 
-    def __init__(self, scene: Scene, settings: Settings, *, posture: Floats, rate_hz: int) -> None:
-        self._period_s = 1.0 / rate_hz
+    def __init__(self, scene: Scene, settings: Settings, *, posture: Floats) -> None:
+        self._period_s = settings.period_s
         x, y, z, *turn = settings.tool.plate_from_tool
         self.plate_from_tool = Pose((x, y, z), (turn[0], turn[1], turn[2], turn[3]))
         bodies = furniture(scene, settings)

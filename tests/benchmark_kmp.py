@@ -114,7 +114,7 @@ def report(benchmark, seconds, unit_s, limit, what):
 
 def primitive_query(primitive):
     """The least that a mean can cost: the offsets, the kernel, one product, written out."""
-    s, weights, query = primitive.solution.centres, primitive.solution.weights, primitive.inputs[:1]
+    s, weights, query = primitive.inner.solution.centres, primitive.inner.solution.weights, primitive.inputs[:1]
 
     def call():
         offsets = query - s
@@ -125,7 +125,7 @@ def primitive_query(primitive):
 
 def page(primitive, queries):
     """The mean of several queries on a page of SciPy and NumPy."""
-    s, weights = primitive.solution.centres, primitive.solution.weights
+    s, weights = primitive.inner.solution.centres, primitive.inner.solution.weights
 
     return lambda: np.exp(-0.5 * cdist(queries, s, "sqeuclidean")) @ weights
 
@@ -223,7 +223,7 @@ def test_extended_beside_a_fit(benchmark, mixture, count, more, limit):
 
 def test_fit_100_000(benchmark, large):
     primitive, took, (before, peak) = large
-    r, d = primitive.solution.w.shape
+    r, d = primitive.inner.solution.w.shape
     work = 100_000 * r * r * (d * (d + 1) / 4 + 2)  # multiply-adds: the normal equations, the features three times
     benchmark.pedantic(primitive_again, args=(primitive,), rounds=1)
     benchmark.extra_info.update(fit_s=round(took, 2), rank=r, peak_mb=peak // 1000, before_mb=before // 1000)
@@ -257,7 +257,7 @@ def test_mean_and_covariance_of_one_query_100_000(benchmark, large):
     primitive = large[0]
     query = primitive.inputs[:1].copy()
     benchmark(primitive.predict, query)
-    r, d = primitive.solution.w.shape
+    r, d = primitive.inner.solution.w.shape
     inverse, z = np.random.default_rng(0).random((r * d * d, r)), np.zeros(r)
     compare(benchmark, lambda: primitive.predict(query), lambda: inverse @ z, 4, "dgemv of the rank's size", calls=50)
 

@@ -6,9 +6,6 @@ from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,18 +13,13 @@ import pytest
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from service.recording.replay import replay
-from support import compiling, tiers, vulkan
+from service.viewer import vulkan
+from support import compiling, tiers
 from support.paths import RECORDINGS, ROOT
 
-BEGAN_S = time.monotonic()
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--seconds-left`, for what is run as long as there is time."""
-    parser.addoption("--seconds-left", type=float, metavar="S", help="leave out what has not begun after so long")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -53,10 +45,7 @@ def _where(item: pytest.Item) -> str:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leaves out a test for which no time is left, and says so; else waits for what is compiled."""
-    left_s = item.config.getoption("--seconds-left")
-    if left_s is not None and time.monotonic() - BEGAN_S > left_s:
-        pytest.skip(f"left out: not begun within {left_s:g} s")
+    """Wait until the functions that the test calls are compiled."""
     if not tiers.is_among(_where(item), tiers.UNCOMPILED):
         compiling.wait(six="ur5" in item.nodeid)
 
@@ -94,11 +83,6 @@ def golden(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
 
 @pytest.fixture(scope="session")
 def drawing() -> None:
-    """That the viewer can draw without a screen: whoever asks for it is skipped where it cannot.
-
-    Asked in a process of its own, as a driver brings libraries of its own.
-    """
-    if sys.platform == "linux":
-        found = subprocess.run([sys.executable, vulkan.__file__], capture_output=True, text=True, check=False)
-        if found.stdout.strip() in {"", "0"}:
-            pytest.skip("drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers")
+    """Skip the test where the viewer cannot draw without a screen."""
+    if not vulkan.is_there():
+        pytest.skip("drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers")

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from service.config import WAM, Settings, SettingsError, load, parse
-from service.network_settings import is_local
+from service.config import WAM, Files, Settings, SettingsError, load, parse, robot_description
+from service.launch import described
+from service.network_settings import Network, is_local
+from service.shipped import cell_of
+from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
 
 def refusal(text: str) -> str:
@@ -252,6 +256,62 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
     assert routed.network.connect == ("tcp/10.0.0.1:1",)
 
 
+def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my" / "share").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "my" / "arm.urdf").write_bytes(WAM.with_name("ur5.urdf").read_bytes())
+    cell = WAM.with_name("ur5.toml").read_text().replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
+    network = '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = "../zenoh.json5"'
+    files = '[files]\nrecord = "records"\nskills = ""\nstate = "~/state"'
+    (tmp_path / "my" / "cell.toml").write_text(f"{cell}\n{network}\n{files}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    read = cell_of("my/cell.toml", rate_hz=250)
+    assert read.arm.urdf == str(tmp_path / "my/arm.urdf")
+    assert read.arm.packages == (str(tmp_path / "my/share"),)
+    assert read.network.certificate == str(tmp_path / "my/secrets")
+    assert read.network.zenoh_config == str(tmp_path / "my/../zenoh.json5")
+    assert (read.files.record, read.files.skills, read.files.state) == (str(tmp_path / "records"), "", "/home/me/state")
+    again = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert again == msgspec.structs.replace(read, network=Network(), files=Files())
+    assert robot_description(again) == robot_description(read)
+
+
 def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:
     text = "[network]\nlisten = ['tls/0.0.0.0:1']\ncertificate = 'secrets/daemon'"
     assert parse(text, origin="cell.toml", folder=tmp_path).network.certificate == str(tmp_path / "secrets/daemon")
+
+
+def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
+    bare = re.sub(r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>', r"\1", continuous_urdf())
+    assert bare.count("<limit") == continuous_urdf().count("<limit") - 1
+    posture = (NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0)
+    cell = cell_in(tmp_path, bare, posture=posture)
+    assert cell.joints.velocity[5] == 2.0
+    assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
+    with pytest.raises(SettingsError, match=r"\$\.joints\.velocity: missing; a URDF does not say it, 6 numbers needed"):
+        load(tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('kinds = ["revolute"]', "$.joints.kinds: 1 kinds, 6 needed"),
+        (
+            f"kinds = {['revolute'] * 6}",
+            "$.joints.kinds: ['revolute', 'revolute', 'revolute', 'revolute', 'revolute', 're",
+        ),
+        ('kinds = ["floating"]', "$.joints.kinds[0]"),
+        (f"lower = {[-7000.0, *[-3.0] * 5]}", "$.joints.lower[0]: -7000.0 given; -6000.0 or more accepted by the URDF"),
+    ],
+)
+def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    continuous_cell(tmp_path)
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(text.replace("[joints]", f"[joints]\n{line}"), encoding="utf-8")
+    with pytest.raises(SettingsError) as caught:
+        load(tmp_path / "cell.toml")
+    assert message in str(caught.value)

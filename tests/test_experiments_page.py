@@ -96,6 +96,12 @@ def elsewhere(name: str) -> list[Source]:
     return [of(f"promp/{name}_summary/{who}/{key}_deviation_elsewhere_cm") for who in ("kmp", "promp") for key in keys]
 
 
+def most_missed(who: str, *, scale: float = 1.0) -> float:
+    """The largest miss of a point [cm] by a method of Table I, times a scale."""
+    found = [result("table")[which][who] for which in ("modelled", "recorded")]
+    return scale * max(float(one[f"largest_miss_of_{kind}_cm"]) for one in found for kind in ("start", "via", "end"))
+
+
 def better(name: str, who: str) -> list[Source]:
     """How many of how many adaptations a method changes less elsewhere."""
     kmp, all_of_them = (
@@ -111,13 +117,42 @@ def letters(name: str) -> float:
 # By the beginning of each paragraph or row: where its numbers are from, in order.
 SOURCES: dict[str, list[Source]] = {
     "| `letters`, `promp`": [AtMost(reached()), *better("model", "kmp"), *better("recorded", "promp")],
+    "| `table`": [
+        AtMost(most_missed("kmp", scale=10)),
+        most_missed("dmp"),
+        most_missed("gmm"),
+    ],
     "| `promp-dimensions`": [
         "six",
-        at_six("KMP"),
+        at_six("KMP, at 200 samples"),
         of("promp/dimensions/0/functions"),
         at_six("ProMP, at 200 samples"),
         at_six("kernel ridge, 200 samples"),
+        at_six("GMM"),
     ],
+    "| `runs`": [
+        of("runs/runs_that_fell"),
+        of("runs/runs"),
+        of("runs/cost_fall_percent/least"),
+        of("runs/cost_fall_percent/largest"),
+    ],
+    **{
+        f"| {title}, {which}": [
+            *(of(f"table/{which}/{who}/largest_miss_of_{one}_cm") for one in ("start", "via", "end")),
+            of(f"table/{which}/{who}/mean_rms_deviation_elsewhere_cm"),
+        ]
+        for which in ("modelled", "recorded")
+        for who, title in (("kmp", "KMP"), ("promp", "ProMP"), ("dmp", "DMP"), ("gmm", "GMM"))
+    },
+    "`runs`": [
+        "3",
+        *("ten", "10"),
+        of("runs/cost_fall_percent/mean"),
+        of("runs/cost_fall_percent/least"),
+        of("runs/cost_fall_percent/largest"),
+        AtMost(of("runs/largest_miss_of_the_via_point_cm", 10)),
+    ],
+    "![Cost after": ["ten"],
     "| `correlation`": [of("correlation/cost_fall_percent/mean"), of("correlation/cost_beside_c_percent/learned/mean")],
     "| `hands`": [AtMost(taught_misses())],
     "| `statistics`": [
@@ -167,20 +202,23 @@ SOURCES: dict[str, list[Source]] = {
     "| recorded": elsewhere("recorded"),
     "The paper's Table I": [
         *("five", "six"),
-        of("promp/dimensions/22/functions"),
+        of("promp/dimensions/30/functions"),
         len({one["method"] for one in result("promp")["dimensions"] if one["error"] is None}),
         *("six", "1"),
     ],
     "Errors are": [
-        of("promp/dimensions/20/functions"),
+        of("promp/dimensions/28/functions"),
         "six",
         at_six("ProMP, at 200 samples"),
         at_six("kernel ridge, 200 samples"),
         "three",
-        of("promp/dimensions/21/functions"),
+        of("promp/dimensions/29/functions"),
         at_six("ProMP, 3 per input"),
+        at_six("KMP, at 200 samples"),
         at_six("KMP"),
-        of("promp/dimensions/18/functions"),
+        of("promp/dimensions/24/functions"),
+        of("promp/dimensions/26/functions"),
+        at_six("GMM"),
     ],
     "`correlation`": [
         "3",

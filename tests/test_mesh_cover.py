@@ -4,7 +4,9 @@ is said of those that are not found.
 
 from __future__ import annotations
 
+import re
 import struct
+import time
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
@@ -16,12 +18,12 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from service.config import Settings, SettingsError, parse, robot_description, urdf_path
+from service.config import Settings, SettingsError, converted, parse, robot_description, urdf_path
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
 from service.described_arm import description
 from service.mesh_cover import capsule_around, covered
-from service.urdf import Urdf, UrdfError
+from service.urdf import Shape, Urdf, UrdfError
 from support import arms
 from support.paths import ROOT
 
@@ -147,6 +149,144 @@ def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Pa
     assert told.format(folder=tmp_path) in str(error.value)
     with pytest.raises(SettingsError, match=r"\$\.arm\.urdf: .*the collision mesh"):
         robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
+
+
+def collada(points: Points, unit: str, node: str = "", up: str = "Z_UP") -> str:
+    """A Collada file of the triangles around points, in a node that may be turned."""
+    numbers = " ".join(f"{value:.9g}" for value in points.ravel())
+    corners = " ".join(map(str, ConvexHull(points).simplices.ravel().tolist()))
+    count = len(ConvexHull(points).simplices)
+    return f"""<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="unit" meter="{unit}"/><up_axis>{up}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="s"><float_array id="a" count="{points.size}">{numbers}</float_array><technique_common>
+<accessor source="#a" count="{len(points)}" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+<triangles count="{count}"><input semantic="VERTEX" source="#v" offset="0"/><p>{corners}</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node id="n">{node}<instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#scene"/></scene></COLLADA>"""
+
+
+def around(shape: Shape, points: Points) -> float:
+    """How far the farthest of points in a link's frame is out of the capsule of a mesh [m]."""
+    ends = np.reshape(shape.size[:6], (2, 3)) @ rotation(shape.rotation).T + shape.translation
+    return outside(points, ends, shape.size[6])
+
+
+LEG = box(0.05, 0.06, 0.3) + np.array((0.02, 0.03, 0.15))
+QUARTER = "<matrix>0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1</matrix>"  # about z
+TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "scale", "expected"),
+    [
+        ("a.stl", stl(LEG), "", LEG),
+        ("a.STL", stl(1000 * LEG), ' scale="0.001 0.001 0.001"', LEG),
+        ("a.stl", stl(LEG), ' scale="1 -1 1"', LEG * (1, -1, 1)),
+        ("a.stl", stl(LEG), ' scale="-1 2 0.5"', LEG * (-1, 2, 0.5)),
+        ("a.dae", collada(LEG, "1"), "", LEG),
+        ("a.dae", collada(1000 * LEG, "0.001"), "", LEG),
+        ("a.dae", collada(100 * LEG, "0.01"), ' scale="1 -1 1"', LEG * (1, -1, 1)),
+        ("a.dae", collada(LEG, "1", QUARTER), "", TURNED),
+        ("a.dae", collada(1000 * LEG, "0.001", QUARTER, "Y_UP"), "", TURNED),  # as RViz and MoveIt have it
+        ("a.obj", "".join(f"v {x} {y} {z}\n" for x, y, z in LEG) + "f 1 2 3\nf 4 5 6\nf 6 7 8\n", "", LEG),
+    ],
+)
+def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
+    name: str, data: bytes | str, scale: str, expected: Points, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+    (tmp_path / "arm.urdf").write_text(described(name, scale))
+    shape = next(one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm")
+    at = expected @ rotation(shape.rotation).T + shape.translation
+    assert around(shape, at) <= 1e-5
+    ends = np.reshape(shape.size[:6], (2, 3))
+    assert volume(ends, shape.size[6]) < 1.1 * plain(expected)
+
+
+def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Path) -> None:
+    for name, points in (("a.stl", LEG), ("b.stl", LEG + np.array((0.2, 0.0, 0.0)))):
+        (tmp_path / name).write_bytes(stl(points))
+    second = '</collision><collision><geometry><mesh filename="b.stl"/></geometry></collision>'
+    text = described("a.stl").replace('<mesh filename="a.stl"/></geometry></collision>',
+                                      f'<mesh filename="a.stl"/></geometry>{second}')  # fmt: skip
+    (tmp_path / "arm.urdf").write_text(text)
+    shapes = [one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm"]
+    assert [round(one.size[6], 2) for one in shapes] == [0.04, 0.04]
+    assert around(shapes[1], LEG + np.array((0.2, 0.0, 0.0))) <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("data", "scale", "said"),
+    [
+        (stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.nan)), "", "finite numbers"),
+        (stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.inf)), "", "finite numbers"),
+        (bytes(80) + struct.pack("<I", 0), "", "vertices with finite numbers needed"),
+        (b"", "", "cannot be read"),
+        (stl(LEG)[:-20], "", "cannot be read"),
+        (stl(LEG), ' scale="nan 1 1"', "finite numbers up to 1e+06 needed"),
+        (stl(LEG), ' scale="1 1"', "scale '1 1' given; three finite numbers"),
+        (stl(LEG), ' scale="0 1 1"', "scale '0 1 1' given; three finite numbers"),
+        (stl(1000 * LEG), "", "the mesh of link 'forearm' is 378 m long"),
+    ],
+)
+def test_what_is_no_mesh_of_an_arm_is_refused(data: bytes, scale: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(data)
+    (tmp_path / "arm.urdf").write_text(described("a.stl", scale))
+    own = Settings()
+    with pytest.raises(SettingsError, match=re.escape(said)) as error:
+        converted(
+            {
+                "arm": {"urdf": "arm.urdf", "plate": own.arm.plate, "posture": list(own.arm.posture)},
+                "joints": {"acceleration": list(own.joints.acceleration), "jerk": list(own.joints.jerk)},
+            },
+            origin="cell.toml",
+            folder=tmp_path,
+        )
+    assert "forearm" in str(error.value)
+
+
+def test_capsules_are_kept_and_found_anew_where_they_are_spoilt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "a.stl").write_bytes(stl(LEG))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(described("a.stl"))
+
+    def found() -> str:
+        covered.cache_clear()
+        return description(urdf)
+
+    first = found()
+    (kept,) = (tmp_path / "home" / ".cache" / "thirdhand" / "capsules").iterdir()
+    right = kept.read_text()
+    kept.write_text(right.replace(right.split()[6], "0.5"))
+    assert found() != first  # it is what is taken
+    for spoilt in ("", "nan " * 7, "1 2 3", "1 2 3 4 5 6 -7", "\udcff"):
+        kept.write_bytes(spoilt.encode(errors="surrogateescape"))
+        assert found() == first
+        assert kept.read_text() == right
+    (tmp_path / "a.stl").write_bytes(stl(LEG * 0.5))
+    assert found() != first
+    monkeypatch.setenv("HOME", "/dev/null")
+    assert found() != first
+
+
+@pytest.mark.timed
+def test_so_101_with_its_13_meshes_is_covered_in_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    urdf = arms.urdf_of(arms.Model("so101.urdf", "gripper_frame_link", ()))
+    capsule_around(LEG)  # what it needs is imported
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for bound_s in (1.0, 0.3):
+        covered.cache_clear()
+        start = time.process_time()
+        description(urdf)
+        assert time.process_time() - start < bound_s
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5"])

@@ -17,8 +17,8 @@ from kmp.gaussians import Gaussians
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
-from kmp.low_rank.error_bound import error_bound
-from kmp.solution import check_resolved
+from kmp.low_rank.error_bound import error_bounds
+from kmp.solution import ErrorBounds, check_resolved
 
 if TYPE_CHECKING:
     from kmp.low_rank.solution import LowRank
@@ -89,8 +89,8 @@ class Conditioned(Immutable):
         return frozen(np.concatenate([base.features.kernel_weights(w), added]))
 
     @cached_property
-    def error_bound(self) -> float:
-        return error_bound(self, self.base.features, added=self._added)
+    def error_bounds(self) -> ErrorBounds:
+        return error_bounds(self, self.base.features, added=self._added)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
@@ -107,6 +107,9 @@ class Conditioned(Immutable):
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         return self.base.adapted(changes)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Conditioned:
+        return Conditioned(self.base.with_hyperparameters(hyperparameters), self.changes)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
@@ -158,7 +161,9 @@ class Conditioned(Immutable):
 
     def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
         parameters, added = self.hyperparameters, Database(self.changes.functionals, self.changes.points)
-        check_resolved(parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name)
+        check_resolved(
+            parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name, both=True
+        )
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
         (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
         first = self._added_columns

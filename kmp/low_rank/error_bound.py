@@ -6,22 +6,27 @@ import numpy as np
 
 from kmp.kernel import between, variances
 from kmp.low_rank.features import BLOCK, Features
-from kmp.solution import Solution, mean_of
+from kmp.solution import ErrorBounds, Solution, mean_of
 
 
-def error_bound(solution: Solution, features: Features, *, added: int = 0) -> float:
-    """The largest distance of the mean at the reference points from the dense solution's, at most.
+def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> ErrorBounds:
+    """Upper bounds of the distance between this mean and the dense solution's.
 
-    The last `added` reference points are via-points. The least of two bounds. Let K = Z^T Z + E: E
-    is positive semidefinite and its diagonal e is known. With alpha = Sigma^-1 (mu - xi) / lambda
-    the low rank solution is the dense one for means moved by delta = K alpha - xi, the prior mean
-    subtracted, and off by (I - S) delta, where S smooths: |Sigma^-1/2 (I - S) delta| is at most
-    |Sigma^-1/2 delta|, and sqrt(lambda) / 2 |g| where delta = Z^T g. So count E alpha, of which
-    element n is at most sqrt(e_n) sum_m sqrt(e_m) |alpha_m|, and g = Z alpha - w, by which the low
-    rank equations are not solved. This is the lower where the rank suffices.
+    The last `added` reference points are via-points. Let K = Z^T Z + E: E is positive semidefinite
+    and its diagonal e is known. Let alpha = Sigma^-1 (mu - xi) / lambda, the prior mean subtracted.
 
-    The cost (4) is quadratic and least at the dense solution: |Sigma^-1/2 df|^2 is at most what (4)
-    is.
+    At any query: the gradient of the cost (4) at the mean xi is 2 lambda h with h = xi - sum_n
+    k(., s_n) alpha_n, and its Hessian is at least 2 lambda. So the mean is at most |h| from the one
+    of least cost, in the norm of the kernel, and at most sqrt(k(s, s)) |h| at a query s. |h|^2 is
+    at most |g|^2 + (sum_n sqrt(e_n) |alpha_n|)^2, where g = Z alpha - w is what the solution of the
+    low rank equations leaves.
+
+    At the reference points: the lesser of two bounds. The low rank solution is the dense one for
+    means moved by delta = K alpha - xi, and off by (I - S) delta, where S smooths: |Sigma^-1/2 (I -
+    S) delta| is at most |Sigma^-1/2 delta|, and sqrt(lambda) / 2 |g| where delta = Z^T g. So add
+    the bound of E alpha, of which element n is at most sqrt(e_n) sum_m sqrt(e_m) |alpha_m|, and
+    that of g. This is the lower one where the rank suffices. The other: the cost (4) is quadratic
+    and least at the dense solution, so |Sigma^-1/2 df|^2 is at most what (4) is.
     """
     kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
     points, reference, known = solution.database.functionals, solution.database.reference, solution.functionals
@@ -38,18 +43,22 @@ def error_bound(solution: Solution, features: Features, *, added: int = 0) -> fl
     alpha[count - added :] -= weights[rank:]
     residual = np.concatenate([features.residual(block) for block in blocks])
     root = np.sqrt(residual * variances(kernel, points))[:, :, None]  # (N, C, 1)
-    moved = root * (root * np.abs(neglected)).sum(axis=(0, 1))
-    unsolved = -features.root.T @ weights[:rank, 0]  # g (r, D)
+    outside = (root * np.abs(neglected)).sum(axis=(0, 1))  # (D,)
+    moved = root * outside
+    unsolved = -features.root.T @ weights[np.arange(rank), features.channels]  # g (r, D)
     for i, block in zip(range(0, count, BLOCK), blocks, strict=True):
         part = alpha[i : i + BLOCK]
         unsolved += features(block) @ part.reshape(-1, part.shape[2])
     via = points.take(slice(count - added, None))
     apart = alpha[count - added :].reshape(added * c, alpha.shape[2])
     z = features(via)
-    squared = (unsolved**2).sum() + (apart * ((between(kernel, via, via) - z.T @ z) @ apart)).sum()
+    between_via = np.sqrt(np.maximum((apart * ((between(kernel, via, via) - z.T @ z) @ apart)).sum(axis=0), 0.0))
+    distance = np.sqrt((unsolved**2).sum() + ((outside + between_via) ** 2).sum())  # |h|
+    squared = (unsolved**2).sum() + (between_via**2).sum()
     by_means = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum()) + np.sqrt(lambda_mean * squared) / 2
 
     flat = weights.reshape(len(known) * c, -1)
     penalty = (flat * (between(kernel, known, known) @ flat)).sum()
     by_cost = np.sqrt((miss * pull).sum() + lambda_mean * max(float(penalty), 0.0))
-    return float(np.sqrt(spread[:, -1].max()) * min(by_means, by_cost))
+    at_points = float(np.sqrt(spread[:, -1].max()) * min(by_means, by_cost))
+    return ErrorBounds(at_points, float(np.sqrt(kernel.prior_variance.max()) * distance))

@@ -27,20 +27,24 @@ _FLOOR = 1e-14  # of k(s, s): a smaller residual is rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Features(Immutable):
-    """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of their kernel matrix."""
+    """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of their kernel matrix.
+
+    A pivot is one channel of a functional: of a kernel with rates, a value or its rate.
+    """
 
     kernel: Kernel
     pivots: Functionals  # r
+    channels: NDArray[np.intp]  # (r,) the channel of each pivot
     root: Array  # L (r, r)
 
     @classmethod
-    def at(cls, kernel: Kernel, pivots: Functionals) -> Features:
+    def at(cls, kernel: Kernel, pivots: Functionals, channels: NDArray[np.intp]) -> Features:
         """The features of these r pivots, without the last if rounding hides what they add."""
-        k = between(kernel, pivots, pivots)[:: kernel.channels, :: kernel.channels]
+        k = _columns(_columns(between(kernel, pivots, pivots), channels, kernel).T, channels, kernel)
         root, info = lapack.dpotrf(k, lower=1, clean=1)
         if info:
-            return cls.at(kernel, pivots.take(slice(info - 1)))
-        return cls(kernel, pivots, frozen(np.asfortranarray(root)))
+            return cls.at(kernel, pivots.take(slice(info - 1)), channels[: info - 1])
+        return cls(kernel, pivots, frozen(channels.copy()), frozen(np.asfortranarray(root)))
 
     @classmethod
     def of(cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float) -> tuple[Features, float]:
@@ -49,44 +53,48 @@ class Features(Immutable):
         return found, residual
 
     @classmethod
+    def spanning(cls, kernel: Kernel, points: Functionals, *, tolerance: float) -> Features:
+        """The features of N points that leave at most `tolerance` of them, whatever their rank."""
+        return cls.of(kernel, points, rank=len(points) * kernel.channels, tolerance=tolerance)[0]
+
+    @classmethod
     def made(
         cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float
     ) -> tuple[Features, float, list[Array]]:
         """The features of N points, at most `rank`, and their largest residual at one of them.
 
-        That is a share of k(s, s), and no more than `tolerance` unless the rank does not reach so
-        far. Last what they are in blocks of points, (r, n), if these are few enough. Where the
-        kernel has rates too, these may be pivots, as derivatives, and nothing is kept.
+        The residual is a share of k(s, s) of a channel. It is at most `tolerance`, unless the rank
+        is too low for that. The third value holds the features of the points in blocks (r, n C), if
+        these are few enough to keep.
         """
-        if kernel.channels > 1:
-            values = points.inputs[points.values]
-            points = Functionals.concatenated([points, Functionals(values, frozen(np.ones(values.shape)))])
-        count = len(points)
-        index = np.linspace(0, count - 1, min(count, _CANDIDATES)).astype(np.intp)
-        chosen = index[_pivots(kernel, points.take(index), rank, _MARGIN * tolerance)]
-        found = cls.at(kernel, points.take(chosen))
+        count, c = len(points), kernel.channels
+        index = np.linspace(0, count - 1, min(count, _CANDIDATES // c)).astype(np.intp)
+        chosen = _pivots(kernel, points.take(index), rank, _MARGIN * tolerance)
+        found = cls.at(kernel, points.take(index[chosen // c]), chosen % c)
         blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
-        z = [found(block) for block in blocks] if count * kernel.channels * rank <= KEPT else []
+        z = [found(block) for block in blocks] if count * c * rank <= KEPT else []
         for n in range(_ROUNDS):
             each = zip(blocks, z, strict=True) if z else ((block, found(block)) for block in blocks)
-            residual = np.concatenate([found.left(block, one)[:, 0] for block, one in each])
-            worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // 2]
+            residual = np.concatenate([found.left(block, one).max(axis=1) for block, one in each])
+            worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // (2 * c)]
             worst = np.sort(worst[residual[worst] > tolerance])
             if len(worst) == 0 or len(found.pivots) >= rank or n == _ROUNDS - 1:
                 break
             some = points.take(worst)
-            more = worst[_pivots(kernel, some, rank, tolerance, found(some)[:, :: kernel.channels])]
-            grown = cls.at(kernel, Functionals.concatenated([found.pivots, points.take(more)]))
+            more = _pivots(kernel, some, rank, tolerance, found(some))
+            pivots = Functionals.concatenated([found.pivots, some.take(more // c)])
+            grown = cls.at(kernel, pivots, np.concatenate([found.channels, more % c]))
             if len(grown.pivots) <= len(found.pivots):
                 break
             z = [grown._grown(block, one) for block, one in zip(blocks, z, strict=False)]  # noqa: SLF001
             found = grown
-        return found, float(residual.max()), z if kernel.channels == 1 else []
+        return found, float(residual.max()), z
 
     def _grown(self, points: Functionals, z: Array) -> Array:
         """The features of n points, of which the first (r', n C) are known."""
         r = len(z)
-        columns = between(self.kernel, points, self.pivots.take(slice(r, None)))[:, :: self.kernel.channels].T
+        added = between(self.kernel, points, self.pivots.take(slice(r, None)))
+        columns = _columns(added, self.channels[r:], self.kernel).T
         found = np.empty((len(self.pivots), columns.shape[1]), order="F")
         found[:r] = z
         found[r:] = lapack.dtrtrs(self.root[r:, r:], columns - self.root[r:, :r] @ z, lower=1)[0]
@@ -94,17 +102,18 @@ class Features(Immutable):
 
     def __call__(self, points: Functionals) -> Array:
         """z of n points, for each channel: (r, n C)."""
-        return self.of_kernel(between(self.kernel, points, self.pivots)[:, :: self.kernel.channels].T)
+        return self.of_kernel(between(self.kernel, points, self.pivots))
 
-    def of_kernel(self, columns: Array) -> Array:
-        """L^-1 times columns (r, n) of the pivots' kernels: the features there."""
+    def of_kernel(self, rows: Array) -> Array:
+        """The features (r, n) of kernel rows (n, r C) to the pivots and all their channels."""
+        columns = _columns(rows, self.channels, self.kernel).T
         return np.asarray(lapack.dtrtrs(self.root, columns, lower=1)[0])
 
     def kernel_weights(self, w: Array) -> Array:
         """The weights (r, O) of the pivots' kernels that stand for w (r, D) of the features."""
         values = lapack.dtrtrs(self.root, w, lower=1, trans=1)[0]
         weights = np.zeros((len(w), self.kernel.channels, w.shape[1]))
-        weights[:, 0] = values
+        weights[np.arange(len(w)), self.channels] = values
         return weights.reshape(len(w), -1)
 
     def residual(self, points: Functionals) -> Array:
@@ -117,24 +126,33 @@ class Features(Immutable):
         return np.asarray(np.maximum(shares, _FLOOR))
 
 
+def _columns(rows: Array, channels: NDArray[np.intp], kernel: Kernel) -> Array:
+    """Of rows (n, r C) the columns of these channels (r,): (n, r)."""
+    if kernel.channels == 1:
+        return rows
+    return np.asfortranarray(rows[:, np.arange(len(channels)) * kernel.channels + channels])
+
+
 def _pivots(
     kernel: Kernel, points: Functionals, rank: int, tolerance: float, known: Array | None = None
 ) -> NDArray[np.intp]:
-    """Which points make the best pivots, greedily: where the share of the residual is largest.
+    """The best pivots among the channels of N points, as numbers below N C.
 
-    Beside the pivots of features that are known, (r', n).
+    They are chosen greedily: the next is where the share of the residual is largest. `known` (r',
+    N C) are the features of pivots that there are already.
     """
-    c, deviation = kernel.channels, np.sqrt(variances(kernel, points)[:, 0])
-    before = np.empty((0, len(points))) if known is None else known / deviation
+    c, deviation = kernel.channels, np.sqrt(variances(kernel, points)).ravel()
+    count = len(deviation)
+    before = np.empty((0, count)) if known is None else known / deviation
     residual = 1 - (before**2).sum(axis=0)
-    columns = np.empty((min(rank, len(before) + len(points)), len(points)))
+    columns = np.empty((min(rank, len(before) + count), count))
     columns[: len(before)] = before
     chosen: list[int] = []
     for j in range(len(before), len(columns)):
         n = int(residual.argmax())
         if residual[n] <= tolerance:
             break
-        column = between(kernel, points.take(slice(n, n + 1)), points)[0, ::c]
+        column = between(kernel, points.take(slice(n // c, n // c + 1)), points)[n % c]
         column = column / (deviation[n] * deviation) - columns[:j, n] @ columns[:j]
         columns[j] = column / np.sqrt(residual[n])
         residual -= columns[j] ** 2

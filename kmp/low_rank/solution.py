@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array, numbers
+from kmp.checks import Array, brief, numbers
 from kmp.database import Changes, Database
 from kmp.functionals import Functionals
 from kmp.hyperparameters import Hyperparameters
@@ -19,9 +19,9 @@ from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.linear_algebra import kron_identity
 from kmp.low_rank.conditioned import Conditioned
-from kmp.low_rank.error_bound import error_bound
+from kmp.low_rank.error_bound import error_bounds
 from kmp.low_rank.features import BLOCK, KEPT, Features
-from kmp.solution import check_resolved
+from kmp.solution import ErrorBounds, check_resolved
 
 RANK = 400
 TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
@@ -61,7 +61,7 @@ class LowRank(Immutable):
 
         Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
         """
-        check_resolved(hyperparameters, database, name="lambda_mean")
+        check_resolved(hyperparameters, database, name="lambda_mean", both=True)
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
@@ -102,7 +102,13 @@ class LowRank(Immutable):
         information = numbers("information", arrays["information"], r * d, r * d)
         w = numbers("features", arrays["features"], r, d)
         directions = arrays.get("pivot_directions")
-        features = Features.at(hyperparameters.kernel, Functionals.checked(pivots, directions))
+        c = hyperparameters.kernel.channels
+        channels = numbers("pivot_channels", arrays.get("pivot_channels", np.zeros(r)), r)
+        if not np.isin(channels, np.arange(c)).all():
+            raise ValueError(f"pivot_channels: {brief(channels)} given, whole numbers below {c} needed.")
+        features = Features.at(
+            hyperparameters.kernel, Functionals.checked(pivots, directions), channels.astype(np.intp)
+        )
         if (usable := len(features.pivots)) < r:
             raise ValueError(f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the primitive anew.")
         return cls(hyperparameters, database, features, information, w)
@@ -123,8 +129,8 @@ class LowRank(Immutable):
         return frozen(self.features.kernel_weights(self.w))
 
     @cached_property
-    def error_bound(self) -> float:
-        return error_bound(self, self.features)
+    def error_bounds(self) -> ErrorBounds:
+        return error_bounds(self, self.features)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
@@ -144,13 +150,17 @@ class LowRank(Immutable):
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         """The base's solution conditioned on these changes, or fitted anew if they are many."""
         base = self.base or self
-        if len(changes.replaced) + len(changes.inputs) <= len(base.centres):
+        changed = len(changes.replaced) + len(changes.inputs)
+        if changed * base.features.kernel.channels <= len(base.centres):
             return Conditioned(base, changes)
         # So many changes cost more, and lose more digits, than a new solution.
         database = base.database.changed(changes)
-        rank = max(RANK, len(base.centres) + len(changes.inputs))
+        rank = max(RANK, len(base.centres) + len(changes.inputs) * base.features.kernel.channels)
         features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
         return LowRank.fit(self.hyperparameters, database, features, base)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> LowRank:
+        return LowRank(hyperparameters, self.database, self.features, self.information, self.w)
 
     def with_weights(self, weights: Array) -> Self:
         return self._with_cached(weights=weights)
@@ -161,18 +171,20 @@ class LowRank(Immutable):
         arrays = {"pivots": base.centres, "information": base.information, "features": base.w}
         if base.functionals.directions is not None:
             arrays["pivot_directions"] = base.functionals.directions
+        if base.features.kernel.channels > 1:
+            arrays["pivot_channels"] = base.features.channels.astype(np.float64)
         return arrays
 
     def whitened_one(self, row: Array) -> tuple[Array, Array]:
         """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
         c = self.features.kernel.channels
-        z = self.features.of_kernel(row[..., : len(self.centres) * c : c].T)
+        z = self.features.of_kernel(row[..., : len(self.centres) * c])
         return z.reshape(len(self.centres), -1), self.inverse_factor.times_one(z)
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
         c = self.features.kernel.channels
-        z = self.features.of_kernel(rows[:, : len(self.centres) * c : c].T)
+        z = self.features.of_kernel(rows[:, : len(self.centres) * c])
         return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.inverse_factor.times_many(z, c)
 
     def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
@@ -189,7 +201,7 @@ class LowRank(Immutable):
     def covariance_factor(self) -> Array:
         """The same with the lambda of the covariance."""
         parameters = self.hyperparameters
-        check_resolved(parameters, self.database)
+        check_resolved(parameters, self.database, both=True)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self.mean_factor
         return _factorised(self.information, parameters.lambda_covariance)

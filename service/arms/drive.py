@@ -12,10 +12,12 @@ import zenoh
 
 from service.arms.playback import Playback, SpeedLimits
 from service.client import Follower, UnreachableError
-from service.config import JointSettings
+from service.config import RATES_HZ, JointSettings
 from service.contract.channels import key
 from service.contract.explain import ExplainedError
 from service.core.frame import Vector
+
+SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
 
 
 class DriveError(ExplainedError, RuntimeError):
@@ -64,26 +66,23 @@ def follow(
     session: zenoh.Session,
     cell: str,
     *,
-    tick_s: float,
     stop: threading.Event,
     wait_s: float = float("inf"),
     say: Callable[[str], None] = say,
 ) -> Playback:
-    """Drives an arm by a cell's commands until `stop`, and brakes it then. `tick_s` is the period
-    of the commands.
+    """Drives an arm by a cell's commands until `stop`, and brakes it then.
 
-    Raises DriveError, and UnreachableError where no command came for `wait_s` [s].
+    Raises DriveError, also where commands come too slowly to be followed, and UnreachableError
+    where no command came for `wait_s` [s].
     """
-    playback = Playback(
-        drive.limits, drive.stands_at(), tick_s=tick_s, period_s=drive.period_s, speed_limits=drive.speed_limits
-    )
+    playback = Playback(drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits)
     passed_s, told_s, following, refused = 0.0, 0.0, False, 0
     with Follower(session, drive.limits.names, cell) as follower, drive:
         while True:
             measured = drive.read()
             passed_s += measured.elapsed_s
-            if passed_s - told_s >= 0.9 * tick_s:
-                follower.tell(measured.position.tolist(), measured.velocity.tolist())
+            if passed_s - told_s >= 0.9 * max(playback.tick_s, SHORTEST_TICK_S):
+                follower.tell(playback.in_turn(measured.position).tolist(), measured.velocity.tolist())
                 told_s = passed_s
             stopping = stop.is_set()
             moved = playback.step(
@@ -97,6 +96,8 @@ def follow(
             if following != playback.following:
                 following, wait_s = not following, float("inf")
                 say("commands come, the arm follows" if following else "no commands: the arm brakes")
+            if (reason := playback.too_slow) and not moved.velocity.any():
+                raise DriveError(f"the daemon of cell {cell}: {reason}")
             if playback.refused and not refused:
                 say(f"refused: {playback.reason}")
             refused = playback.refused

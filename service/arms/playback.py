@@ -9,19 +9,23 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from statistics import fmean, median_low
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from kmp.compiled import compiled
-from service.client import BRAKE_AFTER_S, Command
-from service.config import JointSettings
+from service.client import BRAKE_AFTER_S, Command, no_room_to_brake
+from service.config import RATES_HZ, JointSettings
 from service.core.frame import Records, Vector, parameters
+from service.core.intake.arm_samples import in_turn
 from service.core.limiter.limiter import Limited, Limiter
 
-REJOIN_AFTER_S = 0.1  # without a command; then only one is followed that begins where the arm stands ...
-REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # ... so nearly
-MOST_TICKS = 50  # that a sequence skips: others are another daemon's, or one's that started anew
+REJOIN_AFTER_S = 0.1  # a new sequence begins after this silence, or with a tick number this far from the last
+REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # a new sequence must begin this near to where the arm stands
+TICK_RANGE_S = 0.9 / RATES_HZ[1], 1.1 / RATES_HZ[0]  # stamps farther or less apart per tick: a clock was set
+TICK_SAMPLES = 15  # the length of a tick is the mean over these samples
+TICK_OUTLIER = 0.1  # samples that differ from their median by a larger share are left out
 MOST_DELAY_S = BRAKE_AFTER_S  # behind the newest command: beyond it the arm brakes all the same
 FEEDBACK = 8.0  # [1/s] of a position error that becomes velocity ...
 MOST_FEEDBACK_RADPS = 0.25  # ... and not more, as after a pause
@@ -55,8 +59,9 @@ class Playback:
     """What a drive is to do in each of its periods, given the commands that came.
 
     `limits` are the drive's, of acceleration and jerk as well; an arm may be allowed less where it
-    stands: `speed_limits`. `tick_s` is the commands' period, `period_s` the drive's, `position`
-    (J,) [rad] where the arm stands at rest. Nothing here reads a clock, so none can step.
+    stands: `speed_limits`. `period_s` is the drive's, `position` (J,) [rad] where the arm stands at
+    rest. The commands' period is measured: it is the difference of their stamps per tick. Nothing
+    here reads a clock, so none can step.
     """
 
     def __init__(
@@ -64,12 +69,12 @@ class Playback:
         limits: JointSettings,
         position: Sequence[float] | Vector,
         *,
-        tick_s: float,
         period_s: float,
         speed_limits: SpeedLimits | None = None,
     ) -> None:
         self.refused, self.reason = 0, ""  # commands that were not followed, and why the last one was not
-        self._tick_s, self._period_s, self._speed_limits = tick_s, period_s, speed_limits
+        self.tick_s = 0.0  # of the commands, as measured; 0: not known yet
+        self._period_s, self._speed_limits, self._limits = period_s, speed_limits, limits
         self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
         self._max_velocity, max_jerk = np.array(limits.velocity), np.array(limits.jerk)
         self._parameters = parameters(
@@ -83,9 +88,11 @@ class Playback:
         self._state[0] = position
         self._knots: deque[Knot] = deque()
         self._newest: Knot | None = None  # of the sequence in force
+        self._newest_stamp_ns = 0
+        self._lengths_s: deque[float] = deque(maxlen=TICK_SAMPLES)  # of ticks, in the sequence in force
         self._now = self._heard = self._owed = 0.0  # [s] counted in steps; when the newest came; off the drive's clock
         self._offset = self._needed = 0.0
-        here = Knot(0, 0.0, self._state[:2]), Knot(1, tick_s, self._state[:2])
+        here = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
         self._knots.extend(here)
         self._moved()  # compiled now: there is no time for it in a period
         self._knots.clear()
@@ -99,9 +106,22 @@ class Playback:
         return len(self._knots) > 1
 
     @property
+    def too_slow(self) -> str:
+        """Why commands come too slowly to be followed; empty where they do not, or too few came."""
+        return no_room_to_brake(self.tick_s) if len(self._lengths_s) == TICK_SAMPLES else ""
+
+    @property
     def delay_ticks(self) -> float:
         """How many ticks behind the newest command the arm is led, when that comes."""
-        return 0.0 if self._newest is None else (self._newest.time_s + self._offset - self._heard) / self._tick_s
+        if self._newest is None or not self.tick_s:
+            return 0.0
+        return (self._newest.time_s + self._offset - self._heard) / self.tick_s
+
+    def in_turn(self, position: Sequence[float] | Vector) -> Vector:
+        """Measured joints (J,) [rad], the continuous ones in the turn in which they are led, as a
+        drive may wrap them at ±pi.
+        """
+        return in_turn(self._limits, np.array(position), self._state[0])
 
     def step(
         self,
@@ -117,7 +137,7 @@ class Playback:
         the last step keeps the pace of a loop that is not punctual; else each is one period.
         """
         if measured is not None:
-            self._state[0] = measured
+            self._state[0] = self.in_turn(measured)
         if 0.0 <= elapsed_s <= MOST_ELAPSED_S:
             self._owed += elapsed_s - self._period_s
         self._paused = self._owed > PAUSE_S
@@ -155,31 +175,44 @@ class Playback:
         if (fast := np.abs(velocity) - self._max_velocity).max() > TOLERANCE:
             return f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} rad/s"
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
-        silent_s = self._now - self._heard
-        if last is None or silent_s > REJOIN_AFTER_S or abs(tick - last.tick) > MOST_TICKS:
-            off = np.abs(position - at).max()
+        ticks = 0 if last is None else tick - last.tick
+        if last is None or max(self._now - self._heard, abs(ticks) * self.tick_s) > REJOIN_AFTER_S:
+            off = (np.abs(position - at) / np.array(self._limits.per_rad)).max()
             if self._state[1:].any() or off > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
                 return f"a new sequence that does not begin where the arm stands: {off:.3f} rad off, or moving"
             self._knots.clear()
+            self._lengths_s.clear()
             time_s = self._now
-        elif tick <= last.tick:
+        elif ticks <= 0:
             return ""  # late or twice: the cubic goes on without it
         else:
-            ticks = tick - last.tick
-            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * self._tick_s + TOLERANCE).any():
+            lengths_s, since_s = self._lengths_s.copy(), (command.stamp_ns - self._newest_stamp_ns) * 1e-9
+            if TICK_RANGE_S[0] <= since_s / ticks <= TICK_RANGE_S[1]:
+                lengths_s.append(since_s / ticks)
+            if not (tick_s := _mean_length(lengths_s) if lengths_s else self.tick_s):
+                return (
+                    f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after the command before, "
+                    f"{1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a tick needed"
+                )
+            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * tick_s + TOLERANCE).any():
                 return "a jump from the command before"
-            time_s = last.time_s + self._tick_s * _steps(last, position, velocity, ticks, self._tick_s)
+            self.tick_s, self._lengths_s = tick_s, lengths_s
+            time_s = last.time_s + tick_s * _steps(last, position, velocity, ticks, tick_s)
         latest = self._now - time_s + MOST_DELAY_S
         if self._knots:  # a segment is of use from now on, and should have been when it began
             begins_s = self._knots[-1].time_s
-            if time_s - begins_s < 2.5 * self._tick_s:  # one that was lost alone is not waited for
-                begins_s = time_s - self._tick_s
+            if time_s - begins_s < 2.5 * self.tick_s:  # one that was lost alone is not waited for
+                begins_s = time_s - self.tick_s
             needed = self._needed if self._paused else self._now - begins_s
             self._needed = min(max(self._needed, needed), latest)
             self._offset = min(self._offset, latest)
         else:
             self._needed = self._offset = self._now - time_s
         self._newest, self._heard = Knot(tick, time_s, np.stack((position, velocity))), self._now
+        self._newest_stamp_ns = command.stamp_ns
+        if reason := no_room_to_brake(self.tick_s):
+            self._knots.clear()
+            return reason
         self._knots.append(self._newest)
         return ""
 
@@ -198,6 +231,12 @@ class Playback:
         if self._speed_limits is not None:
             wanted = np.clip(wanted, *self._speed_limits(self._state[0], self._state[1]))
         return wanted
+
+
+def _mean_length(lengths: deque[float]) -> float:
+    """The mean of lengths without outliers."""
+    middle = median_low(lengths)
+    return fmean(one for one in lengths if abs(one - middle) <= TICK_OUTLIER * middle)
 
 
 def _steps(last: Knot, position: Vector, velocity: Vector, ticks: int, tick_s: float) -> float:

@@ -1,19 +1,30 @@
-"""`thirdhand completion`: what lets a shell complete commands and options."""
+"""`thirdhand completion`: the script by which a shell completes commands and options."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
+from service.cli.progress import say
+from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 
 
 def completion(args: argparse.Namespace) -> int:
-    """Exit code 0 once the shell's script is printed."""
+    """Exit code 0 once the shell's script is printed or written."""
     from service.cli.main import parser  # which names this module
 
     try:
         import shtab
     except ModuleNotFoundError:
         raise ExplainedError("shtab is not installed: pip install shtab") from None
-    print(shtab.complete(parser(), shell=args.shell))
+    script = shtab.complete(parser(), shell=args.shell)
+    if args.output:
+        path: Path = args.output.expanduser()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(path)
+        path.write_text(script, encoding="utf-8")
+        say(f"{path} written; it is in force in the next shell")
+    else:
+        print(script)
     return 0

@@ -14,9 +14,10 @@ from typing import Any
 
 from service.child import python
 from service.cli.progress import say
-from service.client import Client, open_session
+from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
+from service.daemon.machine import LATE_MS, MISSED_SHARE
 from service.launch import engine_of, launched, played
 from service.shipped import cell_of
 
@@ -38,16 +39,17 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def run(
-    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int, say: Callable[[str], None]
+    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
-    engine, settings = engine_of(engine), cell_of(arm)
+    engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
+    if reason := no_room_to_brake(settings.period_s):
+        raise DemoError(reason)
     say("starting: the scene, then the service")
     out.mkdir(parents=True, exist_ok=True)
     request = _output("sim.scene", "--arm", arm, *([str(scene)] if scene else []), say=say)
-    bench = ["--engine", engine, "--arm", arm, *(["--scene", str(scene)] if scene else [])]
     add = decode_request(request.encode(), Add)
-    with launched(out, "--arm", "state", "--rate", str(rate_hz), settings=settings, record=out, say=say) as service:
+    with launched(out, "--joints", "state", settings=settings, record=out, say=say) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
@@ -56,6 +58,7 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
             report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
@@ -72,9 +75,11 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
     found = reported(recording)
     timing = found.columns.timing
+    bench = too_busy(report)
     for name, event in report["events"].items():
         if not event["reached"]:
-            event["why"] = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+            why = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+            event["why"] = f"this machine was too busy, {bench}; {why}" if bench else why
     return {
         "success": report["success"],
         "events": report["events"],
@@ -85,9 +90,21 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
         "realtime": status.realtime,
+        "busy": ", ".join(filter(None, (bench, status.busy))),
         "recording": recording,
         "rrd": rrd,
     }
+
+
+def too_busy(report: dict[str, Any]) -> str:
+    """How this machine was too busy for the bench, by its report; empty where it was not."""
+    periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
+    found = []
+    if skipped > MISSED_SHARE * periods:
+        found.append(f"the bench missed {skipped} of its {periods} periods")
+    if pause_ms > LATE_MS:
+        found.append(f"the bench stood still for {pause_ms:.0f} ms")
+    return ", ".join(found)
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
@@ -124,6 +141,7 @@ def text(report: dict[str, Any]) -> str:
         f"p99 {latency['p99']:.2f}, max {latency['max']:.2f} ms",
         f"  late     p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} µs;  "
         f"work p50 {work['p50']:.0f}, p99 {work['p99']:.0f}, max {work['max']:.0f} µs",
+        *([f"  machine  too busy: {report['busy']}"] if report["busy"] else []),
         "",
         f"  thirdhand replay {_shown(report['recording'])}",
         f"  thirdhand view {_shown(report['rrd'])}",

@@ -11,7 +11,7 @@ import msgspec
 
 from service.cli.status import AHEAD_MS
 from service.contract.channels import BY_KEY, key
-from service.contract.incidents import SOURCE_NAMES, Evidence, explained, in_brief, remedy
+from service.contract.incidents import FREE_THE_MACHINE, SOURCE_NAMES, Evidence, explained, in_brief, remedy
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
 from service.contract.requests import Source, Status
@@ -22,14 +22,14 @@ SLACK = 0.9  # of the least rate
 OFTEN = 0.05  # share of what comes that is rejected, above which it is no accident
 NOISY_MM = 8.0  # of a hand's samples, each axis: no tracker that sees it well
 MOST_OTHERS = 4  # keys that are named
-ROOM_MB = 2000.0
+ROOM_MB, LASTS_H = 2000.0, 1.0  # of free space, and how long that is to last at least
 MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
 OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
-STALLED_US = 20_000.0  # late by more a loop leaves an arm without commands, and reads none of its joints
 TOLD_RAD, STUCK = 0.03, 0.1  # what a joint is told to travel before it can be stuck, and the share that it did
 OFF_M, LONG_S = 0.05, 1.5  # a tool farther off its target, and for longer, does not only lag
 LEVEL_M, RAISED_M = 0.03, 0.10  # of hands: the span of z, and of y, by which y looks to be the height
 Y_UP = (0.0, 0.0, 0.0, 0.7071, 0.0, 0.0, 0.7071)  # base_from_tracker of a tracker whose y points up
+MACHINE = "machine"
 LEVELS = ("wrong", "note", "ok")
 OWN_CLOCK_S = 0.5  # a status is up to 0.1 s old
 
@@ -74,7 +74,9 @@ def findings(
     joints were heard, in whatever cell, and `travels` how far each joint was told to go, and went,
     since the first status [rad].
     """
-    found = _in_order_of_cause(seen, own_ns, own_version, published, travels or {})
+    found = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}))
+    if any(finding.level == "wrong" for finding in found):  # it may be the machine that makes it look so
+        found = [wrong(*msgspec.structs.astuple(one)[1:]) if one.what == MACHINE else one for one in found]
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
 
 
@@ -92,37 +94,29 @@ def _in_order_of_cause(
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", "wait: it begins once the recorder listens")
         return
+    yield from _machine(before, now)
     for name in now.sources:
         yield from _source(before, now, name, published)
     yield _driver(before, now)
     yield from _drives(travels)
     yield from _hands_and_skill(seen)
-    yield _mode(before, now)
+    yield _mode(now)
     yield from _tool(seen)
-    yield from _machine(before, now)
+    yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
         told = f"{abs(apart_s):.3g} s {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
         yield Finding("note", "clock here", told, f"within {OWN_CLOCK_S:g} s", "synchronise the clocks (chrony, PTP)")
 
 
-def _mode(before: Status, now: Status) -> Finding:
+def _mode(now: Status) -> Finding:
     told = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
     told += f": {now.because}" if now.because else ""
     advice = now.remedy
-    if now.reason in ("arm_silent", "arm_error") and not _keeps_time(before, now):
-        told += f"; {now.missed} deadlines are missed: this machine or the bench could not keep time"
-        advice = "see what else runs there, `thirdhand bench` measures it; a lower --rate; then `thirdhand reset`"
-    elif now.reason == "arm_error":
+    if now.reason == "arm_error":
         advice += "; if it has not moved since commands began: are the drives on?"
     level = "ok" if now.mode == "follow" else "note" if now.reason == "operator" else "wrong"
     return Finding(level, "mode", told, "follow", advice)
-
-
-def _keeps_time(before: Status, now: Status) -> bool:
-    """Whether the loop ran on time, lately and since the daemon began."""
-    lately = now.missed - before.missed <= MISSED * max(now.tick - before.tick, 1)
-    return lately and now.missed <= MISSED * max(now.tick, 1) and now.lateness_us.max < STALLED_US
 
 
 def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
@@ -174,7 +168,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     told = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
     told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     fine = source.fresh and source.rate_hz >= SLACK * least
-    advice = "" if source.fresh else _of_unit(source) or remedy(source.cause)
+    advice = "" if source.fresh else _of_unit(source) or source.advice or remedy(source.cause)
     rejected = list(_rejected(before, now, name))
     yield from rejected
     if source.age_ms is None and any(one.level == "wrong" for one in rejected):
@@ -197,7 +191,7 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         if rate and not (share > OFTEN and cause in ("older", "jumped")):  # said below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > OFTEN * came else "note"
-            advice = (_of_unit(source) if cause == source.cause else "") or remedy(cause)
+            advice = (_of_unit(source) or source.advice if cause == source.cause else "") or remedy(cause)
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
     noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM
     if share > OFTEN or noisy:
@@ -219,7 +213,7 @@ def _of_unit(source: Source) -> str:
 
 def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
-        return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --arm state")
+        return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --joints state")
     commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
     told = f"{'somebody' if heard else 'nobody'} listens to {commands}"
     return judged(heard, "arm's driver", told, "a driver", f"let the arm's driver subscribe to {commands}")
@@ -272,11 +266,18 @@ def _is_y_up(seen: Sequence[Status]) -> bool:
 
 def _machine(before: Status, now: Status) -> Iterator[Finding]:
     missed, ticks, late_us = now.missed - before.missed, max(now.tick - before.tick, 1), now.lateness_us.p99
+    if now.busy:
+        advice = FREE_THE_MACHINE.replace("`", "")
+        wanted = "time for all that runs in real time; else arm, network and clocks seem to fail"
+        yield Finding("note", MACHINE, f"too busy: {now.busy}", wanted, advice)
     told = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period
     wanted = f"less than {MISSED:.0%} missed, and {most_us:.0f} µs"
     advice = "see what else runs there; `thirdhand bench` measures it"
     yield judged(missed <= MISSED * ticks and late_us <= most_us, "loop", told, wanted, advice)
+
+
+def _privileges_and_recording(now: Status) -> Iterator[Finding]:
     told, wanted = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
     yield judged(now.realtime, "real time", told, wanted, "raise its rtprio limit, as docs/hardware.md says")
     told, wanted = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
@@ -290,8 +291,26 @@ def _machine(before: Status, now: Status) -> Iterator[Finding]:
     advice = "see that the folder is there and has room; `thirdhand replay` says what is missing"
     yield judged(state != "interrupted" and not lost, "recording", told, "recording, none lost", advice)
     if free_mb is not None:
-        told, wanted = f"{free_mb / 1000:.1f} GB free where it records", f"more than {ROOM_MB / 1000:g} GB"
-        yield judged(free_mb > ROOM_MB, "disk", told, wanted, "make room, or lower [files] keep_mb")
+        yield _disk(free_mb, scribe.get("mb_per_hour"), scribe.get("keep_mb_left"))
+
+
+def _disk(free_mb: float, mb_per_hour: float | None, keep_mb_left: float | None) -> Finding:
+    """How long the disk lasts where the cell records."""
+    told, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
+    if mb_per_hour:
+        told += f", {mb_per_hour / 1000:.2g} GB an hour written"
+        if keep_mb_left is not None and keep_mb_left < free_mb:
+            told += f": in {_hours(keep_mb_left / mb_per_hour)} the oldest recordings begin to be removed"
+        else:
+            told += f": full in {_hours(free_mb / mb_per_hour)}"
+            lasts = free_mb / mb_per_hour > LASTS_H
+    wanted = f"more than {ROOM_MB / 1000:g} GB, and {LASTS_H:g} h"
+    advice = "make room, or lower [files] keep_mb, or rerun_mb_per_hour"
+    return judged(free_mb > ROOM_MB and lasts, "disk", told, wanted, advice)
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:.1f} h" if hours < 48 else f"{hours / 24:.0f} days"
 
 
 def _outside(at: Vector3, box: tuple[Vector3, Vector3]) -> float:

@@ -22,7 +22,9 @@ from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
 from service.client import Overheard, StartingError, UnreachableError
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
+from service.contract.explain import in_words
 from service.contract.messages import WireError
+from service.contract.printable import printable_lines
 
 PROBE_S = 1.0
 PUBLISHED = ("**/hands/*", "**/joints/state")  # of whatever cell: a name may be wrong
@@ -34,7 +36,7 @@ def doctor(args: argparse.Namespace) -> int:
     for finding in _looked_at(args):
         found.append(finding)
         if not args.json:
-            print(finding.line(), flush=True)
+            print(printable_lines(finding.line()), flush=True)
     count = sum(finding.level == "wrong" for finding in found)
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
@@ -137,7 +139,7 @@ def unreachable(endpoint: str, said: str) -> Finding:
         return wrong("port", f"nothing listens on {host} port {port}", wanted, remedy)
     except (OSError, OverflowError) as error:
         remedy = "look at the address, the network and its firewall"
-        return wrong("port", f"{host} port {port} cannot be reached: {error}", wanted, remedy)
+        return wrong("port", f"{host} port {port} cannot be reached: {in_words(error)}", wanted, remedy)
     secured = "the --certificate of your role" if protocol == "tls" else "tls/... and a --certificate"
     remedy = f"a daemon may need {secured}, or be overrun; from another program take the port by another --listen"
     return wrong("port", f"something listens on {host} port {port}, but opens no Zenoh session", wanted, remedy)

@@ -8,14 +8,13 @@ import threading
 
 from service.cli.progress import say
 from service.cli.usage import reaching
-from service.client import Client, StartingError, UnreachableError
+from service.client import Client
+from service.client.session import tried
 from service.config import Settings
 from service.described_arm import UnreadableError
 from service.shipped import cell_of
 
 DRIVES = ("franka", "simulated")
-MOST_RATE_OFF = 0.3  # share of it: deadlines that a busy machine misses ...
-MEASURED_TICKS = 200  # ... once so many tell it
 
 
 def follow(args: argparse.Namespace) -> int:
@@ -27,30 +26,19 @@ def follow(args: argparse.Namespace) -> int:
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
     cell = settings.cell if args.config and not args.cell else reach.cell
-    with reach.session(at_once=True) as session:
+    with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
         from service.arms.drive import Drive, DriveError  # heavy, as all below: nobody's absence is told sooner
         from service.arms.drive import follow as driven
         from service.arms.franka import FrankaArm
         from service.arms.simulated import SimulatedArm
         from service.daemon.clock import ask_for_real_time
 
-        client = Client(session, cell)
-        try:
-            status = client.status()
-        except UnreachableError as error:
-            if isinstance(error, StartingError):
-                say(f"waiting: {error}")
-            status = client.wait_until_ready(timeout_s=args.wait)
+        status = Client(session, cell).wait_until_ready(timeout_s=args.wait, silent=False)
         if status.joints != settings.joints.names:
             raise DriveError(
                 f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; here "
                 f"{len(settings.joints.names)} were configured, {', '.join(settings.joints.names)}: "
                 "give --config, the daemon's own settings"
-            )
-        if status.tick > MEASURED_TICKS and abs(status.rate_hz / settings.rate_hz - 1.0) > MOST_RATE_OFF:
-            raise DriveError(
-                f"the daemon of cell {cell} runs at {status.rate_hz:.0f} Hz, {settings.rate_hz} are configured here: "
-                "give --config, the daemon's own settings, with rate_hz in it"
             )
         drive: Drive = FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
         stop = threading.Event()
@@ -58,6 +46,6 @@ def follow(args: argparse.Namespace) -> int:
             signal.signal(number, lambda *_: stop.set())
         ask_for_real_time()
         say(f"{args.arm} of cell {cell} is driven; Ctrl-C ends it")
-        playback = driven(drive, session, cell, tick_s=settings.period_s, stop=stop, wait_s=args.wait)
+        playback = driven(drive, session, cell, stop=stop, wait_s=args.wait)
     say(f"ended at rest, {playback.delay_ticks:.1f} ticks behind; {playback.refused} commands were refused")
     return 0

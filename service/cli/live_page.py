@@ -1,50 +1,63 @@
 """The page of `thirdhand view live --web`: mode and reason, buttons for hold, resume and reset, and
 Rerun's web viewer, on a phone a plain view from above, all at one address.
 
-It is a proxy for the viewer's server and the daemon's stream on this machine: it leaves out
-what a browser does not draw. A request that changes something needs the token in the page, which
-no other site can read.
+The page's server passes on the viewer's files and the daemon's stream from this machine, without
+the samples that a browser does not draw. A request that changes something needs the token in the
+page, which no other site can read. Nothing is fetched from elsewhere.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import functools
 import hmac
 import html
 import http.client
-import http.server
 import ipaddress
 import json
 import re
 import secrets
+import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
+import aiohttp
 import zenoh
+from aiohttp import web
+from yarl import URL
 
-from service.client import Client
+from service.client import Client, RefusedError, decoded
 from service.contract import channels
 from service.contract.explain import ExplainedError
+from service.contract.incidents import in_brief
+from service.contract.requests import Status
 
 ORDERS = ("hold", "resume", "reset")
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
-PIECE = 64 * 1024
+PIECE = 64 * 1024  # bytes of a file that are passed on at once
 MOST_BODY = 4096  # bytes of a request
-TIMEOUT_S = 10.0
-START_S = 15.0
+TIMEOUT_S = 10.0  # the viewer's server and the stream answer within this time
+START_S = 15.0  # the viewer's server starts within this time
 HTML = "text/html; charset=utf-8"
-FROZEN_S = 30.0  # of a browser that reads nothing, for which others would wait
-A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which all comes that is repeated often
-BEHIND_MS, PATIENCE_S = 1000.0, 15.0  # of what is sent ahead, and without word of a picture
-HISTORY_S = 2.0  # in which what was drawn before comes, and is left out
-# of gRPC-Web, after its header of 5 bytes: rows of a recording, not static
+INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+FROZEN_S = 30.0  # a browser that sends no request, or reads no answer, for this long is disconnected
+A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which everything frequent is repeated
+BEHIND_MS = 1000.0  # a picture older than this, compared with the newest message sent, makes no room for more
+PATIENCE_S = 15.0  # a viewer that does not report a picture for this time is sent messages again
+HISTORY_S = 2.0  # the samples of the past, which arrive first, are left out for this time
+# A message of gRPC-Web after its header of 5 bytes: rows of a recording that are not static.
 SAMPLES = re.compile(rb"\n[\x80-\xff]*.\x12[\x80-\xff]*.\n.\x08\x01.*8\0", re.DOTALL)
+FOREIGN = "This page answers at this machine's own address only, and only to itself."
+UNKNOWN = "There is no such page. The page of this cell is at /."
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
-_DROPPED = {"connection", "keep-alive", "transfer-encoding", "content-length", "date", "server"}
+_OF_A_CONNECTION = {"connection", "keep-alive", "transfer-encoding", "content-length"}  # headers that are not passed on
+_DROPPED_OF_REQUEST = {*_OF_A_CONNECTION, "host", "origin"}
+_DROPPED_OF_ANSWER = {*_OF_A_CONNECTION, "date", "server"}
 
 
 class Address(NamedTuple):
@@ -60,18 +73,18 @@ class Address(NamedTuple):
 class Latest:
     """The newest status of the daemon, and its age."""
 
-    def __init__(self, session: zenoh.Session, cell: str, first: dict[str, Any]) -> None:
+    def __init__(self, session: zenoh.Session, cell: str, first: Status) -> None:
         self._status, self._at = first, time.monotonic()
         self._subscriber = session.declare_subscriber(channels.key(cell, "status"), self._take)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        with contextlib.suppress(ValueError):
-            self._status, self._at = json.loads(sample.payload.to_bytes()), time.monotonic()
+        with contextlib.suppress(RefusedError):
+            self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
 
     @property
     def stream(self) -> Address:
         """The server of the live view: another one once the scribe was started again."""
-        parts = urlsplit((self._status["scribe"].get("live") or "").removeprefix("rerun+"))
+        parts = urlsplit(str(self._status.scribe.get("live") or "").removeprefix("rerun+"))
         return Address(parts.hostname or "127.0.0.1", parts.port or 0)
 
     def summary(self) -> dict[str, Any]:
@@ -79,17 +92,16 @@ class Latest:
         [ms], which live view it serves, and further facts in one line.
         """
         now, age_s = self._status, time.monotonic() - self._at
-        hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now["hand_age_ms"].items())
-        near = f"{100 * now['hand_distance_m']:.0f} cm to the nearest, " if hands else ""
-        facts = (
-            f"{hands or 'no hands seen'}; {near}{now['rate_hz']:.0f} Hz, {now['missed']} missed; skill {now['skill']}"
-        )
-        told = {name: now[name] for name in ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m")}
+        hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
+        near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
+        facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
+        told = {name: getattr(now, name) for name in ("mode", "reason", "because", "hands_m")}
+        told |= {name: getattr(now, name) for name in ("tool_m", "target_m", "std_m")}
         remedy = _COMMAND.sub(
             lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
-            now["remedy"],
+            now.remedy,
         )
-        now_ms, live = now["time_ns"] / 1e6 + 1000 * age_s, f"{self.stream} {now['scribe'].get('pid')}"
+        now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
         return told | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
@@ -117,119 +129,213 @@ class Room:
         return self._left >= 0
 
 
-class _Handler(http.server.BaseHTTPRequestHandler):
-    """One request to the page's server."""
+class LivePage:
+    """The page's server."""
 
-    protocol_version = "HTTP/1.1"
-    timeout = FROZEN_S
-    server_version, sys_version = "thirdhand", ""
-    server: LivePage
+    def __init__(self, *, client: Client, latest: Latest, cell: str, viewer: Address) -> None:
+        self._client, self._latest, self._cell, self._viewer = client, latest, cell, viewer
+        self._token, self._page = secrets.token_urlsafe(24), secrets.token_hex(4)
+        self._rooms: dict[str, Room] = {}  # by the viewer's address, each with a number of its own
+        self._unheard: set[web.RequestHandler] = set()  # connections on which no request came yet
+        self._application = web.Application(client_max_size=MOST_BODY, middlewares=[self._guarded])
+        self._application.add_routes(
+            [
+                web.get("/", self._front),
+                web.get("/status", self._status),
+                web.get("/viewer/", self._viewer_page),
+                web.get("/viewer/{file:.+}", self._viewer_file),
+                web.post("/viewer/shown", self._shown),
+                web.post(STREAM, self._stream),
+                web.post(f"/{{order:{'|'.join(ORDERS)}}}", self._order),
+            ]
+        )
 
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Logs nothing."""
+    async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
+        """Serve until SIGTERM or SIGHUP; `listening` is called with the address that was taken.
+        Raises OSError where that cannot be had.
+        """
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(ended.set))
+        runner = web.AppRunner(
+            self._application,
+            access_log=None,
+            handler_cancellation=True,
+            keepalive_timeout=FROZEN_S,
+            shutdown_timeout=0.1,
+        )
+        await runner.setup()
+        self._host, server = listen.host, None
+        # each browser's stream has a connection of its own, without end
+        connector = aiohttp.TCPConnector(limit=0, force_close=True)
+        async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as self._session:
+            try:
+                server = await loop.create_server(functools.partial(self._connection, runner), *listen)
+                listening(Address(listen.host, server.sockets[0].getsockname()[1]))
+                await ended.wait()
+            finally:
+                if server is not None:
+                    server.close()
+                await runner.cleanup()
 
-    def do_GET(self) -> None:
-        if self._is_foreign():
-            return self._respond(403, "This page is for this machine's own address, not for another name.")
-        path = urlsplit(self.path).path
-        if path == "/":
-            return self._respond(200, self.server.html(self.headers["Host"]), kind=HTML)
-        if path == "/status":
-            told = self.server.latest.summary() | {"page": self.server.page}
-            return self._respond(200, json.dumps(told), kind="application/json")
-        if path == "/viewer/":
-            within = f"http://{_other_name(self.headers['Host'])}"
-            return self._respond(200, _text("live_viewer.html"), kind=HTML, within=within)
-        if path.startswith("/viewer/"):
-            return self._pass_on(self.server.viewer, "GET", path.removeprefix("/viewer"), None)
-        return self._respond(404, "There is nothing of this name.")
+    def _connection(self, runner: web.AppRunner) -> web.RequestHandler:
+        """A new connection, closed where no request comes in time."""
+        assert runner.server is not None
+        connection = runner.server()
+        self._unheard.add(connection)
+        asyncio.get_running_loop().call_later(FROZEN_S, self._close_unheard, connection)
+        return connection
 
-    def do_POST(self) -> None:
-        size = self.headers.get("Content-Length", "0")
-        body = self.rfile.read(int(size)) if size.isdecimal() and int(size) <= MOST_BODY else None
-        if body is None:
-            self.close_connection = True
-            return self._respond(413, f"A body of at most {MOST_BODY} bytes is accepted.")
-        if self._is_foreign():
-            return self._respond(403, "This page is for this machine's own address, not for another name.")
-        if self.path == STREAM:
-            return self._pass_on(self.server.latest.stream, "POST", self.path, body)
-        if self.path == "/viewer/shown":
-            with contextlib.suppress(KeyError, ValueError):
-                self.server.rooms[self.headers.get("Referer", "")].shown(float(body))
-            return self._respond(200, "")
-        name = self.path.removeprefix("/")
-        if name not in ORDERS:
-            return self._respond(404, "There is nothing of this name.")
-        if not hmac.compare_digest(self.headers.get("X-Thirdhand-Token", ""), self.server.token):
-            return self._respond(403, "The token of the page is needed: reload it.")
+    def _close_unheard(self, connection: web.RequestHandler) -> None:
+        if connection in self._unheard:
+            self._unheard.remove(connection)
+            connection.force_close()
+
+    @web.middleware
+    async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
+        self._unheard.discard(request.protocol)
+        if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
+            return _answer(403, FOREIGN)
         try:
-            reply = self.server.client.ask(name)
-        except ExplainedError as error:
-            return self._respond(502, f"{name} was NOT carried out: {error}")
-        return self._respond(200, f"{name} in force since tick {reply['tick']}")
-
-    def _is_foreign(self) -> bool:
-        """Whether the request is from another site, or to another host's name."""
-        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return True
+            async with asyncio.timeout(FROZEN_S):
+                await request.read()
+        except TimeoutError:
+            return _answer(408, f"The request was not complete within {FROZEN_S:g} s.")
+        except web.HTTPRequestEntityTooLarge:
+            return _answer(413, f"A body of at most {MOST_BODY} bytes is accepted.")
         try:
+            response: web.StreamResponse = await handler(request)
+        except web.HTTPException as error:
+            return _answer(error.status, UNKNOWN)
+        return response
+
+    def _is_foreign(self, host: str, origin: str | None) -> bool:
+        """Whether a request is from another site, or to another host's name."""
+        try:
+            if origin is not None and urlsplit(origin).netloc != host:
+                return True
             name = urlsplit(f"//{host}").hostname or ""
-            return name not in ("localhost", self.server.address.host) and not ipaddress.ip_address(name)
+            if not re.fullmatch(r"[\w.:\[\]-]+", host):
+                return True
+            return name not in ("localhost", self._host) and not ipaddress.ip_address(name)
         except ValueError:
             return True
 
-    def _respond(
-        self, code: int, text: str, *, kind: str = "text/plain; charset=utf-8", within: str = "'none'"
-    ) -> None:
-        data = text.encode()
-        self.send_response(code)
-        for name, value in (
-            ("Content-Type", kind),
-            ("Content-Length", str(len(data))),
-            ("Cache-Control", "no-store"),
-            ("X-Content-Type-Options", "nosniff"),
-            ("Content-Security-Policy", f"frame-ancestors {within}"),
-        ):
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(data)
+    async def _front(self, request: web.Request) -> web.Response:
+        """The page, for a browser that reaches it by this host and port.
 
-    def _pass_on(self, to: Address, method: str, path: str, body: bytes | None) -> None:
-        """Passes on the answer of another server of this machine, piece by piece."""
-        headers = {name: value for name, value in self.headers.items() if name.lower() not in ("host", "origin")}
-        connection = http.client.HTTPConnection(to.host, to.port, timeout=None if body else TIMEOUT_S)
-        try:
-            connection.request(method, path, body, headers)
-            answer = connection.getresponse()
-        except OSError as error:
-            connection.close()
-            return self._respond(502, f"{to} does not answer: {error}")
-        with contextlib.closing(connection), contextlib.suppress(OSError, http.client.HTTPException):
-            self.send_response(answer.status)
-            for name, value in answer.getheaders():
-                if name.lower() not in _DROPPED:
-                    self.send_header(name, value)
-            self.send_header("Transfer-Encoding", "chunked")
-            self.end_headers()
-            for piece in iter(lambda: answer.read1(PIECE), b"") if body is None else self._drawn(answer):
-                self.wfile.write(f"{len(piece):x}\r\n".encode() + piece + b"\r\n")
-            self.wfile.write(b"0\r\n\r\n")
-        self.close_connection = True
-        return None
+        The viewer is loaded under this machine's other name if it has one. For the browser that is
+        another site, which runs in a process of its own, so that the buttons always respond.
+        """
+        fields = {"__TOKEN__": self._token, "__PAGE__": self._page}
+        fields["__VIEWER__"] = f"http://{_other_name(request.host)}/viewer/"
+        fields["__CELL__"] = html.escape(self._cell)
+        text = _text("live.html")
+        for name, value in fields.items():
+            text = text.replace(name, value)
+        policy = f"connect-src 'self'; frame-src {fields['__VIEWER__']}; {INLINE}; frame-ancestors 'none'"
+        return _answer(200, text, kind=HTML, policy=policy)
 
-    def _drawn(self, answer: http.client.HTTPResponse) -> Iterator[bytes]:
-        """The messages of a stream, but for samples that the page's viewer has no room for."""
-        page = self.headers.get("Referer", "")
-        room = self.server.rooms[page] = Room()
+    async def _status(self, _: web.Request) -> web.Response:
+        told = self._latest.summary() | {"page": self._page}
+        return _answer(200, json.dumps(told), kind="application/json")
+
+    async def _viewer_page(self, request: web.Request) -> web.Response:
+        sources = f"connect-src 'self'; worker-src 'self' blob:; {INLINE} 'self' 'wasm-unsafe-eval'"
+        policy = f"{sources}; frame-ancestors http://{_other_name(request.host)}"
+        return _answer(200, _text("live_viewer.html"), kind=HTML, policy=policy)
+
+    async def _viewer_file(self, request: web.Request) -> web.StreamResponse:
+        path = request.rel_url.raw_path_qs.removeprefix("/viewer")
+        return await self._pass_on(request, self._viewer, path, lambda answer: answer.content.iter_chunked(PIECE))
+
+    async def _stream(self, request: web.Request) -> web.StreamResponse:
+        page = request.headers.get("Referer", "")
+        return await self._pass_on(request, self._latest.stream, STREAM, lambda answer: self._drawn(answer, page))
+
+    async def _shown(self, request: web.Request) -> web.Response:
+        """Note up to when [ms] a viewer has drawn."""
+        with contextlib.suppress(KeyError, ValueError):
+            self._rooms[request.headers.get("Referer", "")].shown(float(await request.read()))
+        return _answer(200, "")
+
+    async def _order(self, request: web.Request) -> web.Response:
+        """Hold, resume or reset; one that was sent is carried out also where the browser leaves."""
+        given = request.headers.get("X-Thirdhand-Token", "")
+        if not hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode()):
+            return _answer(403, "The token of the page is needed: reload it.")
+        name = request.match_info["order"]
         try:
-            while len(header := answer.read(5)) == 5:
-                message = header + answer.read(int.from_bytes(header[1:], "big"))
+            reply = await asyncio.shield(asyncio.to_thread(self._client.ask, name))
+        except ExplainedError as error:
+            return _answer(502, f"{name} was NOT carried out: {error}")
+        now = in_brief(reply.get("mode", ""), reply.get("reason", "")).replace("_", " ")
+        note = f"; {reply['note']}" if reply.get("note") else ""
+        return _answer(200, f"{name} carried out at tick {reply['tick']}; mode then: {now}{note}")
+
+    async def _pass_on(
+        self,
+        request: web.Request,
+        to: Address,
+        path: str,
+        pieces: Callable[[aiohttp.ClientResponse], AsyncIterator[bytes]],
+    ) -> web.StreamResponse:
+        """The answer of another server of this machine, passed on piece by piece."""
+        headers = {name: value for name, value in request.headers.items() if name.lower() not in _DROPPED_OF_REQUEST}
+        body = await request.read()
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=TIMEOUT_S, sock_read=None if body else TIMEOUT_S)
+        begun = web.StreamResponse()
+        try:
+            async with self._session.request(
+                request.method,
+                URL(f"http://{to}{path}", encoded=True),
+                data=body or None,
+                headers=headers,
+                skip_auto_headers=("Accept", "Accept-Encoding", "Content-Type", "User-Agent"),
+                timeout=timeout,
+            ) as answer:
+                begun.set_status(answer.status)
+                for name, value in answer.headers.items():
+                    if name.lower() not in _DROPPED_OF_ANSWER:
+                        begun.headers[name] = value
+                await begun.prepare(request)
+                async for piece in pieces(answer):
+                    async with asyncio.timeout(FROZEN_S):
+                        await begun.write(piece)
+        except (aiohttp.ClientError, OSError) as error:  # a TimeoutError too
+            if not begun.prepared:
+                return _answer(502, f"{to} does not answer: {error}")
+            if request.transport is not None:
+                request.transport.abort()  # so that the browser does not take the part for the whole
+        return begun
+
+    async def _drawn(self, answer: aiohttp.ClientResponse, page: str) -> AsyncIterator[bytes]:
+        """The messages of a stream, without samples that the page's viewer has no room for."""
+        room = self._rooms[page] = Room()
+        try:
+            while True:
+                header = await answer.content.readexactly(5)
+                message = header + await answer.content.readexactly(int.from_bytes(header[1:], "big"))
                 if not SAMPLES.fullmatch(message, 5) or room.take():
                     yield message
+        except asyncio.IncompleteReadError:
+            pass  # the stream has ended
         finally:
-            self.server.rooms.pop(page, None)
+            if self._rooms.get(page) is room:
+                del self._rooms[page]
+
+
+def _answer(
+    code: int, text: str, *, kind: str = "text/plain; charset=utf-8", policy: str = "frame-ancestors 'none'"
+) -> web.Response:
+    headers = {
+        "Content-Type": kind,
+        "Server": "thirdhand",
+        "Cache-Control": "no-store",
+        "X-Content-Type-Options": "nosniff",
+        "Content-Security-Policy": f"default-src 'none'; {policy}",
+    }
+    return web.Response(status=code, body=text.encode(errors="replace"), headers=headers)
 
 
 def _text(name: str) -> str:
@@ -241,30 +347,6 @@ def _other_name(host: str) -> str:
     name, _, port = host.rpartition(":")
     other = {"127.0.0.1": "localhost", "localhost": "127.0.0.1"}.get(name)
     return f"{other}:{port}" if other else host
-
-
-class LivePage(http.server.ThreadingHTTPServer):
-    """The page's server, which listens at `address`. Raises OSError where it cannot."""
-
-    def __init__(self, listen: Address, *, client: Client, latest: Latest, cell: str, viewer: Address) -> None:
-        super().__init__(listen, _Handler)
-        self.address = Address(listen.host, self.server_port)
-        self.client, self.latest, self._cell = client, latest, cell
-        self.viewer, self.token, self.page = viewer, secrets.token_urlsafe(24), secrets.token_hex(4)
-        self.rooms: dict[str, Room] = {}  # by the viewer's address, each with a number of its own
-
-    def html(self, host: str) -> str:
-        """The page, for a browser that reaches it by this host and port.
-
-        The viewer is loaded under this machine's other name if it has one. For the browser that is
-        another site, which runs in a process of its own, so that the buttons always respond.
-        """
-        fields = {"__CELL__": html.escape(self._cell), "__TOKEN__": self.token, "__PAGE__": self.page}
-        fields["__VIEWER__"] = f"http://{_other_name(host)}/viewer/"
-        text = _text("live.html")
-        for name, value in fields.items():
-            text = text.replace(name, value)
-        return text
 
 
 @contextlib.contextmanager

@@ -16,10 +16,11 @@ from typing import Any
 
 from service import interrupt
 from service.cli import record_options
-from service.cli.usage import Parser, UsageError, option, reaching, within
+from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
+from service.contract.printable import printable_lines
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
@@ -32,7 +33,6 @@ RUN_BY = {  # the modules that are not named as their command
     "bench": "timing.benchmark",
 }
 SIM = "The simulated bench: publishes hands and joint states, and follows commands."
-ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "play"),
@@ -40,7 +40,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
-    "set up": ("certificates", "completion"),
+    "set up": ("arm", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
 
@@ -82,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument(
         "--engine", choices=("pybullet", "mujoco"), help="the physics (default: the first that is installed)"
     )
-    option(c, "--rate", "HZ", "of the loop", 500)
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
@@ -91,14 +91,14 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
     c.add_argument("arm", metavar="ARM", help="franka, or simulated: an ideal one, to try a cell without any")
-    option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
+    option(c, "--config", "CELL", f"the daemon's settings: {ARM}")
     option(c, "--robot", "ADDRESS", "of a Franka: name or IP address", "172.16.0.2")
     option(c, "--wait", "S", "for the daemon, and for its first command", 60.0)
     _reach(c)
 
     c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
     option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
-    option(c, "--rate", "HZ", "of the loop", 500)
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
     option(c, "--arm", "ARM", ARM, "wam")
     option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
@@ -109,18 +109,19 @@ def parser() -> argparse.ArgumentParser:
     other.add_argument("--soak", action="store_true", help="memory and open files instead, a sample each 5 s at most")
 
     c = command(
-        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --arm state"
+        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --joints state"
     )
-    option(c, "--config", "FILE", "settings of the cell as TOML; options below go before it")
+    option(c, "--config", "CELL", f"{ARM}; the options below override it")
     option(c, "--cell", "NAME", "prefix of all keys (default: thirdhand)")
     listen = f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "Zenoh endpoint to connect to; may be repeated", action="append")
     option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
-    option(c, "--rate", "HZ", "of the loop (default: 500)")
+    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
     option(c, "--skill", "FILE", "a skill made by `thirdhand learn` (default: the shipped soldering skill)")
-    arm = "wait for the arm's joint states, or assume its posture (default: state)"
-    c.add_argument("--arm", choices=("state", "assumed"), help=arm)
+    joints = "wait for the arm's joint states, or assume its posture (default: the settings', else state)"
+    c.add_argument("--joints", choices=("state", "assumed"), help=joints)
+    c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
     option(c, "--record", "DIR", "write .mcap and .rrd files there")
     live = "serve Rerun viewers on this loopback port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
@@ -163,7 +164,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--csv", "DIR", "each table, and every tick, as CSV files there, too")
     option(c, "--lerobot", "DIR", "all as a new data set of LeRobot 3.0 there: joints, hands and commands, too")
     option(c, "--fps", "N", "rows of it a second", 50, type=within(int, 1, 1000))
-    option(c, "--task", "TEXT", "of it, in words (default: the name of the skill)")
+    option(c, "--task", "TEXT", "the task of the data set, in words (default: the name of the skill)")
 
     c = command(
         "learn",
@@ -172,7 +173,8 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
     )
     demonstrations = (
-        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder"
+        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder, "
+        ".bag, CSV of Motive, C3D"
     )
     option(c, "demonstrations", "DEMO", demonstrations, nargs="+", type=Path)
     for name in ("left", "right", "tool"):
@@ -185,7 +187,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--output", "FILE", "the skill, .npz", required=True)
     option(c, "--plot", "FILE", "a picture of what it is judged by, .png")
     c.add_argument("--name", help="of the skill (default: the file's)")
-    option(c, "--config", "FILE", "settings of the cell: the tracker's axes and unit, the arm")
+    option(c, "--config", "CELL", f"the tracker's axes and unit, the arm: {ARM}")
     places = (
         "where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
         "do not hold it: then the skill is learned between them, and holds wherever they are"
@@ -209,19 +211,19 @@ def parser() -> argparse.ArgumentParser:
         f"{example} add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
         f"--radius .03 --follow left --std .001\n  {example} add glass --here",
     )
-    a.add_argument("name", nargs="?", help="of the via-point; one given again is replaced")
+    a.add_argument("name", nargs="?", help="the name of the via-point; a via-point of this name is replaced")
     for place in (*SIDES, "tool"):
         at = "position [m] in frame base"
         a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
     a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
-    option(a, "--std", "M", "how exactly the tool is to go there [m]", defaults.std)
-    option(a, "--radius", "M", "also for hands this far from there [m]", defaults.radius)
-    follow = "within the radius the tool moves with this hand"
+    option(a, "--std", "M", "standard deviation of the tool's position there [m]", defaults.std)
+    option(a, "--radius", "M", "the via-point also holds for hands this far away [m]", defaults.radius)
+    follow = "the hand that the tool moves with, within the radius"
     option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
-    turn = "how the tool is turned there"
+    turn = "the orientation of the tool there, as a quaternion"
     a.add_argument("--orientation", nargs=4, type=within(float, -1.001, 1.001), metavar=("X", "Y", "Z", "W"), help=turn)
-    a.add_argument("--gripper", choices=("open", "closed"), help="what the gripper does there")
+    a.add_argument("--gripper", choices=("open", "closed"), help="the state of the gripper there")
     option(a, "--tolerance", "M", f"points learned nearer than this give way (default: {TOLERANCE_M} m)")
     option(a, "--file", "FILE", "a request as JSON instead; - is standard input")
     _reach(a)
@@ -232,7 +234,7 @@ def parser() -> argparse.ArgumentParser:
     _reach(described(actions, "clear", "forget all via-points", f"{example} clear"))
 
     c = _reach(command("stage", "Tells that the task has come to a via-point.", "thirdhand stage handover"))
-    c.add_argument("name", metavar="NAME", help="of a via-point of the task")
+    c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
 
     c = _reach(command("status", "What a running daemon does.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")
@@ -240,7 +242,7 @@ def parser() -> argparse.ArgumentParser:
     about = "Looks at a running cell, and says what is wrong and what to do. Then exit 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
-    option(c, "--seconds", "S", "to look for", 2.0, type=within(float, 0.2, 60))
+    option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))
     _reach(command("hold", "Stops the arm, which then stays.", "thirdhand hold"))
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
     _reach(command("reset", "Ends a fault.", "thirdhand reset"))
@@ -250,6 +252,18 @@ def parser() -> argparse.ArgumentParser:
     _reach(c, one=False)
 
     c = command(
+        "arm",
+        "Reads an arm's URDF, prints what it understands, and writes a first cell: settings, and a picture of them.",
+        "thirdhand arm my-arm.urdf",
+    )
+    option(c, "urdf", "URDF", "the arm's description", type=Path)
+    option(c, "--plate", "LINK", "the link that carries the tool (default: the likely one)")
+    at = "where its root stands in frame base [m] (default: 0 0 0, or nearby where it reaches the demo's places)"
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=at)
+    option(c, "--packages", "DIR", "a folder with packages of ROS, for its meshes; may be repeated", action="append")
+    option(c, "--output", "FILE", "the cell's settings; the picture is beside it", Path("cell.toml"), type=Path)
+
+    c = command(
         "certificates",
         "Makes an authority, and a certificate for the daemon and for each role on a network; with --role, one more "
         "certificate by the authority that is there.",
@@ -257,9 +271,9 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "folder", "DIR", "a new folder, private to its user; with --role an old one")
     option(c, "--host", "NAME", "or address at which clients reach the daemon; may be repeated", action="append")
-    c.add_argument("--role", choices=(*ROLES, DAEMON), help="of one more certificate")
-    option(c, "--name", "ROLE-N", "of that one, like tracker-2 (default: the first that is free)")
-    option(c, "--days", "N", "that they are valid", 3650, type=int)
+    c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
+    option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
+    option(c, "--days", "N", "the certificates are valid for this time", 3650, type=int)
 
     # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
@@ -268,20 +282,26 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "view",
-        "Shows a recording, or a running daemon, in Rerun.",
-        "thirdhand view thirdhand-demo/thirdhand-20260101T120000Z.rrd --screenshot scene.png",
+        "Shows recordings, or a running daemon, in Rerun. In a window, as a picture, or in a browser.",
+        "thirdhand view thirdhand-demo/*.rrd\n  thirdhand view thirdhand-demo/*.rrd --screenshot scene.png --time 12\n"
+        "  thirdhand view live --web 8080",
     )
+    option(c, "files", "FILE|live", "drawings (.rrd) and recordings (.mcap); or `live`: a running daemon", nargs="+")
+    picture = c.add_argument_group("a picture")
+    option(picture, "--screenshot", "PNG", "write this picture instead of opening a window; of several files the last")
+    option(picture, "--time", "S", "show this time after the start (default: the last moment in mode follow)")
+    tabs = ("task", "timing", "learning")
+    option(picture, "--tab", None, "show this tab of the viewer", "task", choices=tabs)
+    browser = c.add_argument_group("a browser")
+    web = "serve a page for browsers, with hold, resume and reset, of `live` (default: any port of this machine)"
+    option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     _reach(c)
-    option(c, "file", "FILE|live", "an .rrd or .mcap file, or `live`")
-    option(c, "--screenshot", "PNG", "write a picture instead of opening a window")
-    option(c, "--time", "S", "of the picture, from the recording's start (default: its end)")
-    web = "with `live`: a page for browsers, with hold, resume and reset (default: any port of this machine)"
-    option(c, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
-    option(c, "--tab", None, "of the picture", "task", choices=("task", "timing", "learning"))
 
-    about, example = "Prints what lets a shell complete these commands and their options.", "thirdhand completion bash"
-    c = command("completion", about, f"{example} > ~/.local/share/bash-completion/completions/thirdhand")
+    about = "Prints or writes a script by which a shell completes these commands, their options and files."
+    example = "thirdhand completion bash --output ~/.local/share/bash-completion/completions/thirdhand"
+    c = command("completion", about, example)
     c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    option(c, "--output", "FILE", "write the script there; folders that are missing are made")
     top.groups = {
         title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
     }
@@ -301,13 +321,14 @@ class _Version(argparse.Action):
 def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.ArgumentParser:
     """The same parser, with the options by which a daemon is reached; `one`: and named."""
     group = sub.add_argument_group(
-        "how it is reached", f"What is not given is taken from these variables, else from the file\n{CLIENT_FILE}."
+        "how the daemon is reached",
+        f"An option that is not given is taken from the variable in its text, else from the file\n{CLIENT_FILE}.",
     )
     endpoint = "Zenoh endpoint of the daemon or of a router; of several the first that answers"
     option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    role = "of one's role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
+    role = "the folder of your role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
     option(group, "--certificate", "DIR", role)
     option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
     sub.set_defaults(reaches=True)
@@ -325,13 +346,13 @@ def main(arguments: list[str] | None = None) -> int:
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
     except (UsageError, SettingsError) as error:
-        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        print(f"thirdhand {args.command}: {printable_lines(str(error))}", file=sys.stderr)
         return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:
-        print(f"thirdhand {args.command}: {error}", file=sys.stderr)
+        print(f"thirdhand {args.command}: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         interrupt.end_at_once()

@@ -10,12 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from service.contract.printable import printable_lines
+
 AFTER_S, EVERY_S = 2.0, 10.0
 
 
 def say(line: str) -> None:
-    """Prints a line on standard error at once."""
-    print(line, file=sys.stderr, flush=True)
+    """Print a message on standard error at once, without effects of what it quotes."""
+    print(printable_lines(line), file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, pla
 from service.client import UnreachableError, open_session
 from service.config import Settings
 from service.contract.channels import ENDPOINT
+from service.contract.printable import printable, printable_lines
 from service.demonstrations.capture import capture
 from service.demonstrations.demonstration_files import (
     DemonstrationNameError,
@@ -62,7 +63,7 @@ def record(args: argparse.Namespace) -> int:
     elif not args.show:
         _capture(args, settings or Settings())
     found = summary(existing_path(args.folder, args.name), settings=settings)
-    print(table(found))
+    print(printable_lines(table(found)))
     if args.plot is not None:
         draw(found, args.plot)
         print(f"{args.plot} drawn", file=sys.stderr)
@@ -71,17 +72,21 @@ def record(args: argparse.Namespace) -> int:
 
 def _list(folder: Path, settings: Settings | None) -> int:
     """Exit code 1 where one of the takes cannot be learned from."""
+    if not folder.is_dir():
+        raise DemonstrationNameError(
+            f"{folder} {'is no folder' if folder.exists() else 'does not exist'}: a folder of takes needed (--folder)"
+        )
     paths, unusable = demonstration_paths(folder), 0
     for path in paths:
         try:
             found = summary(path, settings=settings)
         except RecordingError as error:
             unusable += 1
-            print(f"{path.stem:<20} {error}")
+            print(printable(f"{path.stem:<20} {error}"))
             continue
         rates = ", ".join(f"{one.name} {one.rate_hz:.0f} Hz" for one in found.streams)
         gap = f"longest gap {1e3 * max(one.gap_s for one in found.streams):.0f} ms"
-        print(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}")
+        print(printable(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}"))
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
 
@@ -128,13 +133,18 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             wait_s=args.wait,
             longest_s=args.seconds,
             progress=_progress if sys.stderr.isatty() else lambda line: None,
-            say=lambda line: say(f"\r{line}"),
+            say=_say_over_progress,
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
     captured.write(path, places)
     for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
+
+
+def _say_over_progress(line: str) -> None:
+    print("\r", end="", file=sys.stderr)
+    say(line)
 
 
 def _progress(line: str) -> None:

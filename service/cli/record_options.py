@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import option
+from service.cli.usage import ARM, option
 
 ABOUT = (
     "Records a demonstration of hands and tool from a running cell, and shows what it got; lists, shows, trims and "
@@ -23,7 +23,7 @@ def add_options(c: argparse.ArgumentParser) -> None:
     """Adds the command's own options."""
     option(c, "name", "NAME", "of the take", nargs="?")
     option(c, "--folder", "DIR", "where takes are, made if missing", Path("demonstrations"))
-    option(c, "--config", "FILE", "the cell's settings, the same as the daemon's")
+    option(c, "--config", "CELL", f"the daemon's settings: {ARM}")
     hands = "that conduct the tool: of one, only it is recorded, and what is learned heeds no other"
     option(c, "--hands", None, hands, "both", choices=("both", "left", "right"))
     person = "who demonstrates; of two or more, `learn` leaves out all takes of one at once"

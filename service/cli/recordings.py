@@ -17,11 +17,12 @@ from service.client import Client, Tracker
 from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
+from service.contract.printable import printable_lines
 from service.contract.requests import Status
 from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
 from service.demonstrations.pose_streams import SIDES, PoseTopic
 from service.learning.judgement import table
-from service.learning.learn import Evidence
+from service.learning.learn import Evidence, check_count
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.recording.mcap_file import ends_early
@@ -95,6 +96,7 @@ def learn(args: argparse.Namespace) -> int:
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
+    check_count([path.stem for path in args.demonstrations], args.components)
     settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
@@ -121,7 +123,7 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(table(msgspec.structs.replace(figures, unsafe=())))  # what is unsafe is in the error
+    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))  # what is unsafe is in the error
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:

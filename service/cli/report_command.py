@@ -17,6 +17,7 @@ from rich.text import Text
 
 from service.cli.progress import progress
 from service.cli.usage import UsageError, check_writable
+from service.contract.printable import printable
 from service.contract.records import Mode
 from service.recording.recording import Recording
 from service.report.columns import KEPT
@@ -51,27 +52,27 @@ def report(args: argparse.Namespace) -> int:
             _print_table(console, table)
     if args.csv:
         write_csv(reports, args.csv)
-        console.print(f"tables in {args.csv}")
+        console.print(Text(printable(f"tables in {args.csv}")))
     if args.lerobot:
         from service.report import lerobot
 
         columns = [one.columns for one in reports]
         task = args.task or ", ".join({one.skill.name: one.tick for found in columns for one in found.skills})
         parts, rows = lerobot.write(columns, args.lerobot, fps=args.fps, task=task)
-        console.print(f"data set {args.lerobot}: {parts} episodes, {rows} rows")
+        console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
     if args.html:
         from service.report.page import page  # draws, which takes a while to import
 
         with progress("drawing", unit="recordings", total=len(reports)) as done:
             args.html.write_text(page(reports, progress=done), encoding="utf-8")
-        console.print(f"page {args.html}")
+        console.print(Text(printable(f"page {args.html}")))
     return 0
 
 
 def _print(console: Console, one: Report) -> None:
     verdict, *lines = summary(one)
     console.print(Text(verdict, style="bold"), soft_wrap=True)
-    for line in (str(one.path), *lines):
+    for line in (printable(str(one.path)), *lines):
         console.print(Text(line))
     console.print(_bar(one))
     for table in tables(one):

@@ -13,8 +13,10 @@ from typing import Any
 
 import msgspec
 
+from service import child
 from service.cli.usage import UsageError
 from service.config import Settings, converted
+from service.contract.printable import printable_lines
 from service.daemon.start import starting
 from service.described_arm import SettingsError
 from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
@@ -23,7 +25,9 @@ from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 def serve(args: argparse.Namespace) -> int:
     """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
     os.umask(0o077)  # its files are private to its user
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
     skills = skills_folder(settings)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
@@ -33,6 +37,8 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
+    if folder is not None or args.live is not None:
+        child.preload("service.recording.process")  # beside this process, which imports as much
     with starting(settings) as start:
         gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
         from service.daemon import daemon  # heavy, while who asks is answered
@@ -51,6 +57,14 @@ def serve(args: argparse.Namespace) -> int:
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries
 
 
+class PrintableFormatter(logging.Formatter):
+    """Formats a record so that what it quotes has no effect on a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's line or lines."""
+        return printable_lines(super().format(record))
+
+
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
     """The settings, with the options of the command line instead."""
     given: dict[str, Any] = msgspec.to_builtins(settings)
@@ -60,7 +74,7 @@ def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
         (given["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
         (given["network"], "connect", args.connect),
         (given["network"], "zenoh_config", str(args.zenoh_config) if args.zenoh_config else None),
-        (given["arm"], "source", args.arm),
+        (given["arm"], "source", args.joints),
         (given["files"], "record", str(args.record) if args.record else None),
     ):
         if value is not None:

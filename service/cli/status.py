@@ -15,7 +15,7 @@ from zenoh.handlers import RingChannel
 from service import interrupt
 from service.cli.clients import ask
 from service.cli.usage import reached
-from service.client import Client, UnreachableError, why_silent
+from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
@@ -66,7 +66,7 @@ def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
                 time.sleep(LOOK_S)
                 continue
             heard = time.monotonic()
-            yield msgspec.json.decode(sample.payload.to_bytes(), type=Status)
+            yield decoded(sample.payload.to_bytes(), Status)
     raise UnreachableError(f"nothing comes on {key}: {why_silent(session, cell)}")
 
 
@@ -112,6 +112,7 @@ def rows(now: Status) -> dict[str, str]:
     )
     found = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
+        "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
         "what to do": now.remedy,
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
@@ -208,4 +209,5 @@ def _turned(now: Status) -> str:
 
 
 def _rejected(name: str, source: Source) -> str:
-    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items())
+    newest = f" (newest as {source.cause}: {source.refused})" if source.refused else ""
+    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items()) + newest

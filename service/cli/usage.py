@@ -81,9 +81,11 @@ KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for
     "EP": endpoint,
 }
 
+ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
+
 FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
-    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live"), FILES),
+    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILES),
     "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
 }
 

@@ -5,14 +5,13 @@ running daemon, in a window or a browser, or a picture taken without a screen.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import io
 import math
 import os
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +35,7 @@ from service.launch import free_port
 from service.network_settings import is_local
 from service.recording.recording import OBJECTS, Recording
 from service.recording.steps import Gap
+from service.viewer import vulkan
 from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program
 
@@ -43,6 +43,7 @@ RRD_MAGIC = b"RRF2"
 TITLE_BAR = 30  # pixels that a window's bar has at least
 MARGIN, LETTERS = 14, 15  # of what is said of a picture at its top [pixels]
 TINT = 40  # difference of colour channels in a grey bar
+NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
 FRESH_S = 1.0  # age of a live view's picture above which the age is printed
 FRESH_TIMEOUT_S = 10.0
 
@@ -50,31 +51,41 @@ FRESH_TIMEOUT_S = 10.0
 def view(args: argparse.Namespace) -> int:
     """The viewer's exit code once its window is closed; 0 once a picture is written."""
     check_usage(args)
-    if args.file == "live":
+    if args.files == ["live"]:
         now = ask(args, "status")
         say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
         if not (url := now["scribe"].get("live")):
             raise UsageError("this daemon serves no live view; start it with --live PORT")
-        return _serve(args, url) if args.web else _show(url, args)
-    path = Path(args.file)
+        return _serve(args, url) if args.web else _show([url], args)
+    paths = [Path(name) for name in args.files]
+    kinds = [_kind(path) for path in paths]
+    if args.screenshot and len(paths) > 1:
+        say(f"the picture is of {paths[-1]}, the last of {len(paths)} files")
+        paths, kinds = paths[-1:], kinds[-1:]
+    _check_drawing(args)  # before what takes long
+    with tempfile.TemporaryDirectory() as folder:
+        drawings = []
+        for i, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
+            drawings.append(str(path))
+            if kind != RRD_MAGIC:
+                drawings[i] = str(Path(folder) / str(i) / f"{path.stem}.rrd")
+                with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
+                    convert(path, drawings[i], say=say, progress=done)
+        return _show(drawings, args)
+
+
+def _kind(path: Path) -> bytes:
+    """How a file begins that can be shown: RRD_MAGIC or MCAP0_MAGIC. Raises ExplainedError."""
     if not path.exists():
         raise ExplainedError(f"no such file: {path}")
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     with path.open("rb") as file:
         begins = file.read(len(MCAP0_MAGIC))
-    if begins.startswith(RRD_MAGIC):
-        return _show(str(path), args)
-    if begins != MCAP0_MAGIC:
-        raise ExplainedError(
-            f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed"
-        )
-    _check_screen(args)  # before what takes long
-    with tempfile.TemporaryDirectory() as folder:
-        drawn = Path(folder) / f"{path.stem}.rrd"
-        with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
-            convert(path, drawn, say=say, progress=done)
-        return _show(str(drawn), args)
+    for magic in (RRD_MAGIC, MCAP0_MAGIC):
+        if begins.startswith(magic):
+            return magic
+    raise ExplainedError(f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed")
 
 
 def check_usage(args: argparse.Namespace) -> None:
@@ -83,7 +94,9 @@ def check_usage(args: argparse.Namespace) -> None:
         check_writable(args.screenshot, ".png")
     if args.time is not None and not (args.screenshot and math.isfinite(args.time) and args.time >= 0):
         raise UsageError(f"--time {args.time:g}: seconds from 0 on, of a --screenshot, needed")
-    if args.web and (args.file != "live" or args.screenshot):
+    if "live" in args.files and len(args.files) > 1:
+        raise UsageError(f"live beside {len(args.files) - 1} files; either live alone or files needed")
+    if args.web and (args.files != ["live"] or args.screenshot):
         raise UsageError("--web shows the running daemon in a browser: `thirdhand view live --web`")
 
 
@@ -95,18 +108,19 @@ def _serve(args: argparse.Namespace, url: str) -> int:
         web_viewer(rerun_program(), url, free_port()) as viewer,
     ):
         client = Client(session, args.cell)
-        latest = Latest(session, args.cell, client.ask("status"))
+        latest = Latest(session, args.cell, client.status())
+        page = LivePage(client=client, latest=latest, cell=args.cell, viewer=viewer)
+
+        def listening(address: Address) -> None:
+            print(f"http://{address}/", flush=True)
+            if not is_local(f"tcp/{address}"):
+                say("whoever reaches this address can hold, resume and reset the arm")
+
         try:
-            page = LivePage(listen, client=client, latest=latest, cell=args.cell, viewer=viewer)
+            asyncio.run(page.serve(listen, listening))
         except OSError as error:
-            raise UsageError(f"--web {listen}: {error.strerror or error}; another port, or 0 for any, needed") from None
-        print(f"http://{page.address}/", flush=True)
-        if not is_local(f"tcp/{page.address}"):
-            say("whoever reaches this address can hold, resume and reset the arm")
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: threading.Thread(target=page.shutdown).start())
-        with page:
-            page.serve_forever(poll_interval=0.1)
+            why = os.strerror(error.errno) if error.errno else error
+            raise UsageError(f"--web {listen}: {why}; another port, or 0 for any, needed") from None
     return 0
 
 
@@ -118,20 +132,22 @@ def _address(given: str) -> Address:
     return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
-def _show(source: str, args: argparse.Namespace) -> int:
-    """The exit code of the viewer on a file or a live view, once its window is closed; or 0 once
-    its picture is written.
+def _show(sources: list[str], args: argparse.Namespace) -> int:
+    """The exit code of the viewer on files or a live view, once its window is closed; or 0 once
+    the picture of a single one is written.
     """
+    _check_drawing(args)
     if args.screenshot:
-        age_s = screenshot(source, args.screenshot, time=args.time, tab=args.tab)
+        age_s = screenshot(sources[0], args.screenshot, time=args.time, tab=args.tab)
         print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
         return 0
-    _check_screen(args)
-    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", source], check=False).returncode
+    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", *sources], check=False).returncode
 
 
-def _check_screen(args: argparse.Namespace) -> None:
-    """Raises ViewerError where a window is wanted and there is no screen."""
+def _check_drawing(args: argparse.Namespace) -> None:
+    """Raises ViewerError where there is no screen for a window, or no Vulkan for a picture."""
+    if args.screenshot and not vulkan.is_there():
+        raise ViewerError(f"{NO_VULKAN}: no Vulkan device was found")
     has_none = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if has_none and not args.screenshot:
         raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
@@ -224,8 +240,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     except ViewerError:
         raise
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
-        hint = "drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers"
-        raise ViewerError(f"no picture of {source}: {error} ({hint})") from error
+        raise ViewerError(f"no picture of {source}: {error} ({NO_VULKAN})") from error
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:

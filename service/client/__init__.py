@@ -5,6 +5,7 @@ on a network.
 from service.client.calls import Client
 from service.client.client_settings import CLIENT_FILE, ClientSettings, client_settings
 from service.client.presence import Cell, Overheard, cells, living, why_silent
+from service.client.replies import decoded
 from service.client.session import (
     AUTHORITY,
     CERTIFICATE,
@@ -15,7 +16,15 @@ from service.client.session import (
     endpoints,
     open_session,
 )
-from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, publisher
+from service.client.streams import (
+    BRAKE_AFTER_S,
+    ENCODINGS,
+    Command,
+    Follower,
+    Tracker,
+    no_room_to_brake,
+    publisher,
+)
 
 __all__ = [
     "AUTHORITY",
@@ -36,8 +45,10 @@ __all__ = [
     "UnreachableError",
     "cells",
     "client_settings",
+    "decoded",
     "endpoints",
     "living",
+    "no_room_to_brake",
     "open_session",
     "publisher",
     "why_silent",

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-import msgspec
 import zenoh
 
 from service.client.presence import living, why_silent
+from service.client.replies import decoded
 from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, tried
 from service.contract import channels, requests
+from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
 RETRIES = 5
@@ -77,22 +77,22 @@ class Client:
 
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
         """The reply to one request as received; `request` is anything that JSON can encode."""
-        answer: dict[str, Any] = json.loads(self._answer(suffix, request))
+        answer: dict[str, Any] = decoded(self._answer(suffix, request), dict)
         return answer
 
-    def wait_until_ready(self, *, timeout_s: float | None = 15.0) -> Status:
+    def wait_until_ready(self, *, timeout_s: float | None = 15.0, silent: bool | None = None) -> Status:
         """The status, once a daemon is ready on this cell; it waits for `timeout_s` [s], and as
-        long as the daemon's start goes on. None: until Ctrl-C.
+        long as the daemon's start goes on. None: until Ctrl-C. Unless it is `silent`, as by default
+        where it ends by itself, that it waits is said once on standard error.
         """
-        return tried(self.status, timeout_s)
+        return tried(self.status, timeout_s, silent=silent)
 
     def _typed(self, suffix: str, request: Any, kind: type[Answer]) -> Answer:
+        answer = self._answer(suffix, request)
         try:
-            return msgspec.json.decode(self._answer(suffix, request), type=kind)
-        except msgspec.DecodeError as error:
-            raise RefusedError(
-                f"the answer on {self._key(suffix)} is not a {kind.__name__}: {error}. Is the daemon of this version?"
-            ) from None
+            return decoded(answer, kind)
+        except RefusedError as error:
+            raise RefusedError(f"the answer on {self._key(suffix)} is {error}") from None
 
     def _answer(self, suffix: str, request: Any) -> bytes:
         payload = requests.encode_json({} if request is None else request)
@@ -108,7 +108,7 @@ class Client:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=self._timeout_s,
         ):
-            text = "" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace")
+            text = "" if reply.err is None else printable_lines(reply.err.payload.to_bytes().decode(errors="replace"))
             if text == "Timeout":
                 continue
             if text.startswith(requests.STARTING):

@@ -4,13 +4,16 @@ anything is published.
 
 from __future__ import annotations
 
+import contextlib
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-import msgspec
 import zenoh
 
+from service.client.replies import decoded
+from service.client.session import RefusedError
 from service.contract import channels
+from service.contract.printable import printable
 from service.contract.requests import Status
 
 TIMEOUT_S = 5.0
@@ -56,8 +59,9 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
     for replies in queries:
         for reply in replies:
             if reply.ok is not None and reply.replier_id is not None:
-                statuses[str(reply.replier_id.zid)] = msgspec.json.decode(reply.ok.payload.to_bytes(), type=Status)
-    return tuple(Cell(name, own, statuses.get(own)) for name, own in found)
+                with contextlib.suppress(RefusedError):
+                    statuses[str(reply.replier_id.zid)] = decoded(reply.ok.payload.to_bytes(), Status)
+    return tuple(Cell(printable(name), own, statuses.get(own)) for name, own in found)
 
 
 class Overheard(AbstractContextManager["Overheard"]):
@@ -83,7 +87,7 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     def _take(self, sample: zenoh.Sample) -> None:
         if len(self._keys) < MOST_KEYS:
-            self._keys.add(str(sample.key_expr))
+            self._keys.add(printable(str(sample.key_expr)))
 
 
 def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:

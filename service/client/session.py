@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import re
 import socket
 import sys
 import time
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from service.contract.channels import lacking
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
@@ -117,12 +118,13 @@ def _refused(endpoints: Sequence[str]) -> bool:
     return bool(endpoints)
 
 
-def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
+def tried(attempt: Callable[[], T], timeout_s: float | None, *, silent: bool | None = None) -> T:
     """What an attempt returns once it raises no UnreachableError, which is raised after `timeout_s`
-    [s] in which it said the same. None: it is tried until Ctrl-C, and that it waits is said once on
-    standard error.
+    [s] in which it said the same. None: it is tried until Ctrl-C. Unless it is `silent`, as by
+    default where it ends by itself, that it waits is said once on standard error.
     """
-    begun_s, silent, said = time.monotonic(), timeout_s is not None, ""
+    begun_s, said = time.monotonic(), ""
+    silent = timeout_s is not None if silent is None else silent
     while True:
         try:
             return attempt()
@@ -134,7 +136,8 @@ def tried(attempt: Callable[[], T], timeout_s: float | None) -> T:
             if timeout_s is not None and waited_s >= timeout_s:
                 raise
             if not silent and waited_s > ATTEMPT_S / 2:
-                print(f"waiting, until Ctrl-C: {error}", file=sys.stderr, flush=True)
+                until = "until Ctrl-C" if timeout_s is None else f"up to {timeout_s:g} s"
+                print(f"waiting, {until}: {error}", file=sys.stderr, flush=True)
                 silent = True
             time.sleep(RETRY_S)
 
@@ -149,7 +152,9 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
             + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
             "not expired?" * secured
         )
-    return f"cannot listen on {', '.join(listen)}: {reason}" if listen else f"no Zenoh session: {reason}"
+    found = re.search(r"\(os error (\d+)\)", reason)
+    words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
+    return f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
 
 
 def _zenoh_config(path: str | Path | None) -> zenoh.Config:

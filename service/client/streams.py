@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -17,9 +18,21 @@ from service.contract.messages import BASE, JointState, PoseStamped, Quaternion,
 from service.contract.records import SIDES
 
 BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
+LATE_S = 0.005  # a command of the slowest accepted rate may be this late before the follower brakes
 MOST_COMMANDS = 256  # that a follower keeps until it is asked for them: half a second's at 500 Hz
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+def no_room_to_brake(tick_s: float) -> str:
+    """Why a follower cannot follow commands of this period [s]; empty where it can."""
+    if tick_s <= BRAKE_AFTER_S - LATE_S:
+        return ""
+    return (
+        f"{1 / tick_s:.0f} Hz is too slow: commands would come every {1000 * tick_s:.0f} ms, and an arm brakes "
+        f"{1000 * BRAKE_AFTER_S:.0f} ms after its last command; {math.ceil(1 / (BRAKE_AFTER_S - LATE_S))} Hz or more "
+        "needed"
+    )
 
 
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import errno
 import re
 from typing import Any, TypeVar
 
@@ -12,11 +13,31 @@ from msgspec import inspect
 
 LONGEST = 300  # characters of what others say is wrong
 MOST_PROBLEMS = 50  # told at once
+WANTED = {  # by the operating system's number of an error
+    errno.EEXIST: "a folder needed, and that is something else",
+    errno.ENOTDIR: "a folder needed, and that is something else",
+    errno.EISDIR: "a file needed, and that is a folder",
+    errno.ENOSPC: "room on that disk needed",
+    errno.EDQUOT: "room in this user's quota needed",
+    errno.EROFS: "a place that can be written needed",
+    errno.EACCES: "permission of this user needed",
+    errno.EPERM: "permission of this user needed",
+    errno.EADDRINUSE: "another program has it; another port, or 0 for any that is free, needed",
+    errno.EADDRNOTAVAIL: "an address of this machine needed",
+}
 T = TypeVar("T")
 
 
 class ExplainedError(Exception):
     """Tells people what failed, was given and is accepted: commands print it and exit 1."""
+
+
+def in_words(error: BaseException) -> str:
+    """An error without the numbers of the operating system: what failed, and what it would take."""
+    if not isinstance(error, OSError) or isinstance(error, ExplainedError) or error.strerror is None:
+        return str(error) or type(error).__name__
+    wanted = WANTED.get(error.errno or 0, "")
+    return f"{error.filename}: " * (error.filename is not None) + error.strerror + f"; {wanted}" * bool(wanted)
 
 
 class InvalidError(ExplainedError, ValueError):

@@ -19,6 +19,12 @@ SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
 MALFORMED: Final = "malformed"  # bytes that could not be decoded: counted beside the causes
 FAULTS = (Reason.ARM_ERROR, Reason.ARM_SILENT, Reason.TOOL_SPEED, Reason.SETPOINT, Reason.SERVICE)  # all others: holds
 LONGEST_NAME = 64  # of a frame
+OF_TIME = {  # reasons that a machine which is too busy causes as well, unless samples of these sources are refused
+    Reason.STALE_HAND: SIDES,
+    Reason.ARM_ERROR: ("arm",),
+    Reason.ARM_SILENT: ("arm",),
+}
+FREE_THE_MACHINE = "see what else runs on this machine, `thirdhand bench` measures it; or lower `rate_hz`"
 FULL_TURN_RAD = 7.0  # no joint is farther from its zero
 
 Excess: TypeAlias = tuple[float, float]  # a value, and the greatest that is accepted
@@ -53,6 +59,15 @@ class Outside(NamedTuple):
     unit: str = "rad"
 
 
+class Jump(NamedTuple):
+    """A joint that leapt from one state to the next."""
+
+    joint: str
+    before: float
+    after: float
+    unit: str = "rad"
+
+
 class Inside(NamedTuple):
     """A part of the arm that is inside of something."""
 
@@ -82,15 +97,19 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Excess | None = None  # of a joint from its command, at the fault
-    worst_joint: tuple[str, float] | None = None  # the one farthest from its command now [rad]
+    worst_joint: tuple[str, float, str] | None = None  # the one farthest from its command now, and the unit
     measured_speed: Excess | None = None  # of the tool [m/s]
     commanded_speed: Excess | None = None
     failure: str = ""  # of the service
+    silent_ms: float = 0.0  # accepted between states of the arm
+    busy: str = ""  # how this machine was too busy when it began
     # of a sample that was rejected:
     sample: PoseStamped | JointState | None = None
     newest_ns: int = 0  # stamp of the newest one accepted before
     frames: tuple[str, ...] = ()  # that are accepted
     mistake: str = ""  # in its unit, its names or its bytes
+    jump: Jump | None = None
+    held_up_s: float | None = None  # delay of the newest accepted one beyond the others; None: its clock differs
 
 
 NOTHING = Evidence()
@@ -158,13 +177,14 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy += "`rejected` counts `older` and `jumped` meanwhile"
             found = _contest(seen)
         case Reason.OPERATOR:
-            about, remedy = "somebody asked for it", "`thirdhand resume`"
+            about, remedy = "a hold was requested, or the daemon was stopped", "`thirdhand resume`"
         case Reason.ARM_NOT_READY:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
             if (arm := seen.sources.get("arm")) is not None and arm.fresh:
                 remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
+            remedy = _of_rate(seen) or remedy
             if seen.inside is not None:
                 remedy = "bring the arm out by hand, or by `thirdhand reset`, which moves it out slowly; "
                 remedy += "where nothing is there mend [table], [obstacles] or the URDF"
@@ -180,11 +200,14 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm was measured farther from where it was told to be than `[arm] fault_error_rad`"
             remedy = "see what blocked or pushed it, then `thirdhand reset`"
             if seen.error_rad is not None and seen.worst_joint is not None:
-                found = "a joint was {:.3f} rad off, {:g} accepted; ".format(*seen.error_rad)
-                found += "now {} is off by {:.3f} rad".format(*seen.worst_joint)
+                found = "a joint was {:.3f} rad off, {:g} accepted".format(*seen.error_rad)
+                found += "; " if seen.worst_joint[2] == "rad" else ", half as many m for one that slides; "
+                found += "now {} is off by {:.3f} {}".format(*seen.worst_joint)
         case Reason.ARM_SILENT:
-            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen.sources.get("arm"))
+            about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen)
             remedy = "look at its driver and the network, then `thirdhand reset`"
+            if advice := _of_rate(seen):
+                remedy = f"{advice}, then `thirdhand reset`"
         case Reason.TOOL_SPEED:
             about = "the tool was measured faster than `[tool] fault_speed` for 30 ms"
             remedy = "the arm does not do what it is told: check the driver before `thirdhand reset`"
@@ -200,6 +223,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy, found = "keep log and recording, report it, then `thirdhand reset`", seen.failure
         case _:
             assert_never(reason)
+    if seen.busy and reason in OF_TIME and not _of_rejected(seen, *OF_TIME[reason]):
+        found, remedy = f"this machine was too busy, {seen.busy}; {found or about}", f"{FREE_THE_MACHINE}; {remedy}"
     return Incident(about, remedy, found)
 
 
@@ -236,7 +261,10 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
         case Cause.NOT_FINITE:
             also = f", orientation {figures(turned)}" if turned else ""
             about, found = "a NaN, an infinity", f"{at}{also}; finite numbers needed"
-            remedy = "publish nothing while the tracker has lost the hand, or the driver a joint"
+            remedy = "publish nothing while the tracker has lost the hand, or the driver a joint; "
+            remedy += "a joint's velocity may be NaN where it is not measured"
+            if (out := seen.outside) is not None:
+                found = f"{out.joint} at {out.value:g} {out.unit}; a finite number needed"
         case Cause.NOT_A_ROTATION:
             norm = sum(v * v for v in turned) ** 0.5
             about = "a quaternion that is not of norm 1"
@@ -256,12 +284,22 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
             found = f"stamped {-apart_s:.3g} s before the newest accepted one"
             remedy = "stop the second tracker or driver of this key; look for a network that reorders"
         case Cause.AHEAD:
-            about = "a stamp farther ahead than the time that has passed"
-            remedy = "mend the publisher's clock; it is believed once the source was silent"
+            about = "a stamp farther ahead than the time that has passed: its clock stepped, or samples were held up"
+            remedy = "mend the publisher's clock, or see what holds samples up; the status says which of the two; "
+            remedy += "accepted again once the source was silent"
             found = f"stamped {apart_s:.3g} s after the newest accepted one"
+            if came.stamp_ns and seen.held_up_s is None:
+                found += ": its clock stepped ahead"
+                remedy = "mend the publisher's clock; it is believed once the source was silent"
+            elif came.stamp_ns:
+                found += f", which was held up for {seen.held_up_s:.3g} s on its way; the clock is right"
+                remedy = "see what holds samples up: the network, or a publisher or daemon that is too busy"
         case Cause.JUMPED:
             about = "a hand or a joint that leapt; a hand is believed after three samples over 20 ms that agree"
             remedy, found = "look for reflections and for a second source", f"{at}, from one sample to the next"
+            if (jump := seen.jump) is not None:
+                found = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, "
+                found += "from one sample to the next"
         case Cause.SWAPPED:
             about = "a hand where the other one was, and the other where it was; believed after 2 s"
             remedy = "the tracker takes left for right: let it see both hands apart for a moment"
@@ -306,8 +344,25 @@ def _contest(seen: Evidence) -> str:
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
 
 
-def _silence(source: Source | None) -> str:
-    """For how long the arm says nothing; empty where it does."""
+def _is_seldom(seen: Evidence) -> bool:
+    """Whether states of the arm go on coming, but not often enough to go by."""
+    source = seen.sources.get("arm")
+    if source is None or source.age_ms is None or _is_refused(source):
+        return False
+    goes_on = source.age_ms * source.rate_hz < 2000.0  # the next one is not overdue by a whole interval
+    return goes_on and 0.0 < source.rate_hz * seen.silent_ms < 1000.0
+
+
+def _of_rate(seen: Evidence) -> str:
+    """What to do about states that come too seldom; empty where they do not."""
+    return "publish `joints/state` more often, or raise `[arm] silent_ms`" if _is_seldom(seen) else ""
+
+
+def _silence(seen: Evidence) -> str:
+    """For how long the arm says nothing, or that it does so too seldom; empty where it does."""
+    source = seen.sources.get("arm")
+    if source is not None and _is_seldom(seen):
+        return f"joint states come at {source.rate_hz:.1f} Hz, {1000 / seen.silent_ms:g} Hz at least needed"
     if source is None or source.fresh:
         return ""
     return "no joint states came yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"
@@ -322,10 +377,10 @@ def _not_ready(seen: Evidence) -> str:
         return f"what comes of the arm is rejected as {source.cause}: {source.refused}"
     at = "the arm has not told one posture for long enough"
     if out is not None:
-        at = f"{out.joint} at {out.value:.3f} rad is outside {out.low:g} to {out.high:g}, and is moved back"
+        at = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
     elif seen.inside is not None:
         at = "what {} moves is inside of {} by {:.3f} m".format(*seen.inside)
-    return _silence(source) or at
+    return _silence(seen) or at
 
 
 def _stuck(seen: Stuck | None) -> str:
@@ -345,7 +400,7 @@ def _is_refused(source: Source) -> bool:
 def _of_rejected(seen: Evidence, *needed: str) -> str:
     """What to do about the first needed source whose samples are all rejected."""
     refused = (source for name in needed if (source := seen.sources.get(name)) is not None and _is_refused(source))
-    return next((BY_WORD[source.cause].remedy for source in refused), "")
+    return next((source.advice or BY_WORD[source.cause].remedy for source in refused), "")
 
 
 def _time(duration_ms: float) -> str:

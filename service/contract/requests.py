@@ -161,7 +161,7 @@ class Percentiles(msgspec.Struct, frozen=True):
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """What comes in of one hand, or of the arm."""
 
-    rate_hz: float = 0.0  # messages in the last second, accepted or not; at most one a tick is taken
+    rate_hz: float = 0.0  # messages in the last second, accepted or not; of the arm, states of all its joints
     age_ms: float | None = None  # of the newest accepted sample; None: none yet
     fresh: bool = False  # whether that is young enough to go by
     clock_ms: float | None = None  # stamp to arrival, median of the last second; below 0: a clock that is ahead
@@ -171,6 +171,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     rejected: dict[str, int] = {}  # samples by cause, `malformed` among them
     cause: str = ""  # of the newest one rejected in the last second
     refused: str = ""  # that one in words: what came, and what is accepted
+    advice: str = ""  # what to do about that one
     contested: float = 0.0  # share of the last second's samples that contradict the rest
     scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
 
@@ -223,6 +224,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     deviation_m: float | None = None  # of the hands from what the skill knows
     threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
     command_heard: bool = True  # whether anybody listens to `joints/command`
+    busy: str = ""  # how the daemon's machine is too busy, or was when the arm stopped; empty: it is not
 
     @property
     def needed(self) -> tuple[str, ...]:

@@ -154,8 +154,8 @@ CAPSULE = np.dtype(
 
 @compiled
 def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
-    """Into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad]; its capsules are
-    ordered by link.
+    """Into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m]; its capsules
+    are ordered by link.
     """
     turn, at = np.eye(3), np.zeros(3)
     own, moved, there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -167,12 +167,17 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
                 there[i] = at[i]
                 for k in range(3):
                     there[i] += turn[i, k] * frame[k, 3]
-            _about(axes[link - 1], q[link - 1], own)
+            slides = axes[link - 1, 3] != 0.0
+            _about(axes[link - 1], 0.0 if slides else q[link - 1], own)
             for i in range(3):
                 for j in range(3):
                     moved[i, j] = 0.0
                     for k in range(3):
                         moved[i, j] += turn[i, k] * frame[k, j]
+            if slides:
+                for i in range(3):
+                    for k in range(3):
+                        there[i] += moved[i, k] * axes[link - 1, k] * q[link - 1]
             for i in range(3):
                 at[i] = there[i]
                 for j in range(3):

@@ -24,7 +24,7 @@ from service.core.separation.separation import Separation
 
 STARTS, ITERATIONS = 60, 120  # of the search for postures, and steps of each
 STEP_RAD = 0.2  # at most, of a joint in one of them
-SLACK = 0.03  # [rad] kept from the position limits
+SLACK, SLACK_SHARE = 0.03, 0.1  # [rad, m] kept from the position limits; at most this share of the range
 REACHED_M, REACHED_RAD = 2e-3, 0.1  # a posture so near to position and orientation will do
 DAMPING = 1e-5  # [m²] of those steps
 OPPOSITE = -0.9999  # cosine of directions between which no turn is the shortest
@@ -44,7 +44,10 @@ class WayOut:
     def __init__(self, settings: Settings, urdf: str) -> None:
         self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
         limits = settings.joints
-        self._lower, self._upper = np.array(limits.lower) + SLACK, np.array(limits.upper) - SLACK
+        lower, upper = np.array(limits.lower), np.array(limits.upper)
+        slack = np.minimum(SLACK, SLACK_SHARE * (upper - lower))
+        self._lower, self._upper = lower + slack, upper - slack
+        self._is_continuous = np.array(limits.every_kind) == "continuous"
         self._home, self._whole = np.array(settings.arm.posture), settings.tool.orientation == "full"
         self._lever = float(self._arm.parameters["turn_lever"][0])
 
@@ -54,11 +57,12 @@ class WayOut:
         none is found.
         """
         random, here_m = np.random.default_rng(0), self._separation.clearance(joints, hands)[0]
+        limits = self._around(joints)
         ways: list[list[Vector]] = []
         for turned in (True, False):  # position goes before orientation
-            for goal in self._postures(joints, position, orientation if turned else None, hands, random):
+            for goal in self._postures(joints, limits, position, orientation if turned else None, hands, random):
                 least = min(here_m, self._separation.clearance(goal, hands)[0], MARGIN_M) - SMALL_M
-                path = self._connect(joints, goal, hands, least, random)
+                path = self._connect(joints, goal, limits, hands, least, random)
                 if path:
                     ways.append(self._shortened(path, hands, least, random))
                 if len(ways) == WAYS:
@@ -67,21 +71,37 @@ class WayOut:
                 break
         return min((way for way in ways if len(way) <= WAY), key=_length, default=[])
 
+    def _around(self, joints: Vector) -> Vector:
+        """Lower and upper limits (2, J) [rad, m] of the search: of a continuous joint half a turn
+        each way, which is all there is.
+        """
+        lower = np.where(self._is_continuous, np.maximum(joints - math.pi, self._lower), self._lower)
+        upper = np.where(self._is_continuous, np.minimum(joints + math.pi, self._upper), self._upper)
+        return np.array([lower, upper])
+
     def _postures(
-        self, joints: Vector, position: Vector, orientation: Vector | None, hands: Vector, random: np.random.Generator
+        self,
+        joints: Vector,
+        limits: Vector,
+        position: Vector,
+        orientation: Vector | None,
+        hands: Vector,
+        random: np.random.Generator,
     ) -> list[Vector]:
         """Free postures with the tool there, the one nearest to `joints` first."""
-        drawn = random.uniform(self._lower, self._upper, (STARTS, len(joints)))
+        drawn = random.uniform(limits[0], limits[1], (STARTS, len(joints)))
+        turns = 2.0 * math.pi * np.rint((joints - self._home) / (2.0 * math.pi))
+        home = self._home + np.where(self._is_continuous, turns, 0.0)
         found: list[Vector] = []
-        for start in (self._home, *drawn):
-            q = self._solved(start, position, orientation)
+        for start in (home, *drawn):
+            q = self._solved(start, limits, position, orientation)
             if q is not None and self._separation.clearance(q, hands)[0] > 0.0:
                 found.append(q)
             if len(found) >= 2 * GOALS:
                 break
         return sorted(found, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
 
-    def _solved(self, q: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
+    def _solved(self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
         """A posture with the tool there within the limits, from one (J,)."""
         for _ in range(ITERATIONS):
             here = self._arm.at(q)
@@ -93,7 +113,7 @@ class WayOut:
             if np.linalg.norm(error[:3]) < REACHED_M and turn < REACHED_RAD:
                 return q
             step = tasks.T @ np.linalg.solve(tasks @ tasks.T + DAMPING * np.eye(len(tasks)), error)
-            q = np.clip(q + step * min(1.0, STEP_RAD / max(float(np.abs(step).max()), 1e-9)), self._lower, self._upper)
+            q = np.clip(q + step * min(1.0, STEP_RAD / max(float(np.abs(step).max()), 1e-9)), *limits)
         return None
 
     def _turn(self, here: Kinematics, orientation: Vector) -> Vector:
@@ -115,7 +135,7 @@ class WayOut:
         return all(self._separation.clearance(a + k / count * (b - a), hands)[0] > least for k in range(1, count + 1))
 
     def _connect(
-        self, start: Vector, goal: Vector, hands: Vector, least: float, random: np.random.Generator
+        self, start: Vector, goal: Vector, limits: Vector, hands: Vector, least: float, random: np.random.Generator
     ) -> list[Vector]:
         """A free path of straight lines; empty where none is found."""
         if self._is_free(start, goal, hands, least):
@@ -123,7 +143,7 @@ class WayOut:
         trees = [([start], [-1]), ([goal], [-1])]
         for number in range(NODES):
             (grown, before), (other, other_before) = trees[number % 2], trees[1 - number % 2]
-            drawn = random.uniform(self._lower, self._upper)
+            drawn = random.uniform(limits[0], limits[1])
             new = self._grow(grown, before, drawn, hands, least)
             while new is not None:
                 met = self._grow(other, other_before, new, hands, least)

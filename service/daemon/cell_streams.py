@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,21 +13,30 @@ from zenoh.handlers import RingChannel
 from service.client import publisher
 from service.config import Settings
 from service.contract import channels, ros2
+from service.contract.cdr import encode_joints
+from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.core.frame import Event, Frame, Record
 from service.daemon.ros2_domain import Ros2Domain
 
+KEPT_DELAYS = 256  # messages whose delay is remembered
+CLOCK_STEP_NS = 100_000_000  # a delay may be this much below the least one before it
+HELD_UP_NS = 50_000_000  # a message that took this much longer than the next was held up
 LARGEST_MESSAGE = 4096  # bytes of a hand or joint message
 ARM = "joints/state"
-MOST_ARRIVALS = 4  # of a hand in a tick, the newest: what a network held back comes at once; a flood costs no tick
+# Newest messages read in one tick: a network delivers at once what it held back, and a flood must
+# not cost a tick.
+MOST_ARRIVALS = 4  # of a hand
+MOST_JOINT_STATES = 16  # of the arm's topic, on which grippers and other parts may publish too
 
 
 class Arrivals:
     """What came in on one channel. The loop writes, other threads read."""
 
-    __slots__ = ("at_ns", "count", "malformed", "newest", "why")
+    __slots__ = ("_delays", "at_ns", "count", "malformed", "newest", "why")
 
     def __init__(self) -> None:
+        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, and from there to arrival [ns]
         self.count = self.malformed = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
@@ -34,7 +44,27 @@ class Arrivals:
     def take(self, message: PoseStamped | JointState, at_ns: int) -> None:
         """One message, and when it came by the system clock [ns]."""
         self.newest, self.at_ns = message, at_ns
+        self._delays.append((message.stamp_ns, at_ns - message.stamp_ns))
         self.count += 1
+
+    def held_up_s(self, accepted_ns: int, stamp_ns: int) -> float | None:
+        """How much longer than a message with the second stamp the one with the first, accepted
+        before it, was on its way [s]; None where a clock stepped ahead between them.
+
+        A delay is at least that of the quickest message: a message that seems to be quicker than
+        all before it has a stamp of another clock. Before there are others, clocks are assumed to
+        agree.
+        """
+        delays = tuple(self._delays)
+        stamps = [stamp for stamp, _ in delays]
+        if accepted_ns not in stamps or stamp_ns not in stamps:
+            return None
+        accepted = stamps.index(accepted_ns)
+        quickest_ns = min((delay for _, delay in delays[:accepted]), default=0)
+        delay_ns = delays[stamps.index(stamp_ns)][1]
+        held_up_ns = delays[accepted][1] - delay_ns
+        is_delay = held_up_ns > HELD_UP_NS and delay_ns > quickest_ns - CLOCK_STEP_NS
+        return held_up_ns / 1e9 if is_delay else None
 
     def refuse(self, why: str) -> None:
         """Bytes that are no message."""
@@ -61,6 +91,7 @@ class CellStreams:
         cell, domain = settings.cell, settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
+        self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [c for c in ros2.HEARD if c.key != ARM or settings.arm.source == "state"]
         keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
         if domain is not None:
@@ -70,8 +101,7 @@ class CellStreams:
             ]
             keys += [(channels.BY_KEY[one.channel], ros2.key(domain, one)) for one in topics if one.heard]
         self._subscribers = [
-            (channel, session.declare_subscriber(key, RingChannel(1 if channel.key == ARM else MOST_ARRIVALS)))
-            for channel, key in keys
+            (channel, session.declare_subscriber(key, RingChannel(_most(channel)))) for channel, key in keys
         ]
         self._publishers = {
             channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
@@ -81,16 +111,18 @@ class CellStreams:
         self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
-        """What came of the hands since the last call, and the arm's newest message; what can be
+        """The hands' messages since the last call, and the newest state of the arm; what can be
         decoded.
         """
         events: list[Event] = []
         for channel, source in self._subscribers:
-            for _ in range(MOST_ARRIVALS):
+            arrived: list[Event] = []
+            for _ in range(_most(channel)):
                 if (sample := source.try_recv()) is None:
                     break
                 if event := self._decoded(channel, sample):
-                    events.append(event)
+                    arrived.append(event)
+            events += arrived[-1:] if channel.key == ARM else arrived
         return events
 
     def _decoded(self, channel: channels.Channel, sample: Any) -> Event | None:
@@ -98,9 +130,16 @@ class CellStreams:
         try:
             if len(sample.payload) > LARGEST_MESSAGE:
                 raise WireError(f"{len(sample.payload)} bytes, at most {LARGEST_MESSAGE} accepted")
-            payload = sample.payload.to_bytes()
-            event = self.newest[channel.key] = Event(channel.key, payload, channel.codec.decode(payload))
-            arrivals.take(event.value, time.time_ns())
+            payload, at_ns = sample.payload.to_bytes(), time.time_ns()
+            message = channel.codec.decode(payload)
+            if channel.key == ARM:
+                state = self._joints.take(message, at_ns / 1e9) or self._joints.incomplete(message, at_ns / 1e9)
+                if state is None:
+                    return None
+                if state is not message:
+                    message, payload = state, encode_joints(state)
+            event = self.newest[channel.key] = Event(channel.key, payload, message)
+            arrivals.take(message, at_ns)
             return event
         except WireError as error:
             arrivals.refuse(str(error))
@@ -126,3 +165,8 @@ class CellStreams:
         """Ends the threads beside the loop."""
         if self._ros2 is not None:
             self._ros2.close()
+
+
+def _most(channel: channels.Channel) -> int:
+    """Messages of a channel that are read in one tick."""
+    return MOST_JOINT_STATES if channel.key == ARM else MOST_ARRIVALS

@@ -143,6 +143,11 @@ class Window:
         self._values[self._count % len(self._values)] = value
         self._count += 1
 
+    def largest(self, count: int) -> float:
+        """The largest of the newest values, at most so many; 0 while it is empty."""
+        newest = self._values.take(range(self._count - min(count, self._count), self._count), mode="wrap")
+        return float(newest.max(initial=0.0))
+
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and maximum over the window; zeros while it is empty."""
         if not self._count:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import logging
 import signal
@@ -17,11 +16,11 @@ from typing import Any
 from service.client import endpoints
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import Attachment
 from service.contract.records import Reason
-from service.contract.requests import Status, encode_json
+from service.contract.requests import Status, ViaPoint, encode_json
 from service.core.controller import Controller, outgoing, run
 from service.core.frame import STAGES, Event, Frame, Outputs, Tick, blank, frame_layout, order, timed
 from service.core.separation.clearance import FARTHEST
@@ -39,15 +38,17 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
+from service.daemon.machine import WINDOW_S, Machine
+from service.daemon.newest_status import PAUSE_S, NewestStatus
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, skill_of
 from service.daemon.start import Start
-from service.daemon.status import CellStatus, MeasuredArm
+from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.way_finder import WayFinder
-from service.learning.skill_file import SkillError, StoredSkill
+from service.learning.skill_file import StoredSkill
 from service.recording.protocol import pack
 from service.recording.scribe import Scribe
 
@@ -57,6 +58,7 @@ STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STAGE_NUMBERS = {stage: number for number, stage in enumerate(STAGES)}
 MOST_NOTES = 100  # a second
 MOMENT_TRIES = 10  # until a status tells of one moment
+STATUS_S, FIRST_TICK_S = 0.1, 0.01  # between two published statuses; between two looks for the first tick
 LONGEST_LATENCY_MS = 1000.0  # a longer one means that the clocks differ
 
 
@@ -95,7 +97,7 @@ class Daemon:
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
-        self._sources = InputMonitor(settings)
+        self._sources, self._machine = InputMonitor(settings), Machine()
         self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
@@ -115,15 +117,14 @@ class Daemon:
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
-        self._status = encode_json(self._status_now())
-        start.over()
+        self._status = NewestStatus()
+        self._start, self._is_open = start, False
         self._queryables = Queryables(
-            self._session,
             settings,
             stored,
             skill_worker=skill_worker,
             skills=skills,
-            status=lambda: self._status,
+            status=self._status.requested,
             frame=lambda: self._frame,
             note=self.note,
             keep=scribe.keep,
@@ -152,26 +153,27 @@ class Daemon:
 
     def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
         """What the recordings lack, in words (empty: nothing), once `stop` was called and
-        everything is flushed and closed. `announce` is called once requests are answered.
+        everything is flushed and closed. `announce` is called once requests are answered, which
+        they are from the loop's first tick on.
         """
         reporter: threading.Thread | None = None
         try:
             self._scribe.start(skill=self._file, state=self._controller.state)
-            reporter = supervised_thread.start("status thread", self._report, self._fail)
+            reporter = supervised_thread.start("status thread", lambda: self._report(announce), self._fail)
             self._granted = ask_for_real_time()
-            announce(self)
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
             supervised_thread.supervised("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
         finally:
             brake(self._settings, self._frame, self._clock, self._streams)
             self._ended.set()
             gc.unfreeze()
+            self._status.close()
             if reporter is not None:
                 reporter.join(2)
             self._queryables.close()
             self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
-            if missing := self._scribe.close(timeout_s=20):
+            if missing := self._scribe.close():
                 log.warning("%s", missing)
         return missing
 
@@ -277,28 +279,48 @@ class Daemon:
 
     # --- beside the loop ---
 
-    def _report(self) -> None:
-        """Publishes the status, logs what changed, keeps the scribe alive: ten times a second."""
+    def _open(self, announce: Callable[[Daemon], None]) -> None:
+        """Answers requests once the loop takes them."""
+        while not self._is_open and not self._ended.wait(FIRST_TICK_S):
+            if self._frame["tick"] >= 0:
+                self._is_open = True
+                self._start.over()
+                self._queryables.open(self._session)
+                announce(self)
+
+    def _report(self, announce: Callable[[Daemon], None]) -> None:
+        """Publishes the status, logs what changed, keeps the scribe alive: ten times a second, and
+        the status also where a request changed it.
+        """
         run_beside_real_time()
+        self._open(announce)
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
-        while not self._ended.wait(0.1):
+        due_s = time.monotonic()
+        while not self._ended.is_set():
+            self._status.wait(due_s - time.monotonic())
+            is_due, is_published = time.monotonic() >= due_s, self._status.begin()
             status = self._status_now()
-            self._way_finder.poll(self._frame, self._controller.state)
-            errors = list(status.scribe["errors"])
-            payload = self._status = encode_json(status)
-            self._streams.publish("status", payload)
-            self._streams.show(self._frame, self._controller.state)
-            self._scribe.note("status", payload.decode(), time.time_ns())
-            self._objects.poll()
-            try:
-                self._scribe.supervise()
-            except OSError as error:  # a lack of descriptors or memory may pass
-                errors.append(f"the scribe cannot be supervised: {error}")
+            payload, errors = encode_json(status), list(status.scribe["errors"])
+            if is_due or is_published:
+                self._streams.publish("status", payload)
             try:
                 self._saved_stage.keep(self._controller.skill, status.stage, status.stage_belief)
             except OSError as error:
-                errors.append(f"the stage of the task cannot be kept over a restart: {error}")
+                errors.append(f"the stage of the task cannot be kept over a restart: {in_words(error)}")
+            self._status.end(payload)
+            if is_due:
+                due_s = time.monotonic() + STATUS_S
+                self._way_finder.poll(self._frame, self._controller.state)
+                self._streams.show(self._frame, self._controller.state)
+                self._scribe.note("status", payload.decode(), time.time_ns())
+                self._objects.poll()
+                try:
+                    self._scribe.supervise()
+                except OSError as error:  # a lack of descriptors or memory may pass
+                    errors.append(f"the scribe cannot be supervised: {in_words(error)}")
+            else:
+                self._ended.wait(PAUSE_S)
             for error_text in errors:
                 if error_text not in logged_errors:
                     logged_errors.append(error_text)
@@ -317,9 +339,14 @@ class Daemon:
             if frame["tick"] == state["tick"]:
                 break
             time.sleep(0.2 * self._settings.period_s)
-        sources = self._sources.update(self._controller, state, time.monotonic())
+        now_s = time.monotonic()
+        sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)
-        return CellStatus(frame, self._controller, state, sources, self._settings, self._failure, inside).status(
+        late_ms = self._lateness.largest(round(WINDOW_S * self._settings.rate_hz)) / 1e3
+        machine = self._machine
+        machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
+        known = self._failure, inside, machine.at_stop
+        return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
@@ -331,6 +358,7 @@ class Daemon:
             latency_ms=self._latency.percentiles(),
             scribe=self._scribe.status(),
             command_heard=self._streams.is_followed,
+            busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,
             version=self._version,
             tool_measured_m=self._measured_arm.position(state),
@@ -339,19 +367,14 @@ class Daemon:
 
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
     """The skill in a file, with the via-points taught to it before. Raises SkillError."""
-    skill, saved = skill_of(path), SavedViaPoints(settings)
-    try:
-        found = saved.read(skill)
-    except SkillError as error:
-        path = saved.path(skill)
-        aside = path.with_suffix(".damaged")
-        with contextlib.suppress(OSError):
-            path.replace(aside)
-        log.warning("%s; it is kept as %s, and no via-points are in force", error, aside)
-        return skill
-    if found is None or found[0] == skill.via_points:
-        return skill
-    return skill_of(skill.file, *found, settings.tool.max_gain)
+    skill = skill_of(path)
+
+    def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
+        if points == skill.via_points:
+            return skill
+        return skill_of(skill.file, points, tolerance, settings.tool.max_gain)
+
+    return SavedViaPoints(settings).restored(skill, taught, skill)
 
 
 def serve(

@@ -11,8 +11,19 @@ from collections.abc import Iterator
 from statistics import median
 
 from service.config import JointSettings, Settings
-from service.contract.incidents import LONGEST_NAME, MALFORMED, SOURCE_NAMES, Evidence, Outside, explained, remedy, word
-from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
+from service.contract.incidents import (
+    LONGEST_NAME,
+    MALFORMED,
+    SOURCE_NAMES,
+    Evidence,
+    Incident,
+    Jump,
+    Outside,
+    explained,
+    word,
+)
+from service.contract.joint_states import measured
+from service.contract.messages import BASE, PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
@@ -36,7 +47,7 @@ class _History:
         self.clocks: deque[tuple[float, float]] = deque()
         self.seen: dict[str, int] = {}
         self.logged: dict[str, int] = {}
-        self.words: dict[str, str] = {}  # of the newest rejected, by cause
+        self.found: dict[str, Incident] = {}  # of the newest rejected, by cause
         self.cause, self.refused_s = "", -math.inf
 
 
@@ -68,13 +79,14 @@ class InputMonitor:
         rejected |= {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
             if cause == MALFORMED:
-                why = explained(MALFORMED, Evidence(mistake=arrivals.why))
+                history.found[cause] = explained(MALFORMED, Evidence(mistake=arrivals.why))
             else:
                 refused = intake.refused[source, Cause[cause.upper()]]
-                why = explained(refused.cause, evidence(refused, self._settings))
-            history.words[cause] = why.why
+                seen_of = evidence(refused, self._settings, arrivals)
+                history.found[cause] = explained(refused.cause, seen_of)
             history.cause, history.refused_s = cause, now_s
         history.seen, lately = rejected, now_s - history.refused_s <= WINDOW_S
+        newest = history.found[history.cause] if lately else None
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
@@ -90,7 +102,8 @@ class InputMonitor:
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
             cause=history.cause if lately else "",
-            refused=history.words.get(history.cause, "") if lately else "",
+            refused="" if newest is None else newest.why,
+            advice="" if newest is None else newest.what_to_do,
             contested=round(float(state["contested"][index]), 3),
             scatter_mm=None
             if source == "arm" or seen < 0
@@ -101,10 +114,10 @@ class InputMonitor:
         """Lines for the log: the first rejection of each kind at once, then counts."""
         counts = now_s - self._counted_s >= TELL_EVERY_S
         for source, now in sources.items():
-            logged, words, name = self._histories[source].logged, self._histories[source].words, SOURCE_NAMES[source]
+            logged, found, name = self._histories[source].logged, self._histories[source].found, SOURCE_NAMES[source]
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
-                yield f"{name}: rejected as {cause}: {words[cause]}. What to do: {remedy(cause)}"
+                yield f"{name}: rejected as {cause}: {found[cause].why}. What to do: {found[cause].what_to_do}"
             more = {cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]}
             if counts and more:
                 logged |= now.rejected
@@ -120,25 +133,44 @@ def frames(settings: Settings) -> tuple[str, ...]:
     return (BASE, "") if own in ("", BASE) else (BASE, own, "")
 
 
-def evidence(refused: Refused, settings: Settings) -> Evidence:
-    """What is known of a sample that was rejected."""
-    cause, sample, newest_ns = refused
-    mistake, outside = "", None
+def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
+    """What is known of a sample that was rejected, and that arrived with others of its source."""
+    cause, sample, newest_ns, _ = refused
+    held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
+    seen = Evidence(sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
     if isinstance(sample, PoseStamped):
         mistake = too_far(sample.position, settings.hands.unit) if cause is Cause.OUT_OF_RANGE else ""
-    else:
-        try:
-            outside = next(_outside(sample, settings.joints), None)
-        except WireError as error:
-            mistake = str(error)
-    return Evidence(sample=sample, newest_ns=newest_ns, frames=frames(settings), mistake=mistake, outside=outside)
+        return seen._replace(mistake=mistake)
+    try:
+        position, velocity = measured(sample, settings.joints.names)
+    except WireError as error:
+        return seen._replace(mistake=str(error))
+    if cause is Cause.JUMPED:
+        joints = settings.joints
+        leaps = [*map(Jump, joints.names, refused.joints, position, joints.units)]
+        sizes = [
+            abs(_turned(leap, kind) / per_rad)
+            for leap, kind, per_rad in zip(leaps, joints.every_kind, joints.per_rad, strict=True)
+        ]
+        return seen._replace(jump=leaps[sizes.index(max(sizes))])
+    outside = [*_outside(settings.joints, position, velocity)]
+    if cause is Cause.NOT_FINITE:
+        outside = [one for one in outside if not math.isfinite(one.value)]
+    return seen._replace(outside=outside[0] if outside else None)
 
 
-def _outside(sample: JointState, joints: JointSettings) -> Iterator[Outside]:
-    """What of the joints is outside of what is accepted. Raises WireError."""
-    measured = zip(joints.names, *in_order(sample, joints.names), joints.lower, joints.upper, strict=True)
-    for name, position, speed, low, high in measured:
-        if not low - FARTHEST_OUTSIDE <= position <= high + FARTHEST_OUTSIDE:
-            yield Outside(name, position, low - FARTHEST_OUTSIDE, high + FARTHEST_OUTSIDE)
-        if abs(speed) > MAX_JOINT_SPEED:
-            yield Outside(name, speed, -MAX_JOINT_SPEED, MAX_JOINT_SPEED, "rad/s")
+def _turned(leap: Jump, kind: str) -> float:
+    """How far a joint went; of a continuous one without its turns."""
+    far = leap.after - leap.before
+    return math.remainder(far, 2.0 * math.pi) if kind == "continuous" else far
+
+
+def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]) -> Iterator[Outside]:
+    """Measured values that are outside of what is accepted."""
+    of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
+    for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
+        low, high = lower - FARTHEST_OUTSIDE * per_rad, upper + FARTHEST_OUTSIDE * per_rad
+        if not low <= at <= high:
+            yield Outside(name, at, low, high, unit)
+        if not abs(speed) <= (fastest := MAX_JOINT_SPEED * per_rad):
+            yield Outside(name, speed, -fastest, fastest, f"{unit}/s")

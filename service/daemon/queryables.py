@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import zenoh
@@ -50,10 +51,17 @@ MOST_ORDERS = 1024  # ... of orders, of which one tick takes all
 LONGEST_LIST = 100  # bytes
 TEXT = zenoh.Encoding.TEXT_PLAIN
 ORDERS = ("hold", "resume", "reset")
+TOGETHER = (*ORDERS, "status")  # one answer is that of all that wait
 COMPUTED = "teaching"  # the queue of requests for which the skill worker computes
 
 
 Order = Callable[[str], Reply | RequestError]  # carries out hold, resume or reset
+
+
+class Requested(Protocol):
+    """Makes a status that is newer than its call, and publishes it where that is wanted."""
+
+    def __call__(self, *, published: bool) -> bytes: ...
 
 
 class PendingEvent:
@@ -86,14 +94,14 @@ class PendingEvent:
 class RequestQueue:
     """Requests that wait for a thread of their own; one beyond `most` is refused.
 
-    `answer` takes orders together, as many as wait, and other requests one by one.
+    `answer` takes those of TOGETHER as many as wait, and other requests one by one.
     """
 
     def __init__(
         self, name: str, answer: Callable[[list[tuple[str, zenoh.Query]]], None], failed: Callable[[str], None]
     ) -> None:
         self._name, self._answer = name, answer
-        self._most, self._together = (MOST_ORDERS, MOST_ORDERS) if name in ORDERS else (MOST_WAITING, 1)
+        self._most, self._together = (MOST_ORDERS, MOST_ORDERS) if name in TOGETHER else (MOST_WAITING, 1)
         self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(self._most)
         self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
 
@@ -124,21 +132,22 @@ class RequestQueue:
 
 
 class Queryables:
-    """The queryables of one cell.
+    """The queryables of one cell, which answer once they are open.
 
-    What is known is answered at once. Each of hold, resume and reset has a queue of its own, and
-    the requests for which the skill worker computes have one: no kind waits behind another.
+    Each of TOGETHER has a queue of its own, and the requests for which the skill worker computes
+    have one: no kind waits behind another. The via-points in force are listed at once. `status` is
+    to return a status that is newer than its call; a request that changed something is answered
+    once a status that shows it is published.
     """
 
     def __init__(
         self,
-        session: zenoh.Session,
         settings: Settings,
         skill: StoredSkill,
         *,
         skill_worker: SkillWorker,
         skills: Path,
-        status: Callable[[], bytes],
+        status: Requested,
         frame: Callable[[], Frame],
         note: Callable[[str], None],
         keep: Callable[[bytes], object],
@@ -155,7 +164,11 @@ class Queryables:
         self._keep = keep
         self._failed = failed
         self._saved = SavedViaPoints(settings)
-        self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*ORDERS, COMPUTED)}
+        self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*TOGETHER, COMPUTED)}
+        self._queryables: list[zenoh.Queryable[None]] = []
+
+    def open(self, session: zenoh.Session) -> None:
+        """Answers requests from now on."""
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
@@ -166,10 +179,10 @@ class Queryables:
                 if not hasattr(local, "is_prioritised"):
                     local.is_prioritised = True
                     run_beside_real_time()
-                if suffix == "status" or self._is_list(suffix, query):
-                    self._reply(suffix, query)
+                if self._is_list(suffix, query):
+                    self._reply(suffix, query, self._order, self._status)
                 else:
-                    self._queues[suffix if suffix in ORDERS else COMPUTED].enqueue(suffix, query)
+                    self._queues[suffix if suffix in TOGETHER else COMPUTED].enqueue(suffix, query)
             except Exception as error:
                 self._failed(f"receiving {suffix} requests failed: {error!r}")
 
@@ -192,12 +205,14 @@ class Queryables:
             return False
 
     def _reply_together(self, asked: Sequence[tuple[str, zenoh.Query]]) -> None:
-        """Replies to requests, of which equal orders go through the loop once."""
-        order_once = functools.cache(self._order)
+        """Replies to requests once a status shows what they changed; equal orders go through the
+        loop once.
+        """
+        order_once, status_once = functools.cache(self._order), functools.cache(self._status)
         for suffix, query in asked:
-            self._reply(suffix, query, order_once)
+            self._reply(suffix, query, order_once, status_once)
 
-    def _reply(self, suffix: str, query: zenoh.Query, order: Order | None = None) -> None:
+    def _reply(self, suffix: str, query: zenoh.Query, order: Order, status: Requested) -> None:
         key = channels.key(self._settings.cell, suffix)
         with query:  # its end tells the client that no more replies come
             try:
@@ -206,11 +221,13 @@ class Queryables:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 if (size := len(payload)) > channels.LARGEST_REQUEST:
                     raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
-                answer = (
-                    self._status()
-                    if suffix == "status"
-                    else encode_json(self._answer(suffix, payload, order or self._order))
-                )
+                if suffix == "status":
+                    answer, changes = status(published=False), False
+                else:
+                    request = channels.BY_KEY[suffix].codec.decode(payload)
+                    answer, changes = encode_json(self._answer(suffix, request, order)), not isinstance(request, List)
+                if changes:
+                    status(published=True)
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")
                 query.reply_err(str(error).encode(), encoding=TEXT)
@@ -218,12 +235,11 @@ class Queryables:
                 self._note(f"{suffix} failed: {error!r}")
                 query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
             else:
-                if order is not None:  # else it only asks what is known
+                if changes:
                     self._note(f"{suffix} {payload.decode(errors='replace') or '{}'}")
                 query.reply(key, answer, encoding=ENCODINGS["json"])
 
-    def _answer(self, suffix: str, payload: bytes, order: Order) -> Reply:
-        request = channels.BY_KEY[suffix].codec.decode(payload)
+    def _answer(self, suffix: str, request: object, order: Order) -> Reply:
         match request:
             case SkillRequest(name):
                 return self._load(name)
@@ -246,9 +262,6 @@ class Queryables:
             tick = self._through_the_loop(order(suffix))
         except RequestError as error:
             return error
-        end = time.monotonic() + ADOPTION_TIMEOUT_S
-        while int(self._frame()["tick"]) < tick and time.monotonic() < end:
-            time.sleep(POLL_S)
         mode, reason = outcome(self._frame())
         note = ""
         if suffix == "reset" and before is not Mode.FAULT:
@@ -268,9 +281,13 @@ class Queryables:
         return Reply(tick, mode=word(mode), reason=word(reason))
 
     def _through_the_loop(self, event: Event) -> int:
+        """The tick that took an event, once that has decided."""
         pending = PendingEvent(event)
         self.inbox.append(pending)
-        return pending.wait()
+        tick, end = pending.wait(), time.monotonic() + ADOPTION_TIMEOUT_S
+        while int(self._frame()["tick"]) < tick and time.monotonic() < end:
+            time.sleep(POLL_S)
+        return tick
 
     def _adopt(self, skill: StoredSkill) -> Reply:
         self._keep(skill.file)

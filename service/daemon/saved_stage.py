@@ -9,6 +9,7 @@ from pathlib import Path
 
 from service.config import Settings
 from service.core.skill.skill import Skill
+from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 
 LONGEST_S = 600.0  # a restart that takes longer is of another job: its hands tell where it begins
@@ -24,13 +25,13 @@ class SavedStage:
 
     def read(self, skill: Skill) -> str:
         """The via-point that a task of this skill has come to lately; empty: not known."""
-        try:
-            age_s = time.time() - self._path.stat().st_mtime
-            saved = json.loads(self._path.read_bytes())
-            name = saved["via_point"] if saved["learned_from"] == skill.learned_from else ""
-        except (OSError, ValueError, KeyError, TypeError):
-            return ""
-        return name if 0.0 <= age_s < LONGEST_S and name in skill.model.names else ""
+        return restored(self._path, lambda content: self._decoded(content, skill), "", what="the stage of the task")
+
+    def _decoded(self, content: bytes, skill: Skill) -> str:
+        saved, age_s = json.loads(content), time.time() - self._path.stat().st_mtime
+        name, learned_from = saved["via_point"], saved["learned_from"]
+        is_lately = learned_from == skill.learned_from and 0.0 <= age_s < LONGEST_S
+        return str(name) if is_lately and name in skill.model.names else ""
 
     def keep(self, skill: Skill, stage: tuple[str, ...], belief: float) -> None:
         """Takes note of the stage that it is now, from and to a via-point. Raises OSError."""

@@ -6,17 +6,21 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from service.config import Settings, robot_description
 from service.contract.requests import Add, ViaPoint, decode_request
 from service.core.skill.skill import Skill
+from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 from service.learning.skill_file import SkillError
 from service.urdf import Urdf
+
+T = TypeVar("T")
 
 
 def _checksum(saved: dict[str, Any]) -> str:
@@ -46,26 +50,28 @@ class SavedViaPoints:
         return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
-        """Via-points and tolerance taught to this skill of this arm, or None.
+        """Via-points and tolerance taught to this skill of this arm, or None."""
+        return self.restored(skill, lambda points, tolerance: (points, tolerance), None)
 
-        Raises SkillError where the file is damaged.
+    def restored(self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], T], otherwise: T) -> T:
+        """The value that `make` makes of the via-points and the tolerance taught to this skill of
+        this arm; `otherwise` where none were, or where that fails.
         """
-        path = self.path(skill)
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
+
+        def made(content: bytes) -> T:
+            found = self._decoded(content, skill)
+            return otherwise if found is None else make(*found)
+
+        return restored(self.path(skill), made, otherwise, what="the taught via-points")
+
+    def _decoded(self, content: bytes, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
+        """None where they belong to another skill or arm."""
+        saved = json.loads(content)
+        if saved.pop("checksum") != _checksum(saved):
+            raise ValueError("the checksum is wrong: the file was changed since; teach them again")
+        request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
+        if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
             return None
-        except OSError as error:
-            raise SkillError(f"cannot read via-points {path}: {error.strerror}") from None
-        try:
-            saved = json.loads(content)
-            if saved.pop("checksum") != _checksum(saved):
-                raise ValueError("its checksum is wrong: it was changed since; remove it, and teach them again")
-            request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
-            if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
-                return None
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise SkillError(f"{path} does not hold via-points ({error})") from None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def draft(self, skill: Skill) -> Path:

@@ -103,7 +103,7 @@ class Lock:
 
 def _holder(descriptor: int | None) -> str:
     """The holder of a lock, by what it wrote of itself."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
         found = json.loads(os.pread(descriptor, MOST_READ, 0))  # type: ignore[arg-type]
         where = f"listening on {', '.join(found['endpoints'])}" if found["endpoints"] else "not listening, or not yet"
         return f"process {found['pid']}, {where}"

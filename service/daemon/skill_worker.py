@@ -2,32 +2,24 @@
 control process need not.
 
 A skill is returned as a small pickle with its arrays in shared memory, so that the control process
-copies and solves nothing. What it computes with it imports when it is first asked, so that a start
-costs nothing.
+copies and solves nothing.
 """
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
-
-# isort: split
+import math
 import os
 import pickle
 import select
 import signal
 import socket
-import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from service import child
-
-if __name__ == "__main__":
-    select.select([int(sys.argv[1])], [], [])
-
-# isort: split
 from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
@@ -35,7 +27,11 @@ from service.core.way_out import WayOut
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
 
-TIMEOUT_S, FIRST_S = 8.0, 25.0  # shorter than a client waits; the first answer comes after its imports
+MODULE = "service.daemon.skill_worker"
+TIMEOUT_S = 25.0  # shorter than a client waits
+HUNG_S = 5.0  # without progress
+POLL_S = 0.1
+STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
 
 
 class SkillWorker:
@@ -48,13 +44,13 @@ class SkillWorker:
         self._max_gain = max_gain
         self._busy = threading.Lock()
         self._child: child.Child | None = None
-        self._first_s = FIRST_S  # that an answer of this child is waited for at least
 
-    def start(self) -> None:
-        """Starts the process, where it is not there."""
-        if self._child is None or self._child.process.poll() is not None:
+    def start(self) -> child.Child:
+        """The process, started where it is not there. Never waits."""
+        if self._child is None or self._child.poll() is not None:
             self._end()
-            self._child, self._first_s = child.start("service.daemon.skill_worker", socket.SOCK_STREAM), FIRST_S
+            self._child = child.start("skill worker", MODULE, socket.SOCK_STREAM)
+        return self._child
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
@@ -78,32 +74,42 @@ class SkillWorker:
 
     def close(self) -> None:
         """Ends the process, also while it works."""
-        if (running := self._child) is not None:
-            running.process.kill()
+        if (running := self._child) is not None and running.has_begun():
+            running.kill()
         with self._busy:
             self._end()
 
     def _end(self) -> None:
         if self._child is not None:
             self._child.socket.close()
-            self._child.process.kill()
-            self._child.process.wait()
+            if self._child.pid is not None:  # else it ends once it has begun
+                self._child.kill()
+                self._child.wait()
             self._child = None
 
     def _ask(self, timeout_s: float, *request: Any) -> Any:
         with self._busy:
-            self.start()
-            assert self._child is not None
-            timeout_s = max(timeout_s, self._first_s)
+            working, end_s = self.start(), time.monotonic() + timeout_s
+            progress = child.Progress(working)
             try:
-                self._child.socket.settimeout(timeout_s)
-                _send(self._child.socket, pickle.dumps(request))
-                answer, self._first_s = _receive(self._child.socket), 0.0
-            except TimeoutError:
+                while not working.has_begun(POLL_S):
+                    if working.returncode is not None or progress.is_hung(timeout_s):
+                        working.kill()
+                        raise EOFError
+                    if time.monotonic() > end_s:  # what it has imported stays: it is waited for again
+                        raise SkillError(STARTING)
+                _send(working.socket, pickle.dumps(request))
+                poll = select.poll()
+                poll.register(working.socket, select.POLLIN)
+                while not poll.poll(1000 * POLL_S):
+                    if progress.is_hung(HUNG_S, busy_s=math.inf):
+                        raise TimeoutError(f"made no progress for {HUNG_S:g} s")
+                    if time.monotonic() > end_s:
+                        raise TimeoutError(f"did not answer within {timeout_s:g} s")
+                answer = _receive(working.socket)
+            except TimeoutError as error:
                 self._end()
-                raise SkillError(
-                    f"the skill worker did not answer within {timeout_s:g} s; nothing was changed"
-                ) from None
+                raise SkillError(f"the skill worker {error}; nothing was changed") from None
             except (OSError, EOFError):
                 self._end()
                 raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
@@ -159,28 +165,22 @@ def skill_of(
     return skill
 
 
-def _main(descriptor: int) -> None:
+def run(channel: socket.socket) -> None:
     """The child: one request after the other until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     child.end_with_parent()
-    os.nice(10)
-    with socket.socket(fileno=descriptor) as channel:
-        while True:
-            try:
-                request = _receive(channel)
-            except (EOFError, OSError):
-                return
-            buffers: list[pickle.PickleBuffer] = []
-            try:
-                answer: StoredSkill | list[Vector] | str = _work(*request)
-            except Exception as error:  # any failure is an answer to the client
-                answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
-            skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
-            try:
-                _send(channel, skill, *(b.raw() for b in buffers))
-            except BrokenPipeError:
-                return
-
-
-if __name__ == "__main__":
-    _main(int(sys.argv[1]))
+    while True:
+        try:
+            request = _receive(channel)
+        except (EOFError, OSError):
+            return
+        buffers: list[pickle.PickleBuffer] = []
+        try:
+            answer: StoredSkill | list[Vector] | str = _work(*request)
+        except Exception as error:  # any failure is an answer to the client
+            answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
+        skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+        try:
+            _send(channel, skill, *(b.raw() for b in buffers))
+        except BrokenPipeError:
+            return

@@ -34,7 +34,7 @@ class Start:
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
         self.lock, self.session = lock, session
-        self._compiled: list[str] = []  # what is being compiled, callers first
+        self._compiled: list[str] = []  # what is being compiled, callers first; no names of what libraries have
         self._functions: list[Any] = []  # all that the loop may call, once they are imported
         self._is_over = threading.Event()
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
@@ -46,7 +46,8 @@ class Start:
         """What is done, and how far it is."""
         if not self._functions:
             return f"{STARTING}importing, {len(sys.modules)} modules so far"
-        doing = f"compiling {self._compiled[-1]}" if self._compiled else "loading what is compiled"
+        named = [name for name in self._compiled.copy() if name]
+        doing = f"compiling {named[-1]}" if named else "loading what is compiled"
         there = sum(bool(function.signatures) for function in self._functions)
         return f"{STARTING}{doing}, {there} of {len(self._functions)} functions are there"
 
@@ -60,7 +61,8 @@ class Start:
         class Compiling(event.Listener):  # type: ignore[misc]
             def on_start(self, event: event.Event) -> None:
                 function = event.data["dispatcher"].py_func
-                compiled.append(f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
+                name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
+                compiled.append(name if f"{function.__module__}.".startswith(LOOPED) else "")
 
             def on_end(self, event: event.Event) -> None:
                 compiled.pop()

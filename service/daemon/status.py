@@ -40,6 +40,7 @@ class CellStatus(NamedTuple):
     settings: Settings
     failure: str = ""
     inside: Inside | None = None  # of an arm that is not ready
+    busy: str = ""  # how this machine was too busy when the arm stopped
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core knows nothing of."""
@@ -95,6 +96,7 @@ class CellStatus(NamedTuple):
         """The figures of what there is to say."""
         settings, skill, (error_rad, speed) = self.settings, self.controller.skill, self.controller.decision.measured
         errors = np.abs(self.frame["joints"] - self.state["measured"])
+        worst = int((errors / np.array(settings.joints.per_rad)).argmax())
         limit = settings.tool.fault_speed
         return Evidence(
             sources={name: source for name, source in self.sources.items() if not self._spare(name, source)},
@@ -106,10 +108,12 @@ class CellStatus(NamedTuple):
             inside=self.inside,
             stuck=self._stuck() if self.state["stuck"] else None,
             error_rad=(error_rad, settings.arm.fault_error_rad),
-            worst_joint=(settings.joints.names[int(errors.argmax())], float(errors.max())),
+            worst_joint=(settings.joints.names[worst], float(errors[worst]), settings.joints.units[worst]),
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
+            silent_ms=settings.arm.silent_ms,
+            busy=self.busy,
         )
 
     def _spare(self, name: str, source: Source) -> bool:
@@ -120,7 +124,7 @@ class CellStatus(NamedTuple):
     def _outside(self) -> Outside | None:
         """The first joint that is moved back into its limits."""
         joints, measured = self.settings.joints, self.state["measured"].tolist()
-        found = map(Outside, joints.names, measured, joints.lower, joints.upper)
+        found = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
         returning = int(self.state["arm_ready"]) == RETURNING
         return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
 
@@ -129,8 +133,10 @@ class CellStatus(NamedTuple):
         joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
         ends = [
             name
-            for name, at, low, high in zip(joints.names, q, joints.lower, joints.upper, strict=True)
-            if min(at - low, high - at) < AT_LIMIT_RAD
+            for name, at, low, high, per_rad in zip(
+                joints.names, q, joints.lower, joints.upper, joints.per_rad, strict=True
+            )
+            if min(at - low, high - at) < AT_LIMIT_RAD * per_rad
         ]
         off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
         count = int(state["way_count"])

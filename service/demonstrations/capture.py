@@ -18,9 +18,11 @@ from service.client import Overheard
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError
-from service.contract.messages import BASE, PoseStamped, WireError, finite, in_order
+from service.contract.joint_states import JointStates, measured
+from service.contract.messages import BASE, PoseStamped, WireError, finite
 from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
+from service.core.intake.arm_samples import in_turn
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.demonstrations.dwells import REST_M
@@ -67,6 +69,7 @@ class Capture:
         self.malformed: dict[str, int] = {}
         self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in self.samples}
         self._heard_s, self._moved = time.monotonic(), False
+        self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         self._subscribers = [
             session.declare_subscriber(channels.key(cell, key), self._listener(key)) for key in self.samples
         ]
@@ -88,9 +91,25 @@ class Capture:
                 arrived_ns, payload = waiting.pop(0)
                 self._heard_s = time.monotonic()
                 try:
-                    self.samples[key].append(Sample(arrived_ns, payload, self._at(key, payload)))
+                    sample = (self._state if key == JOINT_STATES else self._sample)(key, arrived_ns, payload)
+                    self.samples[key] += [] if sample is None else [sample]
                 except WireError:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
+
+    def _state(self, key: str, arrived_ns: int, payload: bytes) -> Sample | None:
+        """The state of all joints that a message completes; None: it completes none."""
+        message = cdr.decode_joints(payload)
+        state = self._states.take(message, arrived_ns / 1e9) or self._states.incomplete(message, arrived_ns / 1e9)
+        if state is None:
+            return None
+        received = payload if state is message else cdr.encode_joints(state)
+        at = np.array(measured(state, self.settings.joints.names)[0])
+        if before := self.samples[key]:
+            at = in_turn(self.settings.joints, at, before[-1].at)
+        return Sample(arrived_ns, received, at)
+
+    def _sample(self, key: str, arrived_ns: int, payload: bytes) -> Sample:
+        return Sample(arrived_ns, payload, self._at(key, payload))
 
     def _at(self, key: str, payload: bytes) -> Vector:
         message = channels.BY_KEY[key].codec.decode(payload)
@@ -99,9 +118,7 @@ class Capture:
                 raise WireError("a pose that is not finite")
             is_scaled = is_by_tracker(key, message.frame_id, self.settings.hands)
             return UNIT_M[self.settings.hands.unit if is_scaled else "m"] * np.array(message.position)
-        if key == GRIPPER_STATE:
-            return np.array(message.position[:1])
-        return np.array(in_order(message, self.settings.joints.names)[0])
+        return np.array(message.position[:1])
 
     @property
     def missing(self) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,8 @@ from service.contract.channels import JOINTS, POSE
 from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
 from service.demonstrations.dwells import remarks_on_places
-from service.demonstrations.pose_streams import SIDES, Recorded, Track, chosen
+from service.demonstrations.pose_streams import SIDES, Recorded, chosen
+from service.demonstrations.track import Track
 from service.learning.demonstration import LEAST_M, Demonstration
 from service.recording.mcap_file import RecordingError, whole_file
 from service.recording.mcap_reader import Messages
@@ -22,7 +24,7 @@ from service.recording.mcap_reader import Messages
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # without a sample, after which the daemon holds for a stale hand
 AWAY = 5.0  # times the usual gap: where it is longer than this and GAP_S, nothing was seen
-JUMP_M, MAX_HAND_SPEED = 0.02, 5.0  # [m, m/s]: a larger step from one sample to the next is a jump
+END_S, MOVING_MPS = 0.3, 0.1  # [s, m/s] a take begins or ends in motion if its first or last 0.3 s are faster
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDTH = 60  # letters of the plot
 COLOURS = {
@@ -94,13 +96,10 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     demonstration = read_demonstration(path, settings=settings, say=remarks.append)
     remarks = [line.removeprefix(f"{path}: ") for line in remarks]
     recorded = Recorded(path)
-    tracks, _ = chosen(recorded, {}, settings or recorded.settings or Settings())
-    shown = [side for side in SIDES if side == "tool" or recorded.conducts in ("both", side)]
+    tracks = chosen(recorded, {}, settings or recorded.settings or Settings()).tracks
+    shown = [side for side in SIDES if side == "tool" or demonstration.conducts in ("both", side)]
     streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True) if side in shown)
-    remarks += [*_still(demonstration), *remarks_on_places(demonstration)]
-    for side in shown:
-        if jumps := _jumps(getattr(demonstration, side)[:, :3], demonstration.stamps_ns / 1e9):
-            remarks.append(f"{side}: jumps {jumps} times; do two trackers publish it, or does one lose it?")
+    remarks += [*_still(demonstration), *_in_motion(demonstration, shown), *remarks_on_places(demonstration)]
     return Summary(path, demonstration, streams, tuple(remarks))
 
 
@@ -116,9 +115,25 @@ def _still(demonstration: Demonstration) -> list[str]:
     ]
 
 
-def _jumps(at: Vector, seconds: Vector) -> int:
-    """The number of steps in positions (N, 3) [m] that are no motion of a hand."""
-    return int((np.linalg.norm(np.diff(at, axis=0), axis=1) > JUMP_M + MAX_HAND_SPEED * np.diff(seconds)).sum())
+def _in_motion(demonstration: Demonstration, shown: Sequence[str]) -> list[str]:
+    """Remarks on hands or a tool that move when a take begins or ends: what is before or behind it
+    is not known.
+    """
+    out, seconds = [], demonstration.seconds
+    for when, span in (("begins", seconds <= END_S), ("ends", seconds >= seconds[-1] - END_S)):
+        speeds = {side: _mean_speed(seconds[span], getattr(demonstration, side)[span, :3]) for side in shown}
+        if moving := [f"{side} {speed:.2f} m/s" for side, speed in speeds.items() if speed > MOVING_MPS]:
+            out.append(
+                f"it {when} in motion: {', '.join(moving)}; let all rest for a moment before and behind the task"
+            )
+    return out
+
+
+def _mean_speed(seconds: Vector, at: Vector) -> float:
+    """The speed [m/s] of the line that fits positions (N, 3) [m] best."""
+    if len(seconds) < 2:
+        return 0.0
+    return float(np.linalg.norm(np.polyfit(seconds - seconds[0], at, 1)[0]))
 
 
 def _stream(side: str, track: Track) -> Stream:
@@ -183,10 +198,11 @@ def draw(found: Summary, path: Path) -> None:
     first = figure.add_subplot(grid[0, 0])
     axes = [first, *(figure.add_subplot(grid[i, 0], sharex=first) for i in (1, 2))]
     above = figure.add_subplot(grid[:, 1])
+    begins = list(demonstration.begins)
     for side in (one.name for one in found.streams):
-        at = getattr(demonstration, side)
+        at = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)  # no line over what is left out
         for i, axis in enumerate(axes):
-            axis.plot(seconds, at[:, i], color=COLOURS[side], lw=1.2, label=side)
+            axis.plot(np.insert(seconds, begins, np.nan), at[:, i], color=COLOURS[side], lw=1.2, label=side)
         above.plot(at[:, 0], at[:, 1], color=COLOURS[side], lw=1.2, label=side)
         above.plot(at[0, 0], at[0, 1], "o", color=COLOURS[side], ms=5)
     for i, axis in enumerate(axes):
@@ -195,7 +211,7 @@ def draw(found: Summary, path: Path) -> None:
         for one in found.streams:
             if one.gap_s > GAP_S:
                 axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=COLOURS[one.name], alpha=0.15, lw=0)
-    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base")
+    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base", parse_math=False)
     axes[-1].set_xlabel("time [s]")
     above.set(title="from above; dots: the start", xlabel="x [m]", ylabel="y [m]")
     above.set_aspect("equal", adjustable="datalim")

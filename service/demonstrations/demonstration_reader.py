@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
@@ -14,18 +15,23 @@ from service.config import HandSettings, Settings
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING, topic
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
-from service.contract.requests import encode_json
+from service.contract.requests import Hands, encode_json
 from service.core.frame import Vector
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
-from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, Track, chosen
+from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
+from service.demonstrations.track import Track
+from service.demonstrations.track_check import LEAST_PIECE_S, LEAST_SAMPLES, Checked, checked, sound
+from service.demonstrations.track_clocks import by_one_clock
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.recording.mcap_reader import Messages, full_name, next_whole
 
 _STREAMS = tuple(ENDINGS.values())
-LARGEST_DELAY_S = 0.2  # by which the delays from stamp to recording may differ between streams of one clock
+ENOUGH = 0.5  # a take is refused if less than this share of it can be learned from
+HARDLY_SEEN = 0.1  # a hand that is seen for a smaller share of a take is not one of those that conduct
+UNUSUAL = 5.0  # a tool that is reported rarely is out of sight after as many times its usual interval
 
 
 def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
@@ -83,74 +89,150 @@ def read_demonstration(
     that was cut ends early. `say` is called with that, and with what was found or assumed.
     """
     recorded = Recorded(path)
+    if settings is None and recorded.settings is None and recorded.is_ours:
+        raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
     settings = settings or recorded.settings or Settings()
     if any(not fault.cut for fault in recorded.faults):
         readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
         faults = "; ".join(map(str, recorded.faults))
         raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
-    tracks, remarks = chosen(recorded, topics or {}, settings)
+    found = chosen(recorded, topics or {}, settings)
     for fault in recorded.faults:
-        say(f"{path}: {fault}; {', '.join(f'{len(track.poses)} poses on {track.name}' for track in tracks)} are there")
-    count = sum(len(track.poses) for track in tracks)
-    if recorded.is_ours:  # what the daemon rejects, too
-        tracks = [_masked(track, _is_pose(track.poses)) for track in tracks]
-    unmapped = tracks
-    tracks, mapped = in_base(path, tracks, settings.hands)
-    if recorded.is_ours:
-        tracks = [_masked(track, np.linalg.norm(track.poses[:, :3], axis=1) <= FARTHEST_M) for track in tracks]
-        for track, before in zip(tracks, unmapped, strict=True):
-            if len(before.poses) and not len(track.poses):
-                why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings.hands)
-                raise RecordingError(
-                    f"{path}: all {len(before.poses)} poses on {before.name} are too far, the first {why}"
-                )
-        if left_out := count - sum(len(track.poses) for track in tracks):
-            remarks.append(f"{left_out} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out")
-    if remarks or mapped:
-        say(f"{path}: {'; '.join([*remarks, *mapped])}")
-    tracks, clocks = _by_one_clock(tracks)
-    if clocks:
-        say(f"{path}: {clocks}")
-    rows = []
-    for track in tracks:
-        stamps, first = np.unique(track.stamps_ns, return_index=True)
-        if len(stamps) < 2:
-            raise RecordingError(
-                f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
-            )
-        rows.append((stamps, track.poses[first]))
-    stamps = rows[2][0]
-    start, end = max(row[0][0] for row in rows), min(row[0][-1] for row in rows)
-    stamps = stamps[(stamps >= start) & (stamps <= end)]
-    if len(stamps) < 2:
-        raise RecordingError(
-            f"{path}: hands and tool have less than two stamps of the tool in common: "
-            "by which clocks were they stamped?"
-        )
-    left, right, tool = (_resampled(stamps, *row) for row in rows)
-    stamps.setflags(write=False)
+        there = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
+        say(f"{path}: {fault}; {there} are there")
+    one_clock = by_one_clock(found.tracks)
+    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
+    tracks = [_near(path, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
+    remarks = [*found.guessed, *_none_in(tracks), *mapped]
+    if remarks:
+        say(f"{path}: {'; '.join(remarks)}")
+    if one_clock.remark:
+        say(f"{path}: {one_clock.remark}")
+    tracks = [_in_order(path, track) for track in tracks]
+    seen = Seen.of(path, tracks, found.conducts, settings)
+    for line in seen.remarks:
+        say(f"{path}: {line}")
+    left, right, tool = (_resampled(seen.stamps_ns, track.stamps_ns, track.poses) for track in seen.tracks)
+    closure = recorded.closures(seen.stamps_ns, logged=one_clock.logged, part=one_clock.part)
+    for line in recorded.unused:
+        say(f"{path}: {line}")
+    seen.stamps_ns.setflags(write=False)
     return Demonstration(
-        stamps,
+        seen.stamps_ns,
         left,
         right,
         tool,
         BASE,
         recorded.places,
-        recorded.closures(stamps, logged=bool(clocks)),
-        recorded.conducts,
+        closure,
+        seen.conducts,
         recorded.person,
+        seen.begins,
     )
 
 
-def _is_pose(poses: Vector) -> NDArray[np.bool_]:
-    """A mask (N,) of the poses (N, 7) that are finite, with a quaternion of norm 1."""
+class Seen(NamedTuple):
+    """What hands and tool have in common: their trusted samples, the stamps of the tool at which
+    all of them are seen, the indices at which it begins anew behind a stretch that is left out, and
+    what is to be said of it.
+    """
+
+    tracks: list[Track]
+    conducts: Hands
+    stamps_ns: NDArray[np.int64]
+    begins: tuple[int, ...]
+    remarks: list[str]
+
+    @staticmethod
+    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> Seen:
+        """Of the tracks of left hand, right hand and tool.
+
+        Raises RecordingError where too little is left.
+        """
+        unseen_s = settings.hands.unseen_ms / 1000
+        tool_s = max(unseen_s, UNUSUAL * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
+        hands = checked(tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s)
+        (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
+        remarks: list[str] = []
+        if conducts == "both":
+            shares = [one.seen_share for one in hands]
+            if min(shares) < HARDLY_SEEN <= max(shares):
+                side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
+                hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
+                remarks.append(f"the {side} hand conducts alone: the other is seen for {min(shares):.0%} of the time")
+        rows = [*hands, tool]
+        start_ns, end_ns = max(one.start_ns for one in rows), min(one.end_ns for one in rows)
+        if start_ns >= end_ns:
+            raise RecordingError(
+                f"{path}: hands and tool have less than two stamps of the tool in common: "
+                "by which clocks were they stamped?"
+            )
+        named = [one for row in rows for one in row.stretches if one.begin_ns < end_ns and one.end_ns > start_ns]
+        remarks += [one.remark for one in rows if one.remark]
+        stamps, begins = _left_in(tool.track.stamps_ns, rows)
+        kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
+        origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
+        bad = "; ".join(one.text(origin_ns) for one in sorted(named, key=lambda one: one.begin_ns))
+        if kept_s < ENOUGH * span_s:
+            raise RecordingError(
+                f"{path}: {kept_s:.1f} of {span_s:.1f} s can be learned from, {ENOUGH:.0%} needed"
+                f"{f': {bad}' if bad else ''}. Record it anew, or cut it by thirdhand record --trim"
+            )
+        if bad:
+            remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
+        both = [hands[0].track, hands[-1].track, tool.track]
+        return Seen(both, conducts, stamps, tuple(begins), remarks)
+
+
+def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
+    """The tool's stamps at which all are seen, but for pieces that are too short; and the indices
+    of the first ones behind stretches at which they are not.
+    """
+    start_ns = max((int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows)
+    end_ns = min((int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows)
+    stamps = stamps[(stamps >= start_ns) & (stamps <= end_ns)]
+    holes = [hole for row in rows for hole in row.stretches]
+    for hole in holes:
+        stamps = stamps[(stamps <= hole.begin_ns) | (stamps >= hole.end_ns)]
+    cuts = sorted({int(np.searchsorted(stamps, hole.end_ns)) for hole in holes} - {0, len(stamps)})
+    pieces = [
+        piece
+        for piece in np.split(stamps, cuts)
+        if not cuts or (len(piece) >= LEAST_SAMPLES and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
+    ]
+    begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
+    return np.concatenate(pieces) if pieces else stamps[:0], begins
+
+
+def _near(path: str | Path, track: Track, before: Track, hands: HandSettings) -> Track:
+    """The track with NaN for poses that are too far away. Raises RecordingError where all are;
+    `before`: as published.
+    """
     with np.errstate(all="ignore"):
-        return np.asarray(np.isfinite(poses).all(axis=1) & (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) <= 0.01))
+        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > FARTHEST_M
+    if len(is_far) and is_far.all():
+        why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
+        raise RecordingError(f"{path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
+    poses = track.poses.copy()
+    poses[is_far] = np.nan
+    return track._replace(poses=poses)
 
 
-def _masked(track: Track, mask: NDArray[np.bool_]) -> Track:
-    """The track with those of its poses that the mask selects."""
-    return track._replace(stamps_ns=track.stamps_ns[mask], logged_ns=track.logged_ns[mask], poses=track.poses[mask])
+def _none_in(tracks: Sequence[Track]) -> list[str]:
+    """In words, how many poses of the tracks are NaN; nothing where none is."""
+    none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
+    count = sum(len(track.poses) for track in tracks)
+    return [f"{none} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out"] if none else []
+
+
+def _in_order(path: str | Path, track: Track) -> Track:
+    """The track in the order of its stamps, each of them once. Raises RecordingError."""
+    stamps, first = np.unique(track.stamps_ns, return_index=True)
+    if len(stamps) < 2:
+        raise RecordingError(
+            f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+        )
+    return Track(track.name, track.source, stamps, track.logged_ns[first], track.poses[first], track.frame)
 
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
@@ -201,25 +283,14 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
     for i, track in enumerate(tracks):
         if is_by_tracker(track.name, track.frame, hands):
-            at = from_tracker(track.poses[:, :3], hands)
-            turns = (turn * Rotation.from_quat(track.poses[:, 3:])).as_quat()
-            out[i] = track._replace(poses=np.hstack([at, turns]), frame=BASE)
+            poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
+            if some.any():
+                poses[some, :3] = from_tracker(track.poses[some, :3], hands)
+                poses[some, 3:] = (turn * Rotation.from_quat(track.poses[some, 3:])).as_quat()
+            out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
     remark = f"{', '.join(mapped)} brought to frame {BASE} by [hands] unit and base_from_tracker"
     return out, [remark] if mapped else []
-
-
-def _by_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str]:
-    """Tracks with stamps of one clock, and in words why their own are not used; empty: they are."""
-    if not all(len(track.poses) for track in tracks):
-        return list(tracks), ""
-    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
-    if max(ahead_s) - min(ahead_s) <= LARGEST_DELAY_S or any(not np.ptp(track.logged_ns) for track in tracks):
-        return list(tracks), ""
-    clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
-    return [track._replace(stamps_ns=track.logged_ns) for track in tracks], (
-        f"stamps are of different clocks (against the recorder's {clocks}): the times of recording count instead"
-    )
 
 
 def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:

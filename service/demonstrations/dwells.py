@@ -44,6 +44,8 @@ def dwells(demonstration: Demonstration) -> Iterator[tuple[float, float]]:
     at = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
     grid = np.arange(0.0, float(seconds[-1]), GRID_S)
     path = np.stack([np.interp(grid, seconds, column) for column in at.T], axis=1)
+    for begin in demonstration.begins:
+        path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = np.nan  # nothing is known of what is left out
     count = round(DWELL_S / GRID_S)
     if len(path) <= count:
         return

@@ -7,29 +7,45 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
-from service.contract.messages import BASE, PoseStamped, WireError, in_order
+from service.contract.joint_states import JointStates, measured
+from service.contract.messages import BASE, JointState, PoseStamped, WireError
+from service.contract.printable import printable
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
+from service.core.intake.intake import UNIT_M
+from service.demonstrations.motion_capture import FRAME, Captured, read_c3d, read_motive
 from service.demonstrations.tool_poses import tool_poses
+from service.demonstrations.track import Track, clock_parts
 from service.recording.mcap_file import RecordingError, existing
 from service.recording.mcap_reader import FileFault, Messages, full_name
 
 SIDES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 JOINT_STATES, GRIPPER_STATE, PLACES = "joints/state", "gripper/state", "places"
+PATIENCE_S = 0.1  # between the parts of an arm's state that come in several messages
 OF_A_HAND = {"hand", "hands", "wrist", "palm", "glove"}
 WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
+FROM_ARRAYS = "Arrays of any origin become a take in a few lines: docs/arrays.md"
+NOT_READ = {
+    **dict.fromkeys((".zst", ".zstd", ".lz4", ".gz", ".zip"), "decompress it first, or give the folder of the bag"),
+    **dict.fromkeys(
+        (".parquet", ".npz", ".npy", ".h5", ".hdf5", ".json", ".txt", ".tsv", ".trc", ".bvh", ".fbx", ".tak"),
+        FROM_ARRAYS,
+    ),
+}
+LARGEST_MESSAGE = 1 << 24  # [bytes]
 MANY, TREE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
 KINDS = (
     POSE.type,
@@ -55,20 +71,7 @@ class PoseTopic(NamedTuple):
         return cls(topic, part)
 
     def __str__(self) -> str:
-        return f"{self.topic}:{self.part}" if self.part else self.topic
-
-
-class Track(NamedTuple):
-    """Poses (N, 7) of one stream, x y z and quaternion x y z w, in `frame`; their stamps (N,) [ns]
-    and the times at which they were recorded (N,) [ns].
-    """
-
-    name: str
-    source: str
-    stamps_ns: NDArray[np.int64]
-    logged_ns: NDArray[np.int64]
-    poses: Vector
-    frame: str
+        return printable(f"{self.topic}:{self.part}" if self.part else self.topic)
 
 
 Parts = tuple[list[int], list[int], list[tuple[float, ...]], str]
@@ -78,63 +81,104 @@ class Recorded:
     """The messages of a recording from which poses can be read, by topic."""
 
     def __init__(self, path: str | Path) -> None:
-        """Reads an MCAP file, a bag's folder, `.db3` or `.bag`. Raises RecordingError."""
+        """Reads an MCAP file, a bag's folder, `.db3`, `.bag`, CSV of Motive or C3D.
+
+        Raises RecordingError.
+        """
         self.path = Path(path)
         self.topics: dict[str, str] = {}  # types by topic, of all topics
         self.faults: list[FileFault] = []
         self.settings: Settings | None = None  # those in force when it was recorded, if it is ours
         self.urdf = ""
+        self.is_ours = False  # whether settings are attached
+        self.unused: list[str] = []  # in words, what is there and cannot be used
         self.places: tuple[ViaPoint, ...] = ()  # of the task, if they are recorded
         self.conducts: Hands = "both"  # which hands, in a take
         self.person = ""  # who demonstrated, if a take says so
         self._raw: dict[str, list[tuple[int, bytes]]] = {}
         self._read: dict[str, dict[str, Parts]] = {}
-        self._is_ros_1 = self.path.suffix == ".bag"
-        if self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
+        self._ros_1_topics: set[str] = set()
+        self.is_captured = False  # by a motion capture system: in metres, in the axes of that
+        if reader := {".csv": read_motive, ".c3d": read_c3d}.get(self.path.suffix.lower()):
+            self._read_captured(reader(self._existing()))
+        elif self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
             self._read_bag()
+        elif instead := NOT_READ.get(self.path.suffix.lower()):
+            raise RecordingError(f"{self._existing()} is not read: {instead}")
         else:
             self._read_mcap()
 
-    @property
-    def is_ours(self) -> bool:
-        """Whether its settings are attached."""
-        return self.settings is not None
+    def _existing(self) -> Path:
+        if not self.path.is_file():
+            raise RecordingError(f"{self.path} is not there")
+        return self.path
+
+    def _read_captured(self, captured: Captured) -> None:
+        self.is_captured = True
+        for name, (stamps, poses) in captured.items():
+            topic, part = PoseTopic.parsed(name)
+            self.topics[topic] = POSE.type
+            rows = [tuple(row) for row in poses.tolist()]
+            self._read.setdefault(topic, {})[part] = (stamps, stamps, rows, FRAME)
 
     def _read_mcap(self) -> None:
         messages = Messages(existing(self.path))
         for schema, channel, message in messages:
             kind = full_name(schema)
             self.topics.setdefault(channel.topic, kind)
-            if channel.message_encoding == "cdr" and kind in (*KINDS, JOINTS.type):
-                self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
+            if channel.message_encoding in ("cdr", "ros1") and kind in (*KINDS, JOINTS.type):
+                if channel.message_encoding == "ros1":
+                    self._ros_1_topics.add(channel.topic)
+                self._raw.setdefault(channel.topic, []).append((message.log_time, self._whole(message.data)))
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES}"):
-                self.places = self._decoded_places(message.data)
+                self._read_places(self._whole(message.data))
         self.faults = messages.faults
         told = messages.metadata.get("thirdhand", {})
         self.conducts = next((who for who in get_args(Hands) if who == told.get("hands")), "both")
         self.person = told.get("person", "")
         if "settings.json" in messages.attachments:
+            self.is_ours = True
             try:
                 self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)
             except msgspec.DecodeError as error:
-                raise RecordingError(f"the settings in {self.path} are not understood: {error}") from None
+                self.unused.append(f"the settings in {self.path} are not understood: {error}")
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
 
-    def _decoded_places(self, data: bytes) -> tuple[ViaPoint, ...]:
+    def _whole(self, data: bytes) -> bytes:
+        """The bytes of a message, also of one that was compressed alone. Raises RecordingError."""
+        if not data.startswith(zstandard.FRAME_HEADER):
+            return data
         try:
-            return Add(decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])).points
+            with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+                found: bytes = stream.read(LARGEST_MESSAGE + 1)
+        except zstandard.ZstdError as error:
+            raise RecordingError(f"{self.path}: a message that cannot be decompressed: {error}") from None
+        if len(found) > LARGEST_MESSAGE:
+            raise RecordingError(f"{self.path}: a message of more than {LARGEST_MESSAGE} bytes, once decompressed")
+        return found
+
+    def _read_places(self, data: bytes) -> None:
+        try:
+            self.places = Add(decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])).points
         except (WireError, ValueError) as error:
-            raise RecordingError(f"{self.path}: {PLACES}: {error}") from None
+            self.unused.append(f"{PLACES} are not understood, and not used: {error}")
 
     def _read_bag(self) -> None:
         from rosbags.rosbag1 import Reader as Ros1Reader  # heavy, and most recordings are MCAP files
         from rosbags.rosbag2 import Reader as Ros2Reader
 
+        if (self.path / "meta" / "info.json").exists():
+            raise RecordingError(
+                f"{self.path} is a data set of LeRobot: its columns do not say which are the hands and the tool. "
+                f"{FROM_ARRAYS}"
+            )
         if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder: give its files, {self.path}/*.mcap")
         try:
-            with (Ros1Reader if self._is_ros_1 else Ros2Reader)(self.path) as bag:
+            is_ros_1 = self.path.suffix == ".bag"
+            with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
                 self.topics = {one.topic: one.msgtype for one in bag.connections}
+                self._ros_1_topics = set(self.topics) if is_ros_1 else set()
                 wanted = [one for one in bag.connections if one.msgtype in (*KINDS, JOINTS.type)]
                 for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
                     self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
@@ -142,8 +186,8 @@ class Recorded:
             there = "" if self.path.exists() else " It is not there."
             raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{there}") from None
 
-    def _decoded(self, data: bytes, kind: str) -> Any:
-        if self._is_ros_1:
+    def _decoded(self, topic: str, data: bytes, kind: str) -> Any:
+        if topic in self._ros_1_topics:
             return _typestore("ROS1_NOETIC").deserialize_ros1(data, kind)
         return cdr.decode_pose(data) if kind == POSE.type else _typestore("ROS2_HUMBLE").deserialize_cdr(data, kind)
 
@@ -158,14 +202,10 @@ class Recorded:
         out = self._read[topic] = dict[str, Parts]()
         for logged_ns, data in self._raw.get(topic, ()):
             try:
-                parts = _poses(kind, self._decoded(data, kind))
+                parts = _poses(kind, self._decoded(topic, data, kind))
             except Exception as error:  # the deserialiser raises exceptions of many kinds
                 raise RecordingError(f"{self.path}: {topic}: a {kind} that is not readable: {error}") from None
             for part, stamp_ns, frame, pose in parts:
-                if not (self.is_ours or np.isfinite(pose).all()):
-                    raise RecordingError(
-                        f"{self.path}: {topic}: a pose that is not finite, at stamp {stamp_ns or logged_ns} ns"
-                    )
                 stamps, logged, poses, _ = out.setdefault(part, ([], [], [], frame))
                 if frame != out[part][3]:
                     raise RecordingError(
@@ -176,32 +216,47 @@ class Recorded:
                 poses.append(pose)
         return out
 
-    def track(self, name: str, source: PoseTopic) -> Track:
+    def track(self, name: str, source: PoseTopic, settings: Settings) -> Track:
         """One stream as arrays. Raises RecordingError."""
-        stamps, logged, poses, frame = self.tracks(source.topic)[source.part]
-        return Track(name, str(source), np.array(stamps), np.array(logged), np.array(poses), frame)
+        stamps, logged, rows, frame = self.tracks(source.topic)[source.part]
+        poses = np.array(rows, np.float64)
+        if self.is_captured:  # `settings` say where the system is, and the unit in which it publishes
+            poses[:, :3] /= UNIT_M[settings.hands.unit]
+            frame = frame if settings.hands.frame in ("", BASE) else settings.hands.frame
+        return Track(name, str(source), np.array(stamps, np.int64), np.array(logged, np.int64), poses, frame)
 
     def tool_by_joints(self, topic: str, settings: Settings, urdf: str) -> Track:
         """The tool in frame `base`, found from joint states by the URDF. Raises RecordingError."""
-        logged, stamps, joints = zip(*self._joint_states(topic, settings.joints.names), strict=True)
+        states = [one for one in self._joint_states(topic, settings.joints.names) if np.isfinite(one[2]).all()]
+        if not states:
+            raise RecordingError(f"{self.path}: {topic}: no joint state is finite")
+        logged, stamps, joints = zip(*states, strict=True)
         poses, kept = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
         source = f"{topic}, by the URDF"
         return Track(ENDINGS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
 
-    def closures(self, stamps: NDArray[np.int64], *, logged: bool = False) -> Vector | None:
+    def closures(self, stamps: NDArray[np.int64], *, logged: bool = False, part: int | None = None) -> Vector | None:
         """How far the gripper is closed (T,) at stamps (T,) [ns]; None where no topic ends in
         `gripper/state`, whose first joint it is.
 
-        With `logged`, the stamps are times of recording. Raises RecordingError.
+        With `logged`, the stamps are times of recording; with a `part`, they are of that part
+        between two beginnings of the clock. Raises RecordingError.
         """
         topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
         if len(topics) > 1:
-            raise RecordingError(f"{self.path}: topics {', '.join(sorted(topics))}: one gripper needed")
-        closure_at: dict[int, float] = {}
-        for logged_ns, stamp_ns, position in self._joint_states(topics[0]) if topics else ():
-            if not np.isfinite(position[:1]).all() or not position:
-                raise RecordingError(f"{self.path}: {topics[0]}: no finite position, at stamp {stamp_ns} ns")
-            closure_at[logged_ns if logged else stamp_ns] = position[0]
+            self.unused.append(f"topics {', '.join(sorted(topics))}: one gripper needed, and none is used")
+            return None
+        states = list(self._joint_states(topics[0])) if topics else []
+        if part is not None:
+            parts = clock_parts(np.array([stamp_ns for _, stamp_ns, _ in states], np.int64))
+            states = [states[i] for i in parts[min(part, len(parts) - 1)]]
+        closure_at = {
+            logged_ns if logged else stamp_ns: position[0]
+            for logged_ns, stamp_ns, position in states
+            if position and np.isfinite(position[0])
+        }
+        if len(closure_at) < len(states):
+            self.unused.append(f"{len(states) - len(closure_at)} of {len(states)} states of the gripper tell nothing")
         if not closure_at:
             return None
         at = np.array(sorted(closure_at), np.int64)
@@ -212,17 +267,32 @@ class Recorded:
 
     def _joint_states(self, topic: str, names: tuple[str, ...] = ()) -> Iterator[tuple[int, int, tuple[float, ...]]]:
         """Time of recording, stamp [ns], and position of each joint state, of the joints named if
-        there are names. Raises RecordingError.
+        there are names; they may be spread over several messages. Raises RecordingError.
         """
+        states, found = JointStates(names, PATIENCE_S), False
         for logged_ns, data in self._raw[topic]:
             try:
-                if self._is_ros_1:
-                    raise WireError("joint states of ROS 1 are not read; a bag of ROS 2 needed, or --tool with poses")
-                state = cdr.decode_joints(data)
-                position = in_order(state, names)[0] if names else state.position
+                message = self._joint_state(topic, data)
+                state = states.take(message, logged_ns / 1e9) if names else message
             except WireError as error:
                 raise RecordingError(f"{self.path}: {topic}: {error}") from None
-            yield logged_ns, state.stamp_ns or logged_ns, position
+            if state is not None:
+                found = True
+                position = measured(state, names)[0] if names else state.position
+                yield logged_ns, state.stamp_ns or logged_ns, position
+        if names and not found:
+            raise RecordingError(f"{self.path}: {topic}: no state of all joints {', '.join(names)}")
+
+    def _joint_state(self, topic: str, data: bytes) -> JointState:
+        """Raises WireError."""
+        if topic not in self._ros_1_topics:
+            return cdr.decode_joints(data)
+        try:
+            found = self._decoded(topic, data, JOINTS.type)
+        except Exception as error:  # the deserialiser raises exceptions of many kinds
+            raise WireError(f"a {JOINTS.type} that is not readable: {error}") from None
+        stamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
+        return JointState(stamp_ns, tuple(found.name), tuple(found.position.tolist()), ())
 
     def joint_topic(self, settings: Settings) -> str:
         """The one topic with joint states of the arm's joints; empty: none, or several."""
@@ -236,42 +306,85 @@ class Recorded:
         return exact[0] if len(exact) == 1 else found[0] if len(found) == 1 else ""
 
     def streams(self) -> Iterator[tuple[PoseTopic, int]]:
-        """Every stream of poses, and its number of poses."""
-        for topic in sorted(self._raw):
+        """Every stream of poses that is readable, and its number of poses."""
+        for topic in sorted(self.topics):
             if self.topics[topic] in KINDS:
-                for part, (stamps, *_) in self.tracks(topic).items():
-                    yield PoseTopic(topic, part), len(stamps)
+                with contextlib.suppress(RecordingError):  # another may be meant
+                    for part, (stamps, *_) in self.tracks(topic).items():
+                        yield PoseTopic(topic, part), len(stamps)
 
 
-def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Settings) -> tuple[list[Track], list[str]]:
-    """The tracks of left hand, right hand and tool; and in words those that were guessed.
+class Chosen(NamedTuple):
+    """The tracks of left hand, right hand and tool; which hands conduct; and in words what was
+    guessed. The track of a hand that conducts alone is there twice.
+    """
+
+    tracks: list[Track]
+    conducts: Hands
+    guessed: list[str]
+
+
+def chosen(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Settings) -> Chosen:
+    """The tracks of hands and tool in a recording.
 
     Topics are found by what is `given`, else by the ends of their names, the tool else by joint
-    states, all else by words in their names. A hand that conducts alone is both. Raises
+    states, all else by words in their names. If only one hand is found, it conducts alone. Raises
     RecordingError.
     """
-    urdf = recorded.urdf or robot_description(settings)
-    tracks: list[Track] = []
     guessed: list[str] = []
-    for name in SIDES:
-        if name in ("left", "right") and recorded.conducts not in ("both", name):
+    sources: dict[str, PoseTopic] = {}
+    conducts = recorded.conducts
+    for name in SIDES[:2]:
+        if conducts not in ("both", name):
             continue
         source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
-        joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
-        if source is None and name == "tool":
-            joints = recorded.joint_topic(settings)
-        if joints:
-            tracks.append(recorded.tool_by_joints(joints, settings, urdf))
-            guessed.append(f"tool found from {joints} by the arm's URDF")
-            continue
-        if source is None:
-            source = _by_words(recorded, name)
+        if source is None and (source := _by_words(recorded, name)):
             guessed.append(f"{name} is {source}")
-        tracks.append(recorded.track(ENDINGS[name], source))
-    if recorded.conducts != "both":
-        tracks.insert(0, tracks[0])
-        guessed.append(f"the {recorded.conducts} hand conducts alone")
-    return tracks, guessed
+        if source is not None:
+            sources[name] = source
+    if not sources:
+        raise _not_found(recorded, conducts.replace("both", "left"), [])
+    if len(set(sources.values())) < len(sources):
+        sources = _side_of_the_one(recorded, sources["left"])
+    if len(sources) == 1:
+        (conducts,) = (name for name in get_args(Hands) if name in sources)
+        hint = "" if conducts == recorded.conducts else f": no other is there (--{_other(conducts)} TOPIC names one)"
+        guessed.append(f"the {conducts} hand conducts alone{hint}")
+    hands = [recorded.track(ENDINGS[name], source, settings) for name, source in sources.items()]
+    return Chosen([hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed)
+
+
+def _other(side: str) -> str:
+    return SIDES[1 - SIDES.index(side)]
+
+
+def _side_of_the_one(recorded: Recorded, source: PoseTopic) -> dict[str, PoseTopic]:
+    """One stream that was found as both hands, by the side that its name says. Raises
+    RecordingError.
+    """
+    sides = [side for side in SIDES[:2] if _words(str(source)) & WORDS[side]]
+    if len(sides) != 1:
+        raise RecordingError(
+            f"{recorded.path}: {source} is given as left and as right: another topic needed for one of them, or for a "
+            "task of one hand that hand's option alone"
+        )
+    return {sides[0]: source}
+
+
+def _tool(recorded: Recorded, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]) -> Track:
+    """The tool's track; how it was guessed is appended to `guessed`. Raises RecordingError."""
+    source = _given(recorded, "tool", given["tool"]) if "tool" in given else _by_ending(recorded, "tool")
+    joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
+    joints = recorded.joint_topic(settings) if source is None else joints
+    if joints:
+        guessed.append(f"tool found from {joints} by the arm's URDF")
+        return recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
+    if source is None:
+        source = _by_words(recorded, "tool")
+        if source is None:
+            raise _not_found(recorded, "tool", [])
+        guessed.append(f"tool is {source}")
+    return recorded.track(ENDINGS["tool"], source, settings)
 
 
 def _given(recorded: Recorded, name: str, wanted: PoseTopic) -> PoseTopic:
@@ -306,19 +419,25 @@ def _by_ending(recorded: Recorded, name: str) -> PoseTopic | None:
     return PoseTopic(found[0]) if found else None
 
 
-def _by_words(recorded: Recorded, name: str) -> PoseTopic:
-    """The one stream with a fitting word in its name. Raises RecordingError."""
+def _by_words(recorded: Recorded, name: str) -> PoseTopic | None:
+    """The one stream with a fitting word in its name; None where there is none. Raises
+    RecordingError where there are several.
+    """
     others = {word for other in SIDES[:2] if other != name for word in WORDS[other]}
     streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
     words = {source: _words(str(source)) for source in streams}
     fitting = [source for source in streams if words[source] & WORDS[name] and not words[source] & others]
     if len(fitting) > 1 and name != "tool":
-        fitting = [source for source in fitting if words[source] & OF_A_HAND]
-    if len(fitting) == 1:
-        return fitting[0]
+        fitting = [source for source in fitting if words[source] & OF_A_HAND] or fitting
+    if len(fitting) > 1:
+        raise _not_found(recorded, name, fitting)
+    return fitting[0] if fitting else None
+
+
+def _not_found(recorded: Recorded, name: str, fitting: Sequence[PoseTopic]) -> RecordingError:
     also = f" or {JOINT_STATES} of the arm's joints" if name == "tool" else ""
     several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
-    raise RecordingError(
+    return RecordingError(
         f"{recorded.path} has no topic ending in {ENDINGS[name]} with {POSE.type}{also}{several}; "
         f"{_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ class Demonstration(NamedTuple):
     the tool comes to them; and how far the gripper is closed (T,), 0 to 1, where that is told.
 
     Where one hand `conducts`, the poses of the other are that one's again. `person` is who
-    demonstrated; empty: nobody says so.
+    demonstrated; empty: nobody says so. `begins` are the indices of the first samples behind
+    stretches that were left out.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -39,6 +40,7 @@ class Demonstration(NamedTuple):
     gripper: Vector | None = None
     conducts: Hands = "both"
     person: str = ""
+    begins: tuple[int, ...] = ()
 
     @property
     def hands(self) -> Vector:
@@ -58,12 +60,22 @@ class Demonstration(NamedTuple):
 
     @property
     def period_s(self) -> float:
-        """Mean time from one sample to the next [s]."""
-        return float(self.stamps_ns[-1] - self.stamps_ns[0]) / 1e9 / max(1, len(self.stamps_ns) - 1)
+        """Mean time from one sample to the next, without the stretches that were left out [s]."""
+        lasts_ns = sum(part[-1] - part[0] for part in self.pieces(self.stamps_ns))
+        return float(lasts_ns) / 1e9 / max(1, len(self.stamps_ns) - 1 - len(self.begins))
+
+    def pieces(self, values: NDArray[Any]) -> list[NDArray[Any]]:
+        """Values (T, ...) of its samples, divided where stretches were left out."""
+        return np.split(values, self.begins)
+
+    def by_pieces(self, function: Callable[[Vector], Vector], values: Vector) -> Vector:
+        """A function of values (T, ...) of its samples, applied to each piece alone."""
+        return np.concatenate([function(part) for part in self.pieces(values)])
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one sample of so many."""
-        return Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
+        one = Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
+        return one._replace(begins=tuple(sorted({-(-begin // step) for begin in self.begins})))
 
 
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
@@ -123,26 +135,34 @@ def in_phase(demonstration: Demonstration) -> tuple[Vector, Vector]:
 
     With a tool that lags, one position of the hands would go with two of the tool.
     """
-    late, hands = lag(demonstration), demonstration.hands
-    return hands[max(0, -late) : len(hands) - max(0, late)], _shifted(demonstration.tool, late)
+    late = lag(demonstration)
+    return demonstration.by_pieces(lambda x: _shifted(x, -late), demonstration.hands), demonstration.by_pieces(
+        lambda x: _shifted(x, late), demonstration.tool
+    )
 
 
 def at_the_moment(demonstration: Demonstration, samples: int) -> Vector:
     """The tool (T, 3) [m], its lag left in, when the hands were where they are in so many samples:
     all, or those `in_phase`.
     """
-    first = max(0, -lag(demonstration)) if samples < len(demonstration.tool) else 0
-    return demonstration.tool[first : first + samples, :3]
+    tool = demonstration.tool[:, :3]
+    if samples == len(tool):
+        return tool
+    late = lag(demonstration)
+    return demonstration.by_pieces(lambda x: _shifted(x, -late), tool)
 
 
 def closure_in_phase(demonstration: Demonstration) -> Vector | None:
     """How far the gripper is closed (T,), shifted as the tool is."""
     closure = demonstration.gripper
-    return None if closure is None else _shifted(closure, lag(demonstration))
+    if closure is None:
+        return None
+    late = lag(demonstration)
+    return demonstration.by_pieces(lambda x: _shifted(x, late), closure)
 
 
-def _shifted(tool: Vector, late: int) -> Vector:
-    return tool[max(0, late) : len(tool) + min(0, late)]
+def _shifted(values: Vector, late: int) -> Vector:
+    return values[max(0, late) : max(0, len(values) + min(0, late))]
 
 
 def lag(demonstration: Demonstration) -> int:
@@ -155,7 +175,8 @@ def lag(demonstration: Demonstration) -> int:
     if moved_m(demonstration) < LEAST_M:
         return 0
     reach = min(int(LONGEST_LAG_S / demonstration.period_s), len(hands) // 4)
-    speeds = [np.linalg.norm(np.gradient(x, axis=0), axis=1) for x in (hands, tool[:, :3])]
+    steps = [demonstration.by_pieces(lambda x: np.gradient(x, axis=0), x) for x in (hands, tool[:, :3])]
+    speeds = [np.linalg.norm(x, axis=1) for x in steps]
     a, b = (s - s.mean() for s in speeds)
     inner = a[reach : len(a) - reach]
     shifted = [b[reach + shift : len(b) - reach + shift] for shift in range(-reach, reach + 1)]

@@ -121,17 +121,21 @@ class Encoded:
     def of(task: Task, demonstration: Demonstration, late_s: float) -> Encoded:
         """The demonstration of a teacher who is so late."""
         period_s = demonstration.period_s
-        hands = _smoothed(demonstration.hands, round(SMOOTHED_S / period_s))
-        velocities = np.gradient(hands, period_s, axis=0)
+        window = round(SMOOTHED_S / period_s)
+        hands, smooth_tool = (
+            demonstration.by_pieces(lambda x: _smoothed(x, window), x)
+            for x in (demonstration.hands, demonstration.tool[:, :3])
+        )
+        velocities, tool_velocities = (
+            demonstration.by_pieces(lambda x: np.gradient(x, period_s, axis=0), x) for x in (hands, smooth_tool)
+        )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
         at = NamedViaPoints.of(demonstration.places)
         stages, tool = task.stages(at, np.full((len(task.names) - 1, 2), OFF_M)), demonstration.tool[:, :3]
-        labels = _divided(stages, moving, tool, period_s)
-        steps = min(round(late_s / period_s), len(hands) - 1)
+        labels = _divided(stages, moving, (smooth_tool, tool_velocities), period_s)
+        steps = round(late_s / period_s)
         stillness = stillness_of(velocities, period_s)
-        late, rested = (
-            np.concatenate([np.repeat(x[:1], steps, axis=0), x[: len(x) - steps]]) for x in (hands, stillness)
-        )
+        late, rested = (demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (hands, stillness))
         found = np.empty((len(hands), 4))
         along_all(late, rested, labels, stages, found)
         along, off = found[:, :2], found[:, 2:]
@@ -158,14 +162,14 @@ class Encoded:
         return np.asarray(np.unique(kept), np.int64)
 
 
-def _divided(stages: Records, moving: Vector, tool: Vector, period_s: float) -> Indices:
+def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
     """Which stage it is at each sample (T,): the way through a demonstration that costs least
-    (Viterbi 1967), by how far hands and tool are off a stage's ways and whether they go along.
+    (Viterbi 1967), by how far hands and tool, of these positions and velocities (T, 3), are off a
+    stage's ways and whether they go along.
     """
-    count, cost = len(stages), np.zeros((len(tool), len(stages)))
-    smooth = _smoothed(tool, round(SMOOTHED_S / period_s))
+    count, cost = len(stages), np.zeros((len(moving), len(stages)))
     ways = [(stages["begins"][:, i], stages["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
-    ways.append((stages["tool"], stages["tool_way"], smooth, np.gradient(smooth, period_s, axis=0), 0))
+    ways.append((stages["tool"], stages["tool_way"], *tool, 0))
     for begins, way, points, velocities, first in ways:
         at, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
         square = (way**2).sum(axis=1)
@@ -186,6 +190,11 @@ def _divided(stages: Records, moving: Vector, tool: Vector, period_s: float) -> 
     for before in reversed(back):
         labels.append(int(before[labels[-1]]))
     return np.array(labels[::-1], np.int64)
+
+
+def _delayed(values: Vector, samples: int) -> Vector:
+    """Values (T, D) as they were so many samples before; before the first, they were that."""
+    return values[np.maximum(np.arange(len(values)) - samples, 0)]
 
 
 def _smoothed(hands: Vector, samples: int) -> Vector:

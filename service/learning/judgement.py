@@ -36,6 +36,7 @@ HELD, HELD_UNSAFE = 5.0, 20.0  # [%] of the time that the gate holds what was de
 BEYOND_UNSAFE = 20.0  # [%] of the tool's way that the arm cannot reach
 LEAST_DELAY_S = 0.005  # below it a teacher was not late
 OTHER_MM = 1.0  # an error at the moment that differs so from the error is told beside it
+GATE_REMEDY = "take more demonstrations along the same paths, or name the places of the task (--places)"
 COVERAGE = ((30.0, 80.0), (88.0, 100.0))  # [%] beyond these a region is not what it says
 
 
@@ -96,6 +97,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     by_person: bool = False  # whether all of a person's demonstrations were left out at once
     delay_s: float | None = None  # how late the teacher was; None: it was not learned
     delay_std_s: float = 0.0  # of that, from demonstration to demonstration
+    alone: bool | msgspec.UnsetType = msgspec.UNSET  # True: one hand conducts alone, and `beside` is of it
 
 
 def figures(
@@ -113,6 +115,7 @@ def figures(
     by_person: bool,
     near_m: float,
     delay: Delay | None,
+    alone: bool,
     reach: Reach,
     remarks: Sequence[str],
 ) -> Figures:
@@ -120,7 +123,8 @@ def figures(
     what was predicted of each, also at the moment with the regions of which the others tell, its
     gate, what it learned besides, and errors (T, 3) [m] of other ways to predict each
     demonstration, `beside` it. `tried` is what all inputs among which this was `taken` missed the
-    tool by [m]. `near_m` is as in `ambiguity`, `delay` the teacher's.
+    tool by [m]. `near_m` is as in `ambiguity`, `delay` the teacher's, `alone` whether one hand
+    conducts alone.
     """
     rows = tuple(
         _row(name, one, told[i : i + 1], gate.threshold, {way: errors[i] for way, errors in beside.items()})
@@ -156,6 +160,7 @@ def figures(
         by_person=by_person,
         delay_s=delay.mean_s if delay else None,
         delay_std_s=delay.std_s if delay else 0.0,
+        alone=True if alone else msgspec.UNSET,
     )
     warnings, unsafe = _verdicts(found, demonstrations, contradiction, gate=gate)
     return msgspec.structs.replace(
@@ -260,15 +265,26 @@ def _verdicts(
             f"{HELD_UNSAFE:.0f} % accepted",
             bad=overall.held > HELD_UNSAFE,
         )
-    for what, share in (("hands swapped", found.swapped), ("hands 30 cm beside", found.beside)):
+    kinds = (("hands swapped", found.swapped), ("hands 30 cm beside", found.beside))
+    for what, share in (("the hand 30 cm beside", found.beside),) if found.alone is True else kinds:
         if share < CAUGHT:
             bad = share < CAUGHT_UNSAFE
             wanted = f"at least {CAUGHT_UNSAFE:.0f} % needed" if bad else f"{CAUGHT:.0f} % wanted"
-            say(f"the gate holds {share:.1f} % of {what}, {wanted}", bad=bad)
+            say(f"the gate holds {share:.1f} % of {what}, {wanted}{f': {GATE_REMEDY}' if bad else ''}", bad=bad)
     for nominal, share, (low, high) in zip((50, 95), (overall.within_50, overall.within_95), COVERAGE, strict=True):
         if not low <= share <= high:
             say(f"the {nominal} % regions hold {share:.0f} % of held-out samples")
     return warnings, unsafe
+
+
+def _caught(found: Figures) -> str:
+    """In words, the shares of planted nonsense that the gate holds."""
+    if found.alone is True:
+        return f"{found.beside:.0f} % of the hand 30 cm beside"
+    return (
+        f"{found.swapped:.0f} % of hands swapped, {found.beside:.0f} % of both 30 cm beside, {found.one_beside:.0f} % "
+        "of one hand 30 cm beside"
+    )
 
 
 def table(found: Figures) -> str:
@@ -292,8 +308,7 @@ def table(found: Figures) -> str:
     lines += [
         f"the gate would hold {found.all.held:.1f} % of the time: {min(helds):.1f} to {max(helds):.1f} % of a "
         f"demonstration, standard deviation {found.held_std:.1f} %",
-        f"gate {found.gate_mm:.0f} mm: holds {found.swapped:.0f} % of hands swapped, {found.beside:.0f} % of both "
-        f"30 cm beside, {found.one_beside:.0f} % of one hand 30 cm beside",
+        f"gate {found.gate_mm:.0f} mm: holds {_caught(found)}",
         f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
         "out of reach",
     ]

@@ -96,6 +96,7 @@ def learn(
     names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
     demonstrations, names, remarks = _worth_learning(demonstrations, names)
     repeats = "".join(f"; {remark}" for remark in remarks)
+    check_count(names, components, repeats)
     if len(demonstrations) == 1:
         remarks.append("one demonstration: none was held out, so its error is of what was learned, and judges nothing")
     together, near_m, alone = groups(demonstrations), same_hands_m(demonstrations), demonstrations[0].conducts
@@ -187,6 +188,7 @@ def learn(
         by_person=len(set(together.tolist())) < len(paths),
         near_m=near_m,
         delay=found.delay,
+        alone=side is not None,
         reach=reach or Reach(),
         remarks=remarks,
     )
@@ -212,6 +214,16 @@ def learn(
     return skill
 
 
+def check_count(names: Sequence[str], components: int | None, remark: str = "") -> None:
+    """Raises SkillError where nothing could be left out of demonstrations of these names."""
+    if len(names) == 1 and components is None:
+        raise SkillError(
+            f"1 demonstration given ({names[0]}): at least 2 needed, as what is learned from the others must predict "
+            "each; record another. Of one alone only the way of the paper makes a skill, whose error nobody knows: "
+            f"--components 10{remark}"
+        )
+
+
 def _worth_learning(
     demonstrations: Sequence[Demonstration], names: Sequence[str]
 ) -> tuple[list[Demonstration], list[str], list[str]]:
@@ -221,14 +233,22 @@ def _worth_learning(
     twins = repeated(_of_each(names, as_shown, demonstrations))
     remarks = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in twins.items()]
     kept = [i for i in range(len(demonstrations)) if i not in twins]
-    demonstrations = [demonstrations[i] for i in kept]
+    demonstrations, kept_names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     if max(map(moved_m, demonstrations)) < LEAST_M:
         raise SkillError(
             f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"
         )
     if len(who := sorted({one.conducts for one in demonstrations})) > 1:
-        raise SkillError(f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike")
-    return demonstrations, [names[i] for i in kept], remarks
+        by_hand = {
+            hand: [name for name, one in zip(kept_names, demonstrations, strict=True) if one.conducts == hand]
+            for hand in who
+        }
+        which = "; ".join(f"{hand}: {', '.join(some)}" for hand, some in by_hand.items())
+        raise SkillError(
+            f"demonstrations that are conducted by different hands: {', '.join(who)}; take them alike, or leave out "
+            f"those of one kind ({which})"
+        )
+    return demonstrations, kept_names, remarks
 
 
 def _of_each(

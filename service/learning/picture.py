@@ -28,7 +28,10 @@ MOST_NAMED, LEAST_BAND = 12, 0.02  # stages in the legend; share of the time of 
 
 def draw(evidence: Evidence, path: Path) -> None:
     """Writes the picture, a PNG."""
-    drawn(evidence).savefig(path, format="png")
+    import matplotlib as mpl  # heavy, and most learn without
+
+    with mpl.rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
+        drawn(evidence).savefig(path, format="png")
 
 
 def drawn(evidence: Evidence) -> Figure:

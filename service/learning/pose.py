@@ -27,7 +27,9 @@ from service.learning.judgement import Posed
 CONSTANT_RAD = math.radians(5.0)  # a tool that is never farther from its mean is not turned
 APART_RAD = math.radians(30.0)  # tools turned so far apart, with the hands the same, contradict each other
 NOTED, UNSAFE = 0.01, 0.10  # shares of the samples that contradict others
-NOTED_DEG = 15.0  # error of demonstrations that were held out
+NOTED_DEG, UNSAFE_DEG = 15.0, 60.0  # errors of held-out demonstrations that are noted, and that are no skill
+FOLLOWED = 100  # samples of a demonstration that are compared with those of another
+MOST_TURN_DEG = 480.0  # a tool that turns farther comes too near to the opposite of the mean orientation
 ALONE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # of a single demonstration, which tells nothing of others
 UNDECIDED = 0.5  # closure off all data, where a gripper stays as it is
 POINT_NOISE = 0.1  # a point's variance over the kernel's
@@ -53,9 +55,10 @@ def learned_pose(
     """
     mean = mean_orientation(np.concatenate(quaternions))
     unit = [q / np.linalg.norm(q, axis=1)[:, None] for q in quaternions]
+    mean, signed = _followed(mean, unit)
     warnings: list[str] = []
     unsafe: list[str] = []
-    turn, turn_error, missed = _learned_turn(mean, inputs, unit, together, points)
+    turn, turn_error, missed = _learned_turn(mean, inputs, signed, together, points)
     if turn is not None:
         share, worst = ambiguity(
             hands,
@@ -71,7 +74,15 @@ def learned_pose(
             told = f"the tool's orientation contradicts itself in {100 * share:.0f} % of the samples, up to "
             (unsafe if share > UNSAFE else warnings).append(f"{told}{100 * UNSAFE:.0f} % accepted: {worst}")
     if turn_error is not None and turn_error > NOTED_DEG:
-        warnings.append(f"the tool's orientation in held-out demonstrations is missed by {turn_error:.0f}° rms")
+        text = f"the tool's orientation in held-out demonstrations is missed by {turn_error:.0f}° rms"
+        if turn_error > UNSAFE_DEG:
+            turned_deg = max(math.degrees(turned_rad(q)) for q in unit)
+            unsafe.append(
+                f"{text}, up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one of them; let it "
+                f"turn by less than {MOST_TURN_DEG:.0f}°, the same way in each"
+            )
+        else:
+            warnings.append(text)
     gripper, right = _learned_gripper(inputs, closures, names, points=points, ell=gripper_ell, warnings=warnings)
     return Posed(mean, turn, gripper, turn_error, right, warnings, unsafe)
 
@@ -94,6 +105,12 @@ def is_flat(primitive: KMP) -> bool:
     return bool((primitive.base.reference.mean == primitive.prior_offset).all())
 
 
+def turned_rad(quaternions: Vector) -> float:
+    """The largest angle by which orientations (T, 4), followed from the first on, turn from it."""
+    smooth = continuous(quaternions)
+    return float(2.0 * np.arccos(np.clip(smooth @ smooth[0], -1.0, 1.0)).max())
+
+
 def mean_orientation(quaternions: ArrayLike) -> Vector:
     """The mean (4,) of quaternions x y z w (M, 4), whatever their signs: the leading eigenvector of
     their scatter (Markley et al. 2007).
@@ -112,7 +129,7 @@ def _learned_turn(
     """
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None, []
-    zetas = [log(_near(q, mean), mean) for q in unit]
+    zetas = [log(q, mean) for q in unit]
     choice = Choice.of(list(zip(inputs, zetas, strict=True)), points, together=together, alike=True)
     several = len(set(together.tolist())) > 1
     parameters = choice.parameters() if several else ALONE
@@ -125,10 +142,22 @@ def _learned_turn(
     return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
 
 
-def _near(quaternions: Vector, mean: Vector) -> Vector:
-    """The same orientations (T, 4), signed so that neighbours are near, and most near the mean."""
-    smooth = continuous(quaternions)
-    return np.asarray(smooth if (smooth @ mean).sum() >= 0.0 else -smooth)
+def _followed(mean: Vector, unit: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
+    """The mean orientation (4,), and orientations (T, 4) with signs that do not change in time.
+
+    Farther than half a turn from the mean the nearer sign is the wrong one: there each
+    demonstration has the sign by which it is nearest to the first, and the mean is that of signed
+    quaternions.
+    """
+    smooth = [continuous(q) for q in unit]
+    near = [q if (q @ mean).sum() >= 0.0 else -q for q in smooth]
+    if all((q @ mean > 0.0).all() for q in near):
+        return mean, near
+    along = [q[np.linspace(0, len(q) - 1, FOLLOWED).round().astype(int)] for q in smooth]
+    signed = [q if (at * along[0]).sum() >= 0.0 else -q for q, at in zip(smooth, along, strict=True)]
+    total = np.concatenate(signed).sum(axis=0)
+    size = float(np.linalg.norm(total))
+    return (total / size, signed) if size > 0.0 else (mean, near)
 
 
 def _learned_gripper(

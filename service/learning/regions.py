@@ -136,7 +136,10 @@ def _some(count: int) -> NDArray[np.intp]:
 def _apart(demonstration: Demonstration, mean: Vector, covariance: Vector) -> Apart:
     """Of a mean (T, 3) [m], and of covariances (S, 3, 3) [m²] at some of its samples."""
     rows, trail, velocity = _some(len(mean)), mean[0].copy(), np.empty_like(mean)
+    begins = demonstration.begins if len(mean) == len(demonstration.tool) else ()
     for i, position in enumerate(mean):
+        if i in begins:
+            trail[:] = position
         velocity[i] = recent(position, demonstration.period_s, trail)
     tool = at_the_moment(demonstration, len(mean))
     return Apart((tool - mean)[rows], covariance, velocity[rows])

@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP
+from kmp.named_arrays import from_arrays, to_arrays
 from kmp.storage import checksum
 from service.contract.explain import ExplainedError
+from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import FARTHEST_M, LEVELS, NORMAL, REGION_95, Model, Regions
@@ -85,6 +87,9 @@ FARTHEST_TURN = 2.0 * np.pi  # [rad, half the angle] of an orientation from the 
 class SkillError(ExplainedError, ValueError):
     """A skill that cannot be read, learned or adapted."""
 
+    def __init__(self, text: str) -> None:
+        super().__init__(printable_lines(text))  # which may quote what a file holds
+
 
 @dataclass(frozen=True, eq=False)
 class StoredSkill(Skill):
@@ -112,7 +117,7 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         components=np.array(skill.components),
         places=np.array(msgspec.json.encode(skill.via_points).decode()),
         tolerance=np.array(skill.tolerance),
-        **skill.model.primitive.to_arrays(),
+        **to_arrays(skill.model.primitive),
     )
     if skill.conductor is not None:
         arrays["conductor"] = np.array(skill.conductor)
@@ -122,10 +127,10 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         arrays["figures"] = np.array(skill.figures)
     arrays |= skill.model.own_arrays()
     if skill.turn:
-        arrays |= {TURN + name: array for name, array in skill.turn.primitive.to_arrays().items()}
+        arrays |= {TURN + name: array for name, array in to_arrays(skill.turn.primitive).items()}
         arrays[TURN + "auxiliary"] = skill.turn.auxiliary
     if skill.gripper:
-        arrays |= {GRIPPER + name: array for name, array in skill.gripper.primitive.to_arrays().items()}
+        arrays |= {GRIPPER + name: array for name, array in to_arrays(skill.gripper.primitive).items()}
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
 
@@ -157,17 +162,17 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
         turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
         skill = StoredSkill(
-            name=str(arrays["name"]),
+            name=printable(str(arrays["name"])),
             model=model.from_arrays(arrays, via_points),
             orientation=arrays["orientation"],
             workspace=arrays["box"],
             threshold=float(arrays["threshold"]),
-            learned_from=str(arrays["learned_from"]),
+            learned_from=printable(str(arrays["learned_from"])),
             components=int(arrays["components"]),
             via_points=via_points,
             tolerance=float(arrays["tolerance"]),
-            turn=LearnedOrientation(KMP.from_arrays(turn), turn["auxiliary"]) if turn else None,
-            gripper=LearnedGripper(KMP.from_arrays(gripper)) if gripper else None,
+            turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
+            gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
             file=bytes(data),
             digest=_digest(data),

@@ -31,6 +31,7 @@ class RecordingPaths:
         self._newest = datetime.min.replace(tzinfo=UTC)
         self._own: dict[str, bool] = {}  # whether a recording is this cell's, by its stem
         self._cell = settings.cell.replace("/", "-")
+        self.keep_mb_left: float | None = None  # before the oldest are removed; None: no limit, or not known yet
 
     def next(self) -> tuple[Path | None, Path | None]:
         """Paths of the next recording and of the drawing beside it; None where it is not wanted."""
@@ -80,6 +81,7 @@ class RecordingPaths:
                     path.unlink()
                     total -= size
                     removed.append(path)
+        self.keep_mb_left = max(0.0, keep_bytes - total) / MB if keep_bytes else None
         return removed
 
     def _is_own(self, path: Path) -> bool:

@@ -2,23 +2,19 @@
 
 It ends when the other side of the socket is closed or dead, once everything received is written. It
 cannot outlive its daemon for long: the daemon's death continues a stopped scribe, and an alarm ends
-one that hangs.
+one that hangs. While the daemon lives it is the daemon that replaces a scribe that hangs.
+
+Recording does not wait for drawing: Rerun is imported on the drawing's own thread.
 """
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
-
-# isort: split
 import contextlib
-import ctypes
 import os
 import signal
 import socket
-import sys
 import threading
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -29,6 +25,7 @@ import numpy as np
 
 from service import child
 from service.config import urdf_path
+from service.contract.explain import in_words
 from service.core.frame import state_layout
 from service.recording.paths import RecordingPaths
 from service.recording.protocol import LARGEST_MESSAGE, Note, ScribeReport, ScribeSetup, unpack
@@ -37,14 +34,14 @@ from service.recording.segments import Segments
 if TYPE_CHECKING:
     from service.viewer.stream import Viewer
 
-QUEUED = 10_000  # messages; then the socket fills, and then the loop counts losses
+CATCH_UP_NICE = -10  # of a recording that is behind, where that is granted: 9 times an ordinary process's weight
+QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
 FLUSH_S = 0.5  # what a kill can lose
-DRAW_FLUSH_S = 2.0
+DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
 DRAW_END_S = 8.0
 DRAW_QUEUED = 5000  # ticks
-HUNG_S = 30  # whole seconds without a turn of the main loop, after which it is killed
-END_S = 20  # whole seconds for ending, after which it is killed
-_PR_SET_PDEATHSIG = 1  # of Linux; Python does not name it
+BEHIND = 500  # messages that wait to be recorded, beyond which nothing is drawn
+END_S = 60  # whole seconds for ending, after which it is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
 # are dropped.
 RERUN_LOG = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
@@ -52,23 +49,30 @@ POLL_S = 0.02  # it polls, because waking a blocked reader would cost the sender
 
 
 class DrawingThread:
-    """The viewer on a thread of its own: where it falls behind or hangs, the recording does not."""
+    """The viewer, made and used on a thread of its own.
 
-    def __init__(self, viewer: Viewer) -> None:
-        self.viewer = viewer
-        self.dropped = 0
+    Where it falls behind or hangs, the recording does not. While the recording is behind,
+    `is_paused` is to be set, and nothing is drawn.
+    """
+
+    def __init__(self, make: Callable[[], Viewer]) -> None:
+        self.viewer: Viewer | None = None
+        self.problems: list[str] = []
+        self.dropped, self.is_paused = 0, True
         self._wanted_file: Path | None = None
-        self._waiting: deque[Callable[[], None] | Path] = deque()
+        self._waiting: deque[Callable[[Viewer], object] | Path] = deque()
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._draw, name="drawing", daemon=True)
+        self._thread = threading.Thread(target=self._draw, args=(make,), name="drawing", daemon=True)
         self._thread.start()
 
     @property
     def rrd(self) -> str | None:
         """The file that is drawn into, or will be next."""
-        return self.viewer.rrd if self._wanted_file is None else str(self._wanted_file)
+        if self._wanted_file is None:
+            return None if self.viewer is None else self.viewer.rrd
+        return str(self._wanted_file)
 
-    def put(self, act: Callable[[], None]) -> None:
+    def put(self, act: Callable[[Viewer], object]) -> None:
         """Queues a drawing; beyond DRAW_QUEUED the oldest is dropped."""
         self._waiting.append(act)
         if len(self._waiting) > DRAW_QUEUED:
@@ -83,21 +87,33 @@ class DrawingThread:
         self._wanted_file = rrd
         self._waiting.append(rrd)
 
-    def _draw(self) -> None:
+    def _draw(self, make: Callable[[], Viewer]) -> None:
+        self._wait()
+        try:
+            viewer = self.viewer = make()
+        except Exception as error:  # without Rerun there is still a recording
+            self.problems.append(f"nothing is drawn: {in_words(error)}")
+            self._wanted_file = None
+            return
         flushed = time.monotonic()
         while not (self._ended.wait(POLL_S) and not self._waiting):
             while self._waiting:
+                self._wait()
                 next_ = self._waiting.popleft()
                 if isinstance(next_, Path):
-                    self.viewer.draw_into(next_)
+                    viewer.draw_into(next_)
                     if self._wanted_file is next_:
                         self._wanted_file = None
                 else:
-                    next_()
+                    next_(viewer)
             if time.monotonic() - flushed > DRAW_FLUSH_S:
-                self.viewer.flush()
+                viewer.flush()
                 flushed = time.monotonic()
-        self.viewer.close()
+        viewer.close()
+
+    def _wait(self) -> None:
+        while self.is_paused and not self._ended.wait(POLL_S):
+            pass
 
     def close(self) -> None:
         """Ends the file and the live view, within DRAW_END_S at most."""
@@ -117,15 +133,14 @@ class ScribeProcess:
         self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
         self._reported_dropped = self._reported_kept = 0
+        self._is_behind = True  # as it begins, so that it is there soon
         is_drawn = setup.rrd is not None or (setup.folder is not None and setup.settings.files.rerun)
         if is_drawn or setup.live_port is not None:
-            from service.viewer.stream import Viewer  # its import takes half a second
-
-            urdf = urdf_path(setup.settings)
-            viewer = Viewer(urdf=urdf, live_port=setup.live_port, settings=setup.settings, skill=skill)
-            self._drawing = DrawingThread(viewer)
+            self._drawing = DrawingThread(lambda: _viewer(setup, skill))
         paths = RecordingPaths(setup.settings, setup.folder, setup.recording, setup.rrd, attempt=setup.attempt)
-        self._segments = Segments(setup.settings, paths, say=self._errors.append, draw=self._draw_into)
+        self._segments = Segments(
+            setup.settings, paths, say=self._errors.append, draw=self._draw_into, unmarked=setup.unmarked
+        )
         state = None if setup.state is None else np.frombuffer(setup.state, state_layout(self._joints))[0]
         self._segments.begin(skill, state)
         self.report()
@@ -137,8 +152,9 @@ class ScribeProcess:
     def report(self) -> None:
         """Sends a report: new errors, where files are written, and how many ticks are on disk."""
         viewer = None if self._drawing is None else self._drawing.viewer
-        while viewer is not None and viewer.problems:
-            self._errors.append(viewer.problems.pop(0))
+        for problems in (drawn.problems for drawn in (self._drawing, viewer) if drawn is not None):
+            while problems:
+                self._errors.append(problems.pop(0))
         if self._drawing is not None and self._drawing.dropped > 2 * self._reported_dropped:
             self._reported_dropped = self._drawing.dropped
             self._errors.append(f"the drawing cannot keep up: {self._reported_dropped} of its entries dropped")
@@ -154,6 +170,8 @@ class ScribeProcess:
             unmarked=segments.unmarked,
             errors=tuple(self._errors),
             free_mb=segments.free_mb(),
+            mb_per_hour=segments.mb_per_hour(),
+            keep_mb_left=segments.keep_mb_left,
         )
         with contextlib.suppress(OSError):
             self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)
@@ -171,18 +189,28 @@ class ScribeProcess:
             key, text, noted_ns = received.key, received.text, received.time_ns
             self._segments.note(key, text, noted_ns)
             if key != "status" and drawing is not None:
-                drawing.put(lambda: drawing.viewer.note(key, text, noted_ns))
+                drawing.put(lambda viewer: viewer.note(key, text, noted_ns))
             return
         missing, time_ns = self._segments.write(received), int(received.timing["time_ns"])
         if drawing is None:
             return
         if missing:
             gap = f"{missing} ticks before tick {received.tick.index} are not recorded"
-            drawing.put(lambda: drawing.viewer.log(gap, "WARN", time_ns))
+            drawing.put(lambda viewer: viewer.log(gap, "WARN", time_ns))
         if (skill := received.skill) is not None:
-            drawing.put(lambda: drawing.viewer.learn(skill))
+            drawing.put(lambda viewer: viewer.learn(skill))
         events = [(event.kind, event.payload) for event in received.tick.inbox]
-        drawing.put(lambda: drawing.viewer.add(received.frame, time_ns, received.timing, events))
+        drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
+
+    def catch_up(self, waiting: int) -> None:
+        """While the recording is behind, it goes before drawing, and before other processes where
+        that is granted.
+        """
+        if waiting <= BEHIND / 10 if self._is_behind else waiting > BEHIND:
+            self._is_behind = not self._is_behind
+            _run_with(CATCH_UP_NICE if self._is_behind else child.NICE)
+            if self._drawing is not None:
+                self._drawing.is_paused = self._is_behind
 
     def flush(self) -> None:
         """Hands what was recorded to the operating system, and reports it."""
@@ -198,6 +226,26 @@ class ScribeProcess:
         self.report()
 
 
+def _run_with(nice: int) -> None:
+    """Sets the weight of this thread, and of the session of all children among others."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+        Path("/proc/self/autogroup").write_text(str(nice))
+
+
+def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
+    from service.viewer.stream import Viewer  # its import takes half a second, and starts threads
+
+    settings = setup.settings
+    return Viewer(
+        urdf=urdf_path(settings),
+        live_port=setup.live_port,
+        settings=settings,
+        skill=skill,
+        mb_per_hour=settings.files.rerun_mb_per_hour,
+    )
+
+
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
     """The next message and the files sent along; an empty message: the other side is gone."""
     while True:
@@ -211,7 +259,6 @@ def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[byte
 
 
 def _work(source: socket.socket) -> None:
-    """Writes and draws what is received until the other side is gone."""
     buffer = bytearray(LARGEST_MESSAGE)
     first, skills = _receive(source, buffer)
     setup = msgspec.json.decode(first, type=ScribeSetup)
@@ -219,6 +266,8 @@ def _work(source: socket.socket) -> None:
     ended = threading.Event()
 
     def read() -> None:
+        with contextlib.suppress(OSError):  # it does little, and what it does not read cannot be known to wait
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
             while (received := _receive(source, buffer))[0]:
                 waiting.append(received)
@@ -227,51 +276,32 @@ def _work(source: socket.socket) -> None:
         except ConnectionError:
             pass  # the same as its end
         finally:
+            signal.alarm(END_S)
             ended.set()  # in any case: without this reader nothing more comes
 
-    scribe = ScribeProcess(setup, skills[0] if skills else None, source)
     threading.Thread(target=read, name="socket", daemon=True).start()
+    scribe = ScribeProcess(setup, skills[0] if skills else None, source)
     flushed = time.monotonic()
     over = False
     while not over:
         over = ended.wait(0.05) and not waiting
-        if not ended.is_set():
-            signal.alarm(HUNG_S)
         now = time.monotonic()
+        scribe.catch_up(len(waiting))
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
         scribe.report_kept()
         if now - flushed > FLUSH_S:
             scribe.flush()
             flushed = now
-    signal.alarm(END_S)
     scribe.close()
 
 
-def main() -> None:
-    """Serves the socket whose descriptor is the only argument."""
+def run(source: socket.socket) -> None:
+    """Writes and draws what is received until the other side is gone."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends with its socket, once all is written
     for name, value in RERUN_LOG.items():
         os.environ.setdefault(name, value)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(HUNG_S)
-    # The daemon's death continues this process if it was stopped; then it sees the socket's end.
-    # The signal also comes when only the thread that started it ends, so it must be harmless.
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(5)
-    code = 1
-    try:
-        with socket.socket(fileno=int(sys.argv[1])) as source:
-            _work(source)
-        code = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(code)  # does not wait for a drawing that hangs
-
-
-if __name__ == "__main__":
-    main()
+    child.end_with_parent(END_S)
+    _run_with(CATCH_UP_NICE)
+    _work(source)

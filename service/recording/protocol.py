@@ -94,7 +94,8 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     """The setup of a scribe; the skill is sent along as a memory file.
 
     Without state it begins with the first message that has one. `recording` and `rrd` are explicit
-    paths instead of names in `folder`; `attempt` counts the scribes of one daemon.
+    paths instead of names in `folder`; `attempt` counts the scribes of one daemon; `unmarked` ticks
+    were lost with those before, and no recording marks them yet.
     """
 
     settings: Settings
@@ -104,6 +105,7 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     rrd: str | None
     live_port: int | None
     attempt: int
+    unmarked: int = 0
 
 
 class ScribeReport(msgspec.Struct, frozen=True):
@@ -121,3 +123,5 @@ class ScribeReport(msgspec.Struct, frozen=True):
     unmarked: int = 0
     errors: tuple[str, ...] = ()  # new ones
     free_mb: float | None = None  # free space where it writes; None: it writes nothing
+    mb_per_hour: float | None = None  # of recordings and drawings lately; None: not known yet
+    keep_mb_left: float | None = None  # that they may grow by before the oldest are removed; None: they are not

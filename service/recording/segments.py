@@ -11,6 +11,7 @@ import contextlib
 import errno
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,7 @@ from service.recording.protocol import TickMessage
 from service.recording.recording import Recorder
 
 RETRY_S = 1.0
+SAMPLE_S, GROWTH_S, LEAST_GROWTH_S = 5.0, 600.0, 10.0  # how often sizes are noted, over how long growth is told
 ROOM_BYTES = 1_000_000  # some seconds of ticks; a disk that was full is tried again once this is free
 PRUNE_S = 5.0
 
@@ -30,11 +32,18 @@ class Segments:
     """Writes ticks and notes; `say` is called once with what fails, in words.
 
     `draw` is called with the path of the drawing beside a new recording. Of the ticks received,
-    `kept` are on disk and `lost` never will be; of the lost ones no recording marks `unmarked` yet.
+    `kept` are on disk and `lost` never will be. No recording on disk marks `unmarked` of the lost
+    ticks yet; it begins with those of others that went before.
     """
 
     def __init__(
-        self, settings: Settings, paths: RecordingPaths, *, say: Callable[[str], None], draw: Callable[[Path], None]
+        self,
+        settings: Settings,
+        paths: RecordingPaths,
+        *,
+        say: Callable[[str], None],
+        draw: Callable[[Path], None],
+        unmarked: int = 0,
     ) -> None:
         self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
         self._recorder: Recorder | None = None
@@ -42,16 +51,24 @@ class Segments:
         self._skill: bytes | None = None
         self._rrd: Path | None = None
         self._complete: Path | None = None
-        self._kept = self.lost = self.unmarked = 0
+        self._kept = self.lost = 0
+        self._unmarked = unmarked
         self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = self._drawn = False
         self._failure: object = None  # the last that was reported
+        self._written = 0  # bytes in files that have ended
+        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], bytes in all
 
     @property
     def kept(self) -> int:
         """Ticks on disk."""
         return self._kept + (self._recorder.kept if self._recorder is not None else 0)
+
+    @property
+    def unmarked(self) -> int:
+        """Lost ticks that no recording on disk marks yet."""
+        return self._unmarked + self._marked_pending
 
     @property
     def path(self) -> Path | None:
@@ -82,6 +99,7 @@ class Segments:
             self._began, self._moved = self._tried, False
         elif self._rrd is not None:
             return None
+        self._written += _bytes_of(self._rrd)
         self._rrd, self._drawn = rrd, False
         if rrd is not None:
             self._draw(rrd)
@@ -104,12 +122,31 @@ class Segments:
             return None if self.path is None else round(shutil.disk_usage(_existing_folder(self.path)).free / 1e6)
         return None
 
+    def mb_per_hour(self) -> float | None:
+        """Growth of recordings and drawings lately [MB/h]; None where it is not known yet."""
+        if not self._sizes:
+            return None
+        (begin_s, begin), now_s = self._sizes[0], time.monotonic()
+        if now_s - begin_s < LEAST_GROWTH_S:
+            return None
+        return round((self._written + self._size() - begin) / MB * 3600 / (now_s - begin_s), 1)
+
+    @property
+    def keep_mb_left(self) -> float | None:
+        """Growth before the oldest recordings are removed [MB]; None where they are not."""
+        left = self._paths.keep_mb_left
+        return None if left is None else round(left)
+
+    def _size(self) -> int:
+        """Bytes in the files being written."""
+        return _bytes_of(self._rrd) + (0 if self._recorder is None else self._recorder.size)
+
     def _failed(self, path: Path, error: OSError) -> None:
         self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         cause = error.errno or str(error)
         if cause != self._failure:
             self._failure = cause
-            self._say(f"recording to {path} ended: {error}; it continues once that is repaired")
+            self._say(f"recording to {path} ended: {error.strerror or error}; it continues once that is repaired")
 
     def write(self, received: TickMessage) -> int:
         """Writes a tick; the number of missing ticks before it, if it is marked now, else 0."""
@@ -124,14 +161,14 @@ class Segments:
         if self._recorder is None:
             if self._wanted:
                 self.lost += 1
-                self.unmarked += 1 + received.lost
+                self._unmarked += 1 + received.lost
             else:
                 self._kept += 1  # drawing was all that was asked for
             return 0 if self._wanted else received.lost
-        missing = received.lost + self.unmarked
+        missing = received.lost + self._unmarked
         self._marked += missing
         self._marked_pending += missing
-        self.unmarked = 0
+        self._unmarked = 0
         self._safely(lambda recorder: _write_tick(recorder, received, missing))
         if self._recorder is not None and not self._recorder.pending:
             self._marked_pending = 0
@@ -142,9 +179,7 @@ class Segments:
     def _due(self, now: float) -> bool:
         files = self._settings.files
         sizes = [self._recorder.size] if self._recorder is not None else []
-        if self._rrd is not None:
-            with contextlib.suppress(OSError):
-                sizes.append(self._rrd.stat().st_size)
+        sizes.append(_bytes_of(self._rrd))
         too_large = max(sizes, default=0) > files.segment_mb * MB
         return too_large or self._moved or now - self._began > files.segment_minutes * 60
 
@@ -163,6 +198,7 @@ class Segments:
         self._safely(Recorder.close)
         if self._recorder is not None:
             self._kept += self._recorder.kept
+            self._written += self._recorder.size
             self._recorder = None
 
     def _safely(self, act: Callable[[Recorder], None]) -> None:
@@ -178,10 +214,12 @@ class Segments:
 
     def _leave(self, recorder: Recorder, lost: int, unmarked: int) -> None:
         recorder.abandon()
+        self._written += recorder.size
         self._recorder = None
         self._kept += recorder.kept + recorder.pending - lost
         self.lost += lost
-        self.unmarked += lost + unmarked
+        self._unmarked += lost + unmarked
+        self._marked_pending = 0
         self._tried = time.monotonic() if self._full else -1e9
         if not recorder.kept:
             _discard(recorder.path)
@@ -196,6 +234,8 @@ class Segments:
         """
         self._safely(Recorder.flush)
         self._check_files()
+        if not self._sizes or time.monotonic() - self._sizes[-1][0] > SAMPLE_S:
+            self._sizes.append((time.monotonic(), self._written + self._size()))
         if time.monotonic() - self._pruned > PRUNE_S:
             self._pruned = time.monotonic()
             with contextlib.suppress(OSError):
@@ -241,6 +281,13 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None
     )
     if missing:
         recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)
+
+
+def _bytes_of(path: Path | None) -> int:
+    """The size of a file; 0 where there is none."""
+    with contextlib.suppress(OSError):
+        return 0 if path is None else path.stat().st_size
+    return 0
 
 
 def _discard(path: Path) -> None:

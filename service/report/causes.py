@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from service.contract.incidents import Evidence, Incident, explained, word
+from service.contract.incidents import SOURCE_NAMES, Evidence, Incident, explained, word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 from service.report.columns import Columns
@@ -60,6 +60,8 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
     more = frames["rejected"][begin].astype(np.int64) - frames["rejected"][first]
     if rejected := ", ".join(f"{more[cause]} {word(cause)}" for cause in Cause if more[cause] > 0):
         yield f"rejected in the second before: {rejected}"
+    for name, cause, refused in _refused(columns, int(frames["tick"][first]), tick):
+        yield f"{SOURCE_NAMES[name]}: rejected as {cause}: {refused}"
     timing = columns.timing[(columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)]
     if len(timing):
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
@@ -69,6 +71,17 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
         ago_s = (tick - one.tick) * columns.period_s
         if one.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
             yield f"`{one.kind}` was asked for{f' {ago_s:.2f} s before' if ago_s > 0.005 else ''}"
+
+
+def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, str]]:
+    """The source, the cause and the words of what statuses between two ticks called rejected, the
+    newest of each source and cause.
+    """
+    said = [one for one in columns.statuses if first <= one.tick <= last]
+    newest = {
+        (name, source.cause): source.refused for one in said for name, source in one.sources.items() if source.refused
+    }
+    return [(*of, refused) for of, refused in newest.items()]
 
 
 def _was_doing(columns: Columns, begin: int) -> str:

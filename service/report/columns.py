@@ -17,6 +17,8 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from service.contract import cdr
+from service.contract.printable import printable, printable_values
+from service.contract.requests import Source
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
 from service.learning.skill_file import SkillError, decoded
@@ -48,13 +50,14 @@ class InForce(NamedTuple):
 
 
 class Said(msgspec.Struct, frozen=True):
-    """What a status said at its tick of mode and reason."""
+    """What a status said at its tick of mode and reason, and of what came in."""
 
     tick: int
     mode: str
     reason: str
     because: str = ""
     remedy: str = ""
+    sources: dict[str, Source] = {}
 
 
 @dataclass
@@ -123,8 +126,8 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             progress(BLOCK * len(blocks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
     for _, text, _ in recording.notes("status"):
-        with contextlib.suppress(msgspec.DecodeError):  # of another version
-            found.statuses.append(msgspec.json.decode(text, type=Said))
+        with contextlib.suppress(msgspec.MsgspecError):  # of another version
+            found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
     found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
     if found.skills and len(found.frames):
         found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
@@ -140,7 +143,7 @@ def _take_events(found: Columns, step: Step) -> None:
         if kind == "skill":
             _take_skill(found, payload, step.tick)
         elif kind in ORDERS:
-            found.orders.append(Order(step.tick, kind, cdr.decode_string(payload)))
+            found.orders.append(Order(step.tick, kind, printable(cdr.decode_string(payload))))
 
 
 def _take_skill(found: Columns, file: bytes, tick: int) -> None:

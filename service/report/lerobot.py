@@ -15,6 +15,7 @@ from pyarrow import parquet
 
 from service.contract import cdr
 from service.contract.explain import ExplainedError
+from service.core.intake.arm_samples import in_turn
 from service.report.columns import Columns, runs
 
 FEATURES = ("observation.state", "observation.environment_state", "action")
@@ -30,7 +31,8 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
 
     Joints are those that the arm told last; before it told any, the command before.
     """
-    frames, names = found.frames, found.recording.settings.joints.names
+    joint_settings = found.recording.settings.joints
+    frames, names = found.frames, joint_settings.names
     told = {-1: [np.nan] * len(names)}
     for step in found.recording.steps(outputs=False):
         for state in (cdr.decode_joints(payload) for kind, payload in step.events if kind == "joints/state"):
@@ -45,6 +47,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             rows = begin - 1 + times.searchsorted(np.arange(0.0, times[-1] + 1e-6, 1 / fps) + 1e-6, side="right")
             seen = joints[ticks.searchsorted(frames["tick"][rows], side="right") - 1]
             seen = np.where(np.isnan(seen), frames["joints"][np.maximum(rows - 1, begin)], seen)
+            seen = in_turn(joint_settings, seen, frames["joints"][rows])
             values = (seen, frames["hands"][rows].reshape(-1, len(HANDS)), frames["joints"][rows])
             yield {name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)}
 

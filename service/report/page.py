@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from service import palette
+from service.contract.printable import printable
 from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
 from service.report.report import Report
@@ -39,6 +40,7 @@ svg { max-width: 100%; height: auto } p { margin: .3rem 0 }
 """
 
 
+@mpl.rc_context({"text.parse_math": False})  # a name with dollar signs is no formula
 def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda count: None) -> str:
     """The page as HTML."""
     names = names_of(reports)
@@ -50,7 +52,7 @@ def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda 
         parts.append(f"<h2>{escape(name)}</h2>")
         verdict, *lines = summary(report)
         parts.append(f"<p><strong>{escape(verdict)}</strong></p>")
-        parts += [f"<p>{escape(line)}</p>" for line in (str(report.path), *lines)]
+        parts += [f"<p>{escape(line)}</p>" for line in (printable(str(report.path)), *lines)]
         if len(report.columns.frames):
             parts += [_svg(_over_time(report), f"{name}-time-"), _svg(_from_above(report), f"{name}-above-")]
         parts += [_table(table) for table in tables(report)]

@@ -87,12 +87,15 @@ class Limit(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """How near a joint came to its limits: position [rad], and shares of speed and acceleration."""
+    """How near a joint came to its limits: position [rad, m], and shares of speed and
+    acceleration.
+    """
 
     name: str
     margin_rad: float
     speed: float
     acceleration: float
+    kind: str = "revolute"
 
 
 class Rejection(NamedTuple):
@@ -246,8 +249,8 @@ def _joints(columns: Columns, sent: Any) -> Iterator[Joint]:
     margin = np.minimum(low, high).min(axis=0)
     speed = np.abs(sent["joint_velocities"]).max(axis=0) / np.array(limits.velocity)
     acceleration = np.abs(sent["joint_accelerations"]).max(axis=0) / np.array(limits.acceleration)
-    for name, *values in zip(limits.names, margin.tolist(), speed.tolist(), acceleration.tolist(), strict=True):
-        yield Joint(name, *values)
+    values = margin.tolist(), speed.tolist(), acceleration.tolist()
+    yield from map(Joint, limits.names, *values, limits.every_kind)
 
 
 def _rejections(columns: Columns) -> Iterator[Rejection]:
@@ -296,5 +299,5 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     if not hands_m:
         return f"no place {place!r} was taught"
     if best := found.best_m(place):
-        return f"the arm followed; with the hands where {place!r} was taught the tool came within {1000 * best:.0f} mm"
-    return f"the arm followed, but the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"
+        return f"with the hands where {place!r} was taught, the tool came only within {1000 * best:.0f} mm of it"
+    return f"the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from service.contract.incidents import remedy, word
+from service.contract.printable import printable
 from service.contract.records import Mode
-from service.report.report import Figure, Percentiles, Report, Span, differing_settings
+from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
 NOTHING_MISSING = "Nothing is missing in it."
@@ -106,8 +107,7 @@ def _tables(report: Report) -> Iterator[Table]:
         "Joints, at most",
         ("joint", "from a limit [rad]", "of its speed [%]", "of its acceleration [%]"),
         tuple(
-            (one.name, f"{one.margin_rad:.2f}", f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}")
-            for one in report.joints
+            (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
         ),
     )
     yield Table(
@@ -117,6 +117,16 @@ def _tables(report: Report) -> Iterator[Table]:
         tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
         numbers=0,
     )
+
+
+NO_LIMIT_RAD = 1000.0  # a continuous joint farther from its limits has none that matters
+
+
+def _margin(joint: Joint) -> str:
+    """How far a joint stayed from its limits [rad]; in metres where it slides."""
+    if joint.kind == "continuous" and joint.margin_rad > NO_LIMIT_RAD:
+        return "no limit"
+    return f"{joint.margin_rad:.2f}" + (" m" if joint.kind == "prismatic" else "")
 
 
 def _fault(fault: Span) -> tuple[str, str, str]:
@@ -135,9 +145,12 @@ def verdict(report: Report) -> str:
     """The report in one sentence: how much it followed, how often it did not, and the worst."""
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
-    first_s = next((span.start_s for span in report.spans if span.mode is Mode.FOLLOW), -1.0)
-    waited = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s < first_s]
-    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in waited]
+    following = [span for span in report.spans if span.mode is Mode.FOLLOW]
+    first_s, last_s = (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
+    holds = [span for span in report.spans if span.mode is Mode.HOLD]
+    waited = [span for span in holds if span.start_s < first_s]
+    ended = [span for span in holds if span.start_s >= last_s]
+    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)]
     faults = len(report.faults)
     counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
     if stops:
@@ -145,9 +158,12 @@ def verdict(report: Report) -> str:
         most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
     else:
         most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+    lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
-    followed = 100 * report.seconds(Mode.FOLLOW) / report.lasts_s
-    return f"It followed {followed:.0f} % of {report.lasts_s:.1f} s{since}, with {counts}; the worst was {most}."
+    since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
+    end = f" It ended with {ended[0].doing}, {report.lasts_s - last_s:.1f} s before the end." if ended else ""
+    followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
+    return f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was {most}.{end}"
 
 
 def _times_of(count: int, what: str) -> str:
@@ -193,7 +209,7 @@ def names_of(reports: Sequence[Report]) -> list[str]:
     seen: dict[str, int] = {}
     names = []
     for report in reports:
-        stem = report.path.stem
+        stem = printable(report.path.stem)
         seen[stem] = seen.get(stem, 0) + 1
         names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
     return names

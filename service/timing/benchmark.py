@@ -42,16 +42,16 @@ def bench(args: argparse.Namespace) -> int:
     """Exit code 0 once measured, whatever the result."""
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
-    settings = cell_of(args.arm)
+    settings = cell_of(args.arm, rate_hz=args.rate)
     report: Any
     read: Callable[[Any], str]
     seconds = args.seconds or (SOAK_S if args.soak else SECONDS)
     if args.soak:
-        report, read = soak.run(seconds / 60, args.rate, settings=settings, say=say), soak.text
+        report, read = soak.run(seconds / 60, settings.rate_hz, settings=settings, say=say), soak.text
     elif args.loads:
-        report, read = loads.run(args.rate, seconds, settings=settings, say=say), loads.text
+        report, read = loads.run(settings.rate_hz, seconds, settings=settings, say=say), loads.text
     else:
-        report, read = run(args.rate, seconds, arm=args.arm, say=say, keep=args.output), text
+        report, read = run(settings.rate_hz, seconds, arm=args.arm, say=say, keep=args.output), text
     if args.output is not None:
         (args.output / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
         if read is text:
@@ -101,7 +101,7 @@ def _whole(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:
         folder = keep or Path(name)
-        arguments, before = ("--arm", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
+        arguments, before = ("--joints", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
         cell: dict[str, Any] = {"settings": cell_of(arm), "record": folder, "program": program}
         with launched(Path(name), *arguments, **cell, say=say) as service:
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)

@@ -226,7 +226,7 @@ def _row(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
-        arguments = ("--arm", "assumed", "--rate", str(rate_hz), "--live", str(port))
+        arguments = ("--joints", "assumed", "--rate", str(rate_hz), "--live", str(port))
         cell: dict[str, Any] = {"settings": settings, "record": folder, "skills": skills, "program": load.program}
         with (
             launched(folder, *arguments, **cell, say=say) as service,

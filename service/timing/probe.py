@@ -129,7 +129,7 @@ def core(skill: Skill, rate_hz: int, seconds: float, arm: str) -> dict[str, Any]
     settings = msgspec.structs.replace(cell, rate_hz=rate_hz, arm=assumed)
     skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
-    controller, every = Controller(settings, skill, urdf=urdf), round(HANDS_EVERY_S * rate_hz)
+    controller, every = Controller(settings, skill, urdf=urdf), max(1, round(HANDS_EVERY_S * rate_hz))
 
     def step(index: int) -> object:
         hands = swaying(skill, index / rate_hz) if index % every == 0 else []

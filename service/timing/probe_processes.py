@@ -49,7 +49,5 @@ def echo() -> Iterator[str]:
 def family(pid: int) -> dict[str, psutil.Process]:
     """A daemon's process and its children, by kind."""
     found = {"daemon": psutil.Process(pid)}
-    kinds = {"service.recording.process": "scribe", "service.daemon.skill_worker": "skill worker"}
-    for child in found["daemon"].children():
-        found |= {kinds[word]: child for word in child.cmdline() if word in kinds}
+    found |= {child.name(): child for child in found["daemon"].children()}
     return found

@@ -35,7 +35,7 @@ def run(
         folder = Path(name)
         with (
             launched(
-                folder, "--arm", "assumed", "--rate", str(rate_hz), settings=settings, record=folder, say=say
+                folder, "--joints", "assumed", "--rate", str(rate_hz), settings=settings, record=folder, say=say
             ) as service,
             open_session(connect=[service.endpoint]) as session,
             asking("hands", service.endpoint),

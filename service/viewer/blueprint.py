@@ -43,7 +43,14 @@ class PlotView(NamedTuple):
 def plot_views(settings: Settings) -> dict[str, PlotView]:
     """All views of curves by path, with the ranges that follow from the settings."""
     joints, tool, period_us = settings.joints, settings.tool, 1e6 * settings.period_s
-    velocity, acceleration = max(joints.velocity), max(joints.acceleration)
+    velocity, acceleration, kinds = max(joints.velocity), max(joints.acceleration), joints.every_kind
+    unit = "rad" if set(joints.units) == {"rad"} else "rad or m"
+    lowest = min(
+        max(low, -math.pi) if kind == "continuous" else low for low, kind in zip(joints.lower, kinds, strict=True)
+    )
+    highest = max(
+        min(high, math.pi) if kind == "continuous" else high for high, kind in zip(joints.upper, kinds, strict=True)
+    )
     return {
         view.origin: view
         for view in (
@@ -55,10 +62,10 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
             PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
-            PlotView("/joints/velocity", "Joint velocity [rad/s]", -velocity, velocity),
-            PlotView("/joints/position", "Joint position [rad]", min(joints.lower), max(joints.upper), True),
-            PlotView("/joints/acceleration", "Joint acceleration [rad/s²]", -acceleration, acceleration),
-            PlotView("/joints/error", "Joint, measured less commanded [rad]", 0, settings.arm.fault_error_rad),
+            PlotView("/joints/velocity", f"Joint velocity [{unit}/s]", -velocity, velocity),
+            PlotView("/joints/position", f"Joint position [{unit}]", lowest, highest, True),
+            PlotView("/joints/acceleration", f"Joint acceleration [{unit}/s²]", -acceleration, acceleration),
+            PlotView("/joints/error", f"Joint, measured less commanded [{unit}]", 0, settings.arm.fault_error_rad),
             PlotView("/latency", "Hand to command [ms]", 0, 20),
             PlotView("/timing/lateness", "How late a tick begins [µs]", 0, period_us / 2),
             PlotView("/timing/work", "Work of a tick [µs]", 0, period_us),

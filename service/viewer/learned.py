@@ -18,6 +18,7 @@ import numpy as np
 import rerun as rr
 
 from service import palette
+from service.contract.printable import as_markdown, printable, printable_values
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.demonstrations.demonstration_reader import read_demonstration
@@ -69,12 +70,12 @@ def skill_contents(skill: bytes) -> SkillContents:
             for point in msgspec.json.decode(str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...])
         }
         return SkillContents(
-            str(arrays.get("name", "")),
-            str(arrays.get("learned_from", "")),
+            printable(str(arrays.get("name", ""))),
+            printable(str(arrays.get("learned_from", ""))),
             reference if is_tool else np.empty((0, 3)),
             tuple(via_points.values()),
             float(arrays.get("threshold", np.inf)),
-            msgspec.json.decode(str(arrays["figures"])) if "figures" in arrays else {},
+            printable_values(msgspec.json.decode(str(arrays["figures"]))) if "figures" in arrays else {},
         )
     except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"a skill of which nothing can be drawn: {error}") from None
@@ -83,7 +84,7 @@ def skill_contents(skill: bytes) -> SkillContents:
 def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
     """The named via-points in a skill's demonstrations."""
     if "names" in arrays and "nominal" in arrays:
-        names = msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...])
+        names = map(printable, msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...]))
         for name, at in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
             left, right, tool = ((x, y, z) for x, y, z in at)
             yield MarkedViaPoint(name, left, right, tool)
@@ -139,7 +140,7 @@ def skill_chunks(skill: SkillContents, shown: list[Demonstration], at: Column) -
 def about(skill: SkillContents, shown: int) -> str:
     """A description of the skill, as Markdown."""
     rows = skill.figures.get("demonstrations", ())
-    lines = [f"# {skill.name or 'skill'}", ""]
+    lines = [f"# {as_markdown(skill.name or 'skill')}", ""]
     if len(skill.reference):
         lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
     lines.append(f"Learned from {shown} demonstrations (faint lines)." if shown else "Its demonstrations are not here.")
@@ -149,14 +150,17 @@ def about(skill: SkillContents, shown: int) -> str:
         lines += ["| place | tool x, y, z [m] | within [mm] of the hands | goes with |", "|---|---|---|---|"]
         for point in skill.via_points:
             at = ", ".join(f"{value:.3f}" for value in point.tool)
-            lines.append(f"| {point.name} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
+            lines.append(f"| {as_markdown(point.name)} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
     else:
         lines.append("None.")
     if rows:
         lines += ["", "## Held out", "", "| demonstration | error [mm] | worst [mm] | within 95 % [%] |"]
         lines.append("|---|---|---|---|")
         for row in rows:
-            cells = [str(row.get("name")), *(f"{row.get(key, 0):.1f}" for key in ("error_mm", "worst_mm", "within_95"))]
+            cells = [
+                as_markdown(str(row.get("name"))),
+                *(f"{row.get(key, 0):.1f}" for key in ("error_mm", "worst_mm", "within_95")),
+            ]
             lines.append(f"| {' | '.join(cells)} |")
-        lines += [f"- {text}" for text in skill.figures.get("warnings", ())]
+        lines += [f"- {as_markdown(text)}" for text in skill.figures.get("warnings", ())]
     return "\n".join(lines)

@@ -10,6 +10,7 @@ import rerun as rr
 
 from service import palette
 from service.contract.messages import BASE, SceneObject
+from service.contract.printable import printable
 
 LABEL_OFFSET_M = (
     0.06  # of an object's name: above it, clear of via-points' names; toward the arm where the tool holds it
@@ -43,7 +44,8 @@ def object_chunks(
             yield at(path, *row(kind, 1, half_sizes=half, **pose, **style))
         x, y, z = found.position
         label_at = (x, y, z + (LABEL_OFFSET_M if found.frame_id == BASE else -LABEL_OFFSET_M))
-        label = {"labels": [found.name], "show_labels": [found.name not in labelled], "colors": [palette.light(colour)]}
+        label = {"labels": [printable(found.name)], "show_labels": [found.name not in labelled]}
+        label |= {"colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
         yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[label_at], radii=[0.0], **label))
     for name in set(before) - names:

@@ -7,9 +7,11 @@ Millimetres, microseconds and degrees of transparency are chosen here, in `dynam
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import rerun as rr
@@ -21,6 +23,7 @@ from service.config import Reach, Settings, robot_description, urdf_path
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
+from service.robot_xml import element_of
 from service.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
@@ -46,10 +49,18 @@ class ArmModels:
         live = urdf == urdf_path(settings)  # else it is a recording's, which has its meshes covered
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
         self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
-        self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
-        self.measured = rr.urdf.UrdfTree.from_file_path(
-            urdf, entity_path_prefix="measured", frame_prefix=GHOST, static_transform_entity_path="/measured/tf_static"
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+            except RuntimeError:
+                urdf = _plain(urdf, Path(folder))
+                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+            self.measured = rr.urdf.UrdfTree.from_file_path(
+                urdf,
+                entity_path_prefix="measured",
+                frame_prefix=GHOST,
+                static_transform_entity_path="/measured/tf_static",
+            )
         drawn: dict[str, bool] = {}
         size = 0
         for chunk in self.commanded.stream(include_joint_transforms=False):
@@ -67,6 +78,19 @@ class ArmModels:
         links = ", ".join(dict.fromkeys(path.partition("/")[0] for path in self.unfound))
         said = "the arm is drawn by its capsules: ROS_PACKAGE_PATH leads to no meshes of"
         return f"{said} {links}" if links else ""
+
+
+def _plain(urdf: Path, folder: Path) -> Path:
+    """A copy of a URDF in a folder, without what Rerun does not accept: masses, prefixes, other
+    encodings than UTF-8. Meshes are not found from there: their capsules are drawn.
+    """
+    robot = element_of(urdf.read_bytes())
+    for link in robot.findall("link"):
+        for inertial in link.findall("inertial"):
+            link.remove(inertial)
+    copy = folder / urdf.name
+    ElementTree.ElementTree(robot).write(copy, encoding="utf-8")
+    return copy
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
@@ -195,9 +219,14 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
 def _log_names(fix: Any, settings: Settings) -> None:
     """Logs names, units and colours of the curves, and the labels and colours of the modes."""
     joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
+    units = settings.joints.units
     series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
-        (f"/joints/{quantity}", [f"{joint} [{unit}]" for joint in joints], palette.JOINTS)
-        for quantity, unit in (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"))
+        (
+            f"/joints/{quantity}",
+            [f"{joint} [{unit}{per}]" for joint, unit in zip(joints, units, strict=True)],
+            palette.JOINTS,
+        )
+        for quantity, per in (("position", ""), ("velocity", "/s"), ("acceleration", "/s²"))
     ]
     series += [
         ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.JOINTS),
@@ -219,7 +248,7 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
-        ("/joints/error", "largest [rad]", palette.MEASURED),
+        ("/joints/error", "largest [rad]" if set(units) == {"rad"} else "largest [rad or m]", palette.MEASURED),
         ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),

@@ -25,9 +25,12 @@ from numpy.typing import NDArray
 
 from service.config import Settings
 from service.contract import cdr
-from service.contract.explain import ExplainedError
-from service.contract.messages import SceneObject, WireError, in_order
+from service.contract.explain import ExplainedError, in_words
+from service.contract.joint_states import measured
+from service.contract.messages import SceneObject, WireError
+from service.contract.printable import printable
 from service.core.frame import Record
+from service.core.intake.arm_samples import in_turn
 from service.learning.demonstration import Demonstration
 from service.recording.recording import OBJECTS
 from service.shipped import skills_folder
@@ -37,8 +40,10 @@ from service.viewer.dynamic import LOG_NS, DrawnFrame, DynamicScene
 from service.viewer.learned import SkillContents
 from service.viewer.sentences import sentence
 from service.viewer.static import ArmModels, log_static
+from service.viewer.thinning import Thinning
 
 FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.2
+THIN_BATCH_S = 10.0  # of a file with a budget: each batch takes 50 kB beside its frames
 LIVE_MB = 24  # for viewers that connect later, the arm's meshes aside: the newest 20 s at 500 Hz, which curves show
 LIVE_WAITING = 5  # batches; where a viewer lags the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
@@ -56,6 +61,7 @@ class _Destination:
         self,
         name: str,
         sink: Any,
+        path: Path | None = None,
         *,
         live: bool,
         batch_s: float,
@@ -63,8 +69,10 @@ class _Destination:
         settings: Settings,
         recording_id: str,
         skill: tuple[SkillContents, list[Demonstration]] | None,
+        thinning: Thinning | None = None,
     ) -> None:
         self._batch_ns = round(batch_s * 1e9)
+        self._thinning = thinning
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
         self._models = ArmModels(urdf, settings)
@@ -76,15 +84,15 @@ class _Destination:
         self._objects: tuple[SceneObject, ...] = ()
         self._repeated_ns = 0
         self._open = False
-        self.redirect(name, sink)
+        self.redirect(name, sink, path)
 
-    def redirect(self, name: str, sink: Any) -> None:
-        """Sends the scene to another sink from now on.
+    def redirect(self, name: str, sink: Any, path: Path | None = None) -> None:
+        """Sends the scene to another sink from now on, which may be the file at `path`.
 
         The static part is sent first; skill and objects follow with the first frame.
         """
         self._finish()
-        self.name = name
+        self.name, self._path = name, path
         self._dynamic.restart()
         self._repeated_ns, self._open = 0, True
         self._stream.set_sinks(sink)
@@ -93,6 +101,14 @@ class _Destination:
         self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
         log_static(self._stream, self._models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
+        if self._thinning is not None:
+            self._thinning.restart(self._size())
+
+    def _size(self) -> int:
+        """Bytes in the file; 0 where there is none."""
+        with contextlib.suppress(OSError):
+            return 0 if self._path is None else self._path.stat().st_size
+        return 0
 
     def add(self, shown: DrawnFrame) -> None:
         """Adds one frame."""
@@ -100,8 +116,10 @@ class _Destination:
             self._repeat(shown.time_ns)
             if self._models.remark:
                 self.log(self._models.remark, "WARN", shown.time_ns)
-        self._pending.append(shown)
-        if shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
+        kept = shown if self._thinning is None else self._thinning.kept(shown)
+        if kept is not None:
+            self._pending.append(kept)
+        if self._pending and shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
             self.send()
         if self._live and shown.time_ns - self._repeated_ns > REPEAT_S * 1e9:
             self._repeat(shown.time_ns)
@@ -147,6 +165,8 @@ class _Destination:
         """Sends what is pending."""
         if self._pending:
             batch, self._pending = self._pending, []
+            if self._thinning is not None:
+                self._thinning.sent(len(batch), self._size())
             self.put(list(self._dynamic.chunks(batch)))
 
     def _finish(self) -> None:
@@ -241,7 +261,11 @@ class Viewer:
         skill: bytes | None = None,
         rrd: Path | None = None,
         live_port: int | None = None,
+        mb_per_hour: float = 0.0,
     ) -> None:
+        """`mb_per_hour` [MB/h] is the most that files grow by, for which frames are left out; 0: no
+        limit.
+        """
         self.problems: list[str] = []
         self.url: str | None = None
         self.rrd: str | None = None
@@ -253,6 +277,10 @@ class Viewer:
         self._demonstrations: list[Demonstration] = []
         self._destinations: list[_Destination] = []
         self._file: _Destination | None = None
+        self._thinning: Thinning | None = None
+        if mb_per_hour:
+            segment_s = 60 * settings.files.segment_minutes
+            self._thinning = Thinning(mb_per_hour, rate_hz=settings.rate_hz, segment_s=segment_s)
         self._common: dict[str, Any] = {
             "urdf": urdf,
             "settings": settings,
@@ -281,10 +309,12 @@ class Viewer:
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
             if drawn is None:
-                self._file = _Destination(name, rr.FileSink(rrd), live=False, batch_s=FILE_BATCH_S, **self._common)
+                batch_s = FILE_BATCH_S if self._thinning is None else THIN_BATCH_S
+                thinned: dict[str, Any] = {"thinning": self._thinning, "batch_s": batch_s}
+                self._file = _Destination(name, rr.FileSink(rrd), rrd, live=False, **thinned, **self._common)
                 self._destinations.append(self._file)
             else:
-                drawn.redirect(name, rr.FileSink(rrd))
+                drawn.redirect(name, rr.FileSink(rrd), rrd)
             self.rrd = str(rrd)
 
     @contextlib.contextmanager
@@ -293,7 +323,7 @@ class Viewer:
         try:
             yield
         except Exception as error:
-            self.problems.append(f"{name} ended: {error}")
+            self.problems.append(f"{name} ended: {in_words(error)}")
             if destination in self._destinations:
                 self._destinations.remove(destination)
             if destination is not None and destination is self._file:
@@ -311,7 +341,9 @@ class Viewer:
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):
-                    self._measured = np.array(in_order(cdr.decode_joints(payload), self._settings.joints.names)[0])
+                    joints = self._settings.joints
+                    position = np.array(measured(cdr.decode_joints(payload), joints.names)[0])
+                    self._measured = in_turn(joints, position, frame["joints"])
             elif kind == "skill":
                 self.learn(payload)
         if self._unread is not None:
@@ -352,7 +384,8 @@ class Viewer:
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Shows a line in the log; level is INFO, WARN or ERROR."""
-        self._each(lambda destination: destination.log(text, level, time_ns))
+        shown = printable(text)
+        self._each(lambda destination: destination.log(shown, level, time_ns))
 
     def flush(self) -> None:
         """Sends what is pending, and waits until the file has it."""

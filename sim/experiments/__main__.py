@@ -29,6 +29,8 @@ ABOUT = {
     "letters": "adaptation of handwritten letters (Figure 1)",
     "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
     "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
+    "runs": "ten runs of that search with one letter and one via-point (Figure 3(c))",
+    "table": "DMP, ProMP, mixture regression and KMP on the same letters (Table I)",
     "phase": "hands that pause and go back pause and reverse the robot",
     "orientation": "the tool turns the glass to the eyes: orientation predicted with the position, and followed",
     "demonstrations": "error against the number of demonstrations",

@@ -26,7 +26,7 @@ def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = 
     folder.mkdir(parents=True, exist_ok=True)
     with (
         tempfile.TemporaryDirectory() as scratch,  # nothing taught from before
-        launched(Path(scratch), "--arm", "state", record=folder if record else None) as service,
+        launched(Path(scratch), "--joints", "state", record=folder if record else None) as service,
     ):
         with open_session(connect=[service.endpoint]) as session:
             if taught:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import rerun as rr
 
-from kmp import KMP, GaussianKernel, GaussianMixture
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
 from sim.experiments.rivals import RIDGE, learned_promp
@@ -19,7 +19,16 @@ from sim.experiments.writing import DURATION_S, TIMES
 
 BASES = 20  # for each of x and y
 COLUMNS = 5  # of the figure
-STYLES = (("o-", ADAPTED), ("x-", DESIRED), ("v--", "#009E73"), ("s:", "#56B4E9"), ("^--", OTHER), ("D-.", "black"))
+STYLES = (
+    ("o-", ADAPTED),
+    ("x-", DESIRED),
+    ("v--", "#009E73"),
+    ("s:", "#56B4E9"),
+    ("^--", OTHER),
+    ("D-.", "black"),
+    ("+-", "#8B5A2B"),
+    ("*:", "#595959"),
+)
 FAINT = "#595959"
 VIA_VARIANCE = 1e-6  # [cm²] as for KMP
 
@@ -28,6 +37,7 @@ PER_DIMENSION = (3, 5, 10)  # basis functions along each input
 MOST_BYTES = 2**30  # for the covariance of the weights; beyond it, it is not made
 ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
+SAMPLE_DEVIATION = 0.003  # of a sample as a reference point: lambda Sigma is about WEIGHT_RIDGE
 WEIGHT_RIDGE = 1e-6  # the functions are known without noise
 FUNCTIONS = 5  # random ones, over which times and errors are averaged
 OUTPUTS = 3
@@ -81,7 +91,7 @@ class Compared(NamedTuple):
 
 
 def _compared(letter: Letter, case: Case) -> Compared:
-    kmp, other = adapted(letter, case).mean(TIMES[:, None]), _conditioned(letter, case, ridge=RIDGE)
+    kmp, other = adapted(letter, case).mean(TIMES[:, None]), conditioned(letter, case, ridge=RIDGE)
     misses, deviations, largest, everywhere = zip(*(_off(letter, case, line) for line in (kmp, other)), strict=True)
     return Compared(case, kmp, other, misses, deviations, largest, everywhere)
 
@@ -101,7 +111,7 @@ Drawn: TypeAlias = tuple[list[Letter], dict[str, list[Compared]]]
 """The letters of a set, and what was found for each."""
 
 
-def _conditioned(letter: Letter, case: Case, *, ridge: float) -> Array:
+def conditioned(letter: Letter, case: Case, *, ridge: float = RIDGE) -> Array:
     """The trajectory (200, 2) [cm] of the letter's ProMP through the desired points."""
     primitive = learned_promp(
         [TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES, ridge=ridge
@@ -116,7 +126,7 @@ def _bare(letters: list[Letter]) -> dict[str, float]:
     rms deviation elsewhere [cm].
     """
     found = [
-        _off(letter, case, _conditioned(letter, case, ridge=0.0))[:2] for letter in letters for case in cases(letter)
+        _off(letter, case, conditioned(letter, case, ridge=0.0))[:2] for letter in letters for case in cases(letter)
     ]
     misses, deviations = zip(*found, strict=True)
     return {"largest_miss_cm": max(misses), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
@@ -191,6 +201,16 @@ def grown(inputs: int, seed: int) -> list[Grown]:
 
     some = slice(None, None, len(train) // POINTS)
 
+    def kmp_at_samples() -> Array:
+        reference, centre = Gaussians.of(y[some], deviation=SAMPLE_DEVIATION), y.mean(axis=0)
+        return KMP.fit(train[some], reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=centre).mean(
+            test
+        )
+
+    def mixture_regression() -> Array:
+        mixture = GaussianMixture.fit(np.hstack([train, y]), components=COMPONENTS, seed=seed)
+        return mixture.regress(test).mean
+
     def kernel_ridge() -> Array:
         kernel, centre = GaussianKernel(ELL), y.mean(axis=0)
         gram = kernel(train[some], train[some]) + WEIGHT_RIDGE * np.eye(POINTS)
@@ -202,6 +222,8 @@ def grown(inputs: int, seed: int) -> list[Grown]:
     size = 8.0 * (POINTS * OUTPUTS) ** 2
     rows = [
         tried("KMP", POINTS, size, kmp),
+        tried("KMP, at 200 samples", POINTS, size, kmp_at_samples),
+        tried("GMM", COMPONENTS, 8.0 * COMPONENTS * (inputs + OUTPUTS) ** 2, mixture_regression),
         tried("kernel ridge, 200 samples", POINTS, 8.0 * POINTS**2, kernel_ridge),
         tried("ProMP, at 200 samples", POINTS, size, promp(lambda s: GaussianKernel(ELL)(s, train[some]))),
     ]
@@ -319,7 +341,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     functions.text(
         0.9, at * 1.4, "above: more than 1 GiB\nfor their covariance,\nwhich is not made", fontsize=7.5, color=FAINT
     )
-    functions.text(6, 165, "three at 200", fontsize=7.5, color=FAINT, ha="right", va="top")
+    functions.text(6, 165, "four at 200", fontsize=7.5, color=FAINT, ha="right", va="top")
     functions.set(yscale="log", ylim=(2, 3e6), ylabel="basis functions, or reference points")
     seconds.set(yscale="log", ylabel="time to learn [s]")
     error.set(

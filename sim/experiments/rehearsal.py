@@ -53,7 +53,7 @@ def rehearse(
     script: HandScript,
     skill_for: Callable[[Bench], Skill],
     *,
-    rate_hz: int = 500,
+    rate_hz: int | None = None,
     settings: Settings | None = None,
     world: type[World] | None = None,
     keep: bool = False,
@@ -61,10 +61,12 @@ def rehearse(
 ) -> Rehearsed:
     """One run of a script through core and physics.
 
-    `settings` say which arm (or else the shipped one), `world` by which physics (or else the
-    first installed). `look` is shown the bench after each tick; `keep` keeps what was seen.
+    `settings` name the arm and the rate (or else the shipped cell's), unless `rate_hz` is another;
+    `world` is the physics, or else the first installed. `look` is shown the bench after each tick;
+    `keep` keeps what was seen.
     """
-    settings = msgspec.structs.replace(settings or Settings(), rate_hz=rate_hz)
+    settings = settings or Settings()
+    settings = msgspec.structs.replace(settings, rate_hz=rate_hz or settings.rate_hz)
     frames: list[Frame] = []
     times: list[float] = []
     hands: list[Array] = []
@@ -72,7 +74,7 @@ def rehearse(
     tool: list[tuple[float, ...]] = []
     axes: list[tuple[float, float, float]] = []
     held = 0
-    with Bench(script, settings=settings, world=world, rate_hz=rate_hz) as bench:
+    with Bench(script, settings=settings, world=world) as bench:
 
         def tap(_: Tick, frame: Frame) -> None:
             nonlocal held

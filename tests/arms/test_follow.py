@@ -25,6 +25,7 @@ from service.arms.simulated import SimulatedArm
 from service.client import Client, UnreachableError, endpoints, open_session
 from service.config import Settings
 from service.contract import cdr
+from service.launch import free_port
 from sim.scene import Scene
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
@@ -191,10 +192,9 @@ def refused(*arguments: str) -> str:
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     assert "no arm 'frankia'; franka and simulated are shipped" in refused("frankia")
-    assert "is a daemon running" in refused("simulated", "--connect", "tcp/127.0.0.1:1")
-    six, slow = tmp_path / "six.toml", tmp_path / "slow.toml"
+    assert "is a daemon running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
+    six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
-    slow.write_text("rate_hz = 200\n")
     with serving(tmp_path) as daemon:
         at = ("--connect", daemon.endpoint)
         assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
@@ -202,14 +202,49 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
         assert "here 6 were configured" in line
         assert "give --config, the daemon's own settings" in line
         assert "give --config with its own URDF" in refused("franka", *at)
-        daemon.until(lambda status: status["tick"] > 200)
-        assert "200 are configured here: give --config" in refused("simulated", *at, "--config", str(slow))
+
+
+def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> None:
+    at = f"tcp/127.0.0.1:{free_port()}"
+    with following("simulated", "--connect", at) as running:
+        running.until("waiting, up to 60 s: ")
+        time.sleep(3.0)  # longer than a connection or a request is tried
+        with serving(tmp_path, network=f'[network]\nlisten = ["{at}"]\n') as daemon, Tracker(daemon.session):
+            running.until("commands come, the arm follows")
+            assert running.ended() == 0
+
+
+@pytest.mark.parametrize("program", ["follow", "sim"])
+def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program: str, tmp_path: Path) -> None:
+    with serving(tmp_path, "--rate", "50") as daemon, Tracker(daemon.session):
+        done = thirdhand(program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        "50 Hz is too slow: commands would come every 20 ms, and an arm brakes 20 ms after its last command; "
+        "67 Hz or more needed"
+    )
+
+
+@pytest.mark.timed
+def test_an_arm_follows_a_daemon_at_1000_hz_without_being_told_its_rate(tmp_path: Path) -> None:
+    with serving(tmp_path, "--rate", "1000", network=PATIENT) as daemon, Tracker(daemon.session) as tracker:
+        joints = Joints(daemon.session)
+        with following("simulated", "--connect", daemon.endpoint) as running:
+            running.until("commands come")
+            for attempt in range(20):
+                tracker.left = LEFT if attempt % 2 else NEAR_LEFT
+                with contextlib.suppress(TimeoutError):
+                    running.waits(joints.moving, 3.0)
+                    break
+            assert daemon.client.status().mode != "fault"
+            assert running.ended() == 0
+    assert "0 commands were refused" in running.said[-1]
 
 
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     arm, told_so = SimulatedArm(Settings()), r"no command came on thirdhand/joints/command within 0\.3 s: is the daemon"
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
-        follow(arm, session, "thirdhand", tick_s=0.002, stop=threading.Event(), wait_s=0.3)
+        follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)
 
 
@@ -218,7 +253,7 @@ def test_the_joints_are_told_by_their_names() -> None:
         heard = session.declare_subscriber("thirdhand/joints/state", RingChannel(1))
         stop = threading.Event()
         arm = threading.Thread(
-            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"tick_s": 0.002, "stop": stop}
+            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"stop": stop}
         )
         arm.start()
         state = cdr.decode_joints(heard.recv().payload.to_bytes())

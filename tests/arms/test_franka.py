@@ -30,7 +30,7 @@ def motion(wanted: Vector) -> list[Command]:
     commands = [Command(0, tuple(STANDS), (0.0,) * 7, 0, 0, 0)]
     for tick, velocity in enumerate(wanted, start=1):
         state = limiter.step(*state, velocity)[:3]
-        commands.append(Command(0, tuple(state[0]), tuple(state[1]), tick, 0, 0))
+        commands.append(Command(round(1e9 * TICK * tick), tuple(state[0]), tuple(state[1]), tick, 0, 0))
     return commands
 
 
@@ -46,7 +46,7 @@ def test_toward_its_ends_each_joint_is_slower_as_the_robot_asks(way: float, lost
     """Commands go there faster than it allows, as fast as they may."""
     rng, commands = np.random.default_rng(1), motion(np.full((2000, 7), way * 1.5))
     limits = franka.limits_of(fr3())
-    playback = Playback(limits, STANDS, tick_s=TICK, period_s=PERIOD, speed_limits=franka.speed_limits)
+    playback = Playback(limits, STANDS, period_s=PERIOD, speed_limits=franka.speed_limits)
     joints, velocity = [STANDS], []
     for i in range(4000):
         came = [commands[i // 2]] if i % 2 == 0 and rng.uniform() >= lost else []
@@ -69,9 +69,7 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     measured, passed_s, at = [], 0.0, 0
     with robot(tmp_path, "--fast") as there:
         arm = franka.FrankaArm(cell(), there.address)
-        playback = Playback(
-            arm.limits, arm.stands_at(), tick_s=TICK, period_s=arm.period_s, speed_limits=arm.speed_limits
-        )
+        playback = Playback(arm.limits, arm.stands_at(), period_s=arm.period_s, speed_limits=arm.speed_limits)
         with arm:
             while passed_s < 6.3:
                 now = arm.read()

@@ -5,7 +5,7 @@ limit; and where they do little, it is what was commanded, a little later.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,8 +43,9 @@ class Sent(NamedTuple):
     command: Command
 
 
-def commanded(tick: int, position: Iterable[float], velocity: Iterable[float]) -> Command:
-    return Command(0, tuple(position), tuple(velocity), tick, 0, 0)
+def commanded(tick: int, position: Iterable[float], velocity: Iterable[float], stamp_ns: int | None = None) -> Command:
+    stamp_ns = round(1e9 * TICK * tick) if stamp_ns is None else stamp_ns
+    return Command(stamp_ns, tuple(position), tuple(velocity), tick, 0, 0)
 
 
 def motion(wanted: Vector, *, at: Vector = AT, tick: int = 0) -> list[Command]:
@@ -115,6 +116,7 @@ hostile = st.builds(
     st.integers(-1, 400),
     st.lists(numbers, min_size=6, max_size=8),
     st.lists(numbers, min_size=7, max_size=7),
+    st.none() | st.integers(-(10**9), 10**12),
 )
 restarts = st.tuples(
     st.integers(0, 150), st.integers(0, 2000), st.floats(-0.06, 0.06), st.sampled_from([0.0, 0.04, 0.5])
@@ -142,7 +144,7 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
         commands, end = commands[:after], commands[min(after, len(commands) - 1)]
         again = motion(-wanted, at=(np.array(end.position) + off).clip(LOWER, UPPER), tick=tick)
         arriving = [*sent(commands, late), *sent(again, late, len(commands) * TICK + silent_s)]
-    playback = Playback(limits, AT, tick_s=TICK, period_s=period)
+    playback = Playback(limits, AT, period_s=period)
     written = play(playback, arriving, len(wanted) * TICK + 1.0, period, clocks)
     assert_held(limits, written, period)
 
@@ -150,7 +152,7 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 9.0, -9.0])
 @pytest.mark.parametrize("which", ["position", "velocity"])
 def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, which: str) -> None:
-    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    playback = Playback(COMMANDED, AT, period_s=0.001)
     position, velocity = [*AT], [0.0] * 7
     (position if which == "position" else velocity)[3] = bad
     arriving = sent([commanded(i, position, velocity) for i in range(100)])
@@ -162,7 +164,7 @@ def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, whic
 def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
     commands = motion(sway(1.0))
     jumping = [Sent(one.at_s, one.command._replace(position=tuple(AT))) for one in sent(commands)[300::50]]
-    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    playback = Playback(COMMANDED, AT, period_s=0.001)
     kept = [one for i, one in enumerate(sent(commands)) if i < 300 or i % 50]
     written = play(playback, [*kept, *jumping], 1.0, 0.001)
     assert (playback.refused, playback.reason) == (4, "a jump from the command before")
@@ -172,7 +174,7 @@ def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
 
 
 def test_another_number_of_joints_is_refused_and_named() -> None:
-    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    playback = Playback(COMMANDED, AT, period_s=0.001)
     playback.step([commanded(0, AT[:6], [0.0] * 6)])
     assert playback.reason == "6 joints, 7 needed"
 
@@ -181,7 +183,7 @@ def test_another_number_of_joints_is_refused_and_named() -> None:
 
 
 def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow() -> None:
-    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(np.full((400, 7), 0.5))
+    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(np.full((400, 7), 0.5))
     written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
     moving = np.abs(written.velocity).max(axis=1)
     silent = round((len(commands) - 1) * TICK / 0.001)
@@ -193,7 +195,7 @@ def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow(
 
 
 def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
-    playback, commands = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), motion(sway(2.0))
+    playback, commands = Playback(STRONG, AT, period_s=0.001), motion(sway(2.0))
     cut = [one for one in sent(commands) if not 1.0 < one.at_s < 1.06]
     written = play(playback, cut, 2.0, 0.001)
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.01
@@ -208,7 +210,7 @@ def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
     off: float, speed: float, followed: bool, at_start: bool
 ) -> None:
     assert REJOIN_RAD == 0.05
-    playback, arm = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), AT
+    playback, arm = Playback(COMMANDED, AT, period_s=0.001), AT
     if not at_start:
         arm = play(playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S, 0.001).position[-1]
     where = arm + off * np.eye(7)[2]
@@ -221,7 +223,7 @@ def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
 
 def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
     """Half a second of motion comes at once, half a second late."""
-    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(sway(1.5))
+    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.5))
     held = [Sent(1.0, one.command) if 0.5 < one.at_s < 1.0 else one for one in sent(commands[:500])]
     written = play(playback, held, 1.5, 0.001)
     assert (written.position[1000:] == written.position[999]).all()
@@ -229,7 +231,7 @@ def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
 
 
 def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -> None:
-    playback, commands = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001), motion(sway(1.0), tick=70_000)
+    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.0), tick=70_000)
     before = play(playback, sent(commands[:400]), 0.8 + 0.5, 0.001)
     stands = before.position[-1]
     again = motion(sway(1.0), at=stands)
@@ -241,10 +243,90 @@ def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -
 def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
     """The one that came first is followed; the other's ticks are none of that sequence."""
     one, other = motion(sway(1.0)), motion(-sway(1.0), tick=40_000)
-    playback = Playback(COMMANDED, AT, tick_s=TICK, period_s=0.001)
+    playback = Playback(COMMANDED, AT, period_s=0.001)
     written = play(playback, [*sent(one), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
     assert np.abs(written.position[-1] - one[-1].position).max() < 0.01
     assert playback.refused > 400
+
+
+# --- the length of a tick ------------------------------------------------------------------------
+
+
+def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT, begin_s: float = 0.0, tick: int = 0) -> list[Sent]:
+    """Commands of a daemon of this rate: from rest, 0.15 rad to and fro at 0.4 Hz."""
+    pace, arriving = 2 * math.pi * 0.4, []
+    for k in range(round(seconds * rate_hz)):
+        t = k / rate_hz
+        position, velocity = at + 0.15 * (1 - math.cos(pace * t)), np.full(7, 0.15 * pace * math.sin(pace * t))
+        command = commanded(tick + k, position, velocity, stamp_ns=10**18 + round(1e9 * (begin_s + t)))
+        arriving.append(Sent(begin_s + t, command))
+    return arriving
+
+
+def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> float:
+    """The largest distance between what is written and what was commanded by then [rad]."""
+    when, where = [one.at_s for one in arriving], [one.command.position[0] for one in arriving]
+    told = np.interp(period * np.arange(1, len(written.position) + 1), when, where)
+    return float(np.abs(written.position[:, 0] - told).max())
+
+
+@pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
+@pytest.mark.parametrize("rate_hz", [67, 100, 250, 500, 700, 1000])
+def test_commands_of_any_rate_are_played_back_at_their_own_pace(rate_hz: int, period: float) -> None:
+    playback, arriving = Playback(STRONG, AT, period_s=period), at_rate(rate_hz, 4.0)
+    written = play(playback, arriving, 4.0, period)
+    assert playback.tick_s == pytest.approx(1 / rate_hz, rel=1e-3)
+    assert playback.refused == 0
+    assert farthest_rad(written, arriving, period) < 0.4 * (2 / rate_hz + 2 * period)  # at 0.38 rad/s
+
+
+@pytest.mark.parametrize(
+    ("since", "stamped"),
+    [
+        (800, lambda stamp_ns, k: stamp_ns + 3_600_000_000_000),
+        (800, lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799)),  # creeps until time has caught up
+        (0, lambda stamp_ns, k: stamp_ns + 20_000 * (k % 7)),
+    ],
+    ids=["set ahead", "set back", "trembles"],
+)
+def test_a_clock_that_is_set_does_not_change_the_pace(since: int, stamped: Callable[[int, int], int]) -> None:
+    arriving = [
+        one if k < since else one._replace(command=one.command._replace(stamp_ns=stamped(one.command.stamp_ns, k)))
+        for k, one in enumerate(at_rate(500, 4.0))
+    ]
+    playback = Playback(STRONG, AT, period_s=0.001)
+    written = play(playback, arriving, 4.0, 0.001)
+    assert playback.refused == 0
+    assert farthest_rad(written, arriving, 0.001) < 0.003
+
+
+def test_a_daemon_of_another_rate_that_takes_over_is_followed_at_its_own() -> None:
+    playback, first = Playback(STRONG, AT, period_s=0.001), at_rate(250, 1.0)
+    stands = play(playback, first, 1.5, 0.001).position[-1]
+    then = at_rate(1000, 3.0, at=stands)
+    assert farthest_rad(play(playback, then, 3.0, 0.001), then, 0.001) < 0.003
+    assert playback.tick_s == pytest.approx(0.001, rel=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 60, 66])
+def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_hz: int) -> None:
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    assert (play(playback, at_rate(rate_hz, 2.0), 2.0, 0.001).position == AT).all()
+    period = f"{1000 / rate_hz:.0f} ms"
+    assert playback.reason == playback.too_slow
+    assert playback.too_slow == (
+        f"{rate_hz} Hz is too slow: commands would come every {period}, and an arm brakes 20 ms after its last "
+        "command; 67 Hz or more needed"
+    )
+
+
+def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    unstamped = [one._replace(command=one.command._replace(stamp_ns=0)) for one in at_rate(500, 1.0)]
+    assert (play(playback, unstamped, 0.1, 0.001).position == AT).all()
+    assert "no length of a tick" in playback.reason
+    assert playback.reason.endswith("1 to 20 ms a tick needed")
+    assert playback.too_slow == ""
 
 
 # --- accuracy ------------------------------------------------------------------------------------
@@ -272,7 +354,7 @@ def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as
     rng = np.random.default_rng(3)
     commands = motion(sway(6.0))
     late_s = np.where(rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands)))
-    playback = Playback(STRONG, AT, tick_s=TICK, period_s=period)
+    playback = Playback(STRONG, AT, period_s=period)
     written = play(playback, sent(commands, late_s.tolist()), 6.0, period)
     late, off = behind(written, commands, period)
     assert 0.0 < late < delay_s + period
@@ -287,7 +369,7 @@ def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None
     rng = np.random.default_rng(5)
     commands = motion(sway(6.0))
     late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))
-    playback, delays = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), []
+    playback, delays = Playback(STRONG, AT, period_s=0.001), []
     for begin in range(0, 3000, 500):
         play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0, 0.001)
         delays.append(playback.delay_ticks)
@@ -301,7 +383,7 @@ def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None
 def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(share: float) -> None:
     """A step is taken each 0.97 or 1.03 ms, by a drive whose period is 1 ms."""
     commands = motion(sway(6.0))
-    playback = Playback(STRONG, AT, tick_s=TICK, period_s=0.001)
+    playback = Playback(STRONG, AT, period_s=0.001)
     arriving = [Sent(one.at_s / share, one.command) for one in sent(commands)]
     written = play(playback, arriving, 6.0 / share, 0.001, [0.001 * share])
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.02
@@ -312,7 +394,7 @@ def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(sh
 def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
     """The loop stands for 60 ms each second; the network is as punctual as ever."""
     commands = motion(sway(6.0))
-    playback, queue = Playback(STRONG, AT, tick_s=TICK, period_s=0.001), list(reversed(sent(commands)))
+    playback, queue = Playback(STRONG, AT, period_s=0.001), list(reversed(sent(commands)))
     velocity: list[Vector] = []
     now_s = before_s = 0.0
     while now_s < 5.9:
@@ -332,8 +414,8 @@ def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
     commands, jumped, tick = motion(sway(3.0)), [], 0
     for i, command in enumerate(commands):
         tick += 3 if i % 200 == 199 else 1
-        jumped.append(Sent(tick * TICK, command._replace(tick=tick)))
-    playback = Playback(STRONG, AT, tick_s=TICK, period_s=0.001)
+        jumped.append(Sent(tick * TICK, command._replace(tick=tick, stamp_ns=round(1e9 * TICK * tick))))
+    playback = Playback(STRONG, AT, period_s=0.001)
     written = play(playback, jumped, tick * TICK + 0.02, 0.001)
     assert np.abs(np.diff(written.velocity, axis=0) / 0.001).max() < 6.0
     assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(COMMANDED.jerk)

@@ -38,7 +38,7 @@ def test_a_leak_is_told_from_noise() -> None:
 @pytest.mark.timed
 def test_soak_reports_each_process() -> None:
     report = soak.run(0.12, 500, **QUIET)
-    assert set(report["processes"]) == {"daemon", "scribe", "skill worker"}
+    assert set(report["processes"]) == {"daemon", "fork server", "scribe", "skill worker"}
     assert report["lost"] == report["restarts"] == 0
     assert "MB/h" in soak.text(report)
 

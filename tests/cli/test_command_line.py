@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import signal
@@ -9,11 +10,12 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from service.cli.main import GROUPS
+from service.cli.main import GROUPS, parser
 from service.launch import free_port
 from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
@@ -120,7 +122,8 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "needed", ("via-points", "add")),
         (2, "", ("via-points", "add", "here", *NOBODY)),
         (2, "", ("view", "live", "--time", "-1", *NOBODY)),
-        (2, "invalid choice", ("serve", "--arm", "left")),
+        *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
+        (1, "50 Hz is too slow: commands would come every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
         (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
     ],
@@ -194,6 +197,36 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
             assert process.wait(30) == code
 
 
+# --- help -----------------------------------------------------------------------------------------
+
+FRAGMENTARY = ("demo", "serve", "follow", "bench", "play", "record", "learn")  # not yet rewritten
+FRAGMENT = re.compile(r"(of|to|for|by|in|with|how|what|where|that|from|within) ")
+
+
+def options(sub: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """The options and arguments of a command and of the commands below it."""
+    for action in sub._actions:  # noqa: SLF001  (argparse has no other way)
+        if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
+            for below in action.choices.values():
+                yield from options(below)
+        else:
+            yield action
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {"sim", *FRAGMENTARY}))
+def test_the_help_of_an_option_says_what_it_is_without_the_name_before_it(command: str) -> None:
+    (commands,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))  # noqa: SLF001
+    assert [one.help for one in options(commands.choices[command]) if FRAGMENT.match(one.help or "")] == []
+
+
+def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
+    text = " ".join(told("view", "--help").stdout.split())
+    assert "FILE|live [FILE|live ...]" in text
+    assert "(default: the last moment in mode follow)" in text
+    assert "thirdhand view thirdhand-demo/*.rrd --screenshot scene.png" in text
+    assert "thirdhand view live --web" in text
+
+
 # --- completion -----------------------------------------------------------------------------------
 
 BASH = """
@@ -213,7 +246,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
         ("thirdhand via-points l", {"list"}),
         ("thirdhand status --wat", {"--watch"}),
         ("thirdhand record --f", {"--folder"}),
-        ("thirdhand serve --arm a", {"assumed"}),
+        ("thirdhand serve --joints a", {"assumed"}),
     ],
 )
 def test_a_shell_completes_commands_options_and_choices(words: str, found: set[str], tmp_path: Path) -> None:
@@ -223,7 +256,42 @@ def test_a_shell_completes_commands_options_and_choices(words: str, found: set[s
     assert done.returncode == 0, done.stderr
     script.write_text(done.stdout)
     program = BASH.format(words=words, last=len(words.split()) - 1)
+    written = tmp_path / "missing" / "folders" / "thirdhand"
+    assert told("completion", "bash", "--output", str(written)).returncode == 0
+    assert written.read_text() == script.read_text().removesuffix("\n")
     asked = subprocess.run(
         ["bash", "-c", program, "bash", str(script)], capture_output=True, text=True, timeout=30, check=False
     )
     assert set(asked.stdout.split()) == found, asked.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["certificates /dev/full", "demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
+)
+def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> None:
+    done = told(*command.split())
+    assert done.returncode == 1
+    assert re.search(r"/dev/full: (File exists|Not a directory); a folder needed", done.stderr)
+    assert "rrno" not in done.stderr
+
+
+def test_that_the_output_is_full_is_said_in_words() -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "service", "completion", "bash"]
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=ROOT
+        )
+    assert done.returncode == 1
+    assert done.stderr == "thirdhand completion: No space left on device; room on that disk needed\n"
+
+
+def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = told("record", "take", "--folder", str(tmp_path), "--listen", endpoint)
+    assert done.returncode == 1
+    assert f"cannot listen on {endpoint}: Address already in use; another program has it; another port" in done.stderr
+    assert "os error" not in done.stderr

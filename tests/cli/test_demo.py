@@ -5,6 +5,7 @@ glass and holds it over the board.
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from service.cli.demo import text
+from service.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
 
@@ -51,6 +53,23 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
             left -= {next(decoded).channel.topic}
 
 
+def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
+    """Its URDF lies beside it, and both are named by a relative path."""
+    (tmp_path / "my").mkdir()
+    for name in ("ur5.toml", "ur5.urdf"):
+        (tmp_path / "my" / name).write_bytes(WAM.with_name(name).read_bytes())
+    command = [sys.executable, "-m", "service", "demo", "--json", "--arm", "my/ur5.toml", "--rate", "1000"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command += ["--output", "out"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=110, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert report["success"]
+    assert report["rate_hz"] == pytest.approx(1000, rel=0.05)
+
+
 def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")
     done = thirdhand("demo", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
@@ -67,11 +86,7 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     while "taught while it runs" not in (tmp_path / "said").read_text():
         assert time.monotonic() < end
         time.sleep(0.1)
-    (scribe,) = (
-        process
-        for process in psutil.Process(demo.pid).children(recursive=True)
-        if "service.recording.process" in process.cmdline()
-    )
+    (scribe,) = (process for process in psutil.Process(demo.pid).children(recursive=True) if process.name() == "scribe")
     scribe.kill()
     out, _ = demo.communicate(timeout=100)
     assert demo.returncode == 1

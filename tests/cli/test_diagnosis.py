@@ -159,6 +159,11 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
             ("7 ticks lost", "full"),
         ),
         ({"scribe": {"state": "recording", "free_mb": 300.0}}, "disk", ("0.3 GB free", "more than 2 GB", "keep_mb")),
+        (
+            {"scribe": {"state": "recording", "free_mb": 2400.0, "mb_per_hour": 3600.0, "keep_mb_left": 9000.0}},
+            "disk",
+            ("2.4 GB free", "3.6 GB an hour written: full in 0.7 h", "1 h", "rerun_mb_per_hour"),
+        ),
     ],
 )
 def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
@@ -168,6 +173,24 @@ def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     assert lines
     assert all(word in "\n".join(lines) for word in words), lines
     assert all(" | wanted: " in line and " | what to do: " in line and "\n" not in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("scribe", "told"),
+    [
+        ({"mb_per_hour": 1500.0, "keep_mb_left": None}, "1.5 GB an hour written: full in 33.3 h"),
+        ({"mb_per_hour": 200.0, "keep_mb_left": None}, "0.2 GB an hour written: full in 10 days"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "in 0.0 h the oldest recordings begin to be removed"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 3000.0}, "in 2.0 h the oldest recordings begin to be removed"),
+        ({"mb_per_hour": None, "keep_mb_left": None}, "50.0 GB free where it records |"),
+        ({}, "50.0 GB free where it records |"),  # of an older daemon
+    ],
+)
+def test_the_doctor_tells_how_long_the_disk_lasts(scribe: dict[str, Any], told: str) -> None:
+    recording = {"state": "recording", "free_mb": 50_000.0, **scribe}
+    (line,) = [one for one in diagnosed(scribe=recording) if one.what == "disk"]
+    assert line.level == "ok"
+    assert told in line.line() + " |"
 
 
 def test_what_need_not_be_mended_is_a_note() -> None:
@@ -193,6 +216,9 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert "±" in line(HEALTHY)
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
+    why = {"cause": "ahead", "refused": "stamped 2 s after the newest accepted one, which was held up for 2 s"}
+    named = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"ahead": 3}, **why))
+    assert rows(named)["rejected"] == f"right hand 3 ahead (newest as ahead: {why['refused']})"
 
 
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
@@ -233,14 +259,32 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
     assert "what to do: see what; if it has not moved since commands began: are the drives on?" in alone[0]
 
 
-@pytest.mark.parametrize("reason", ["arm_silent", "arm_error"])
-@pytest.mark.parametrize("late", [{"missed": 90}, {"lateness_us": Percentiles(1, 90, 60_000)}])
-def test_a_fault_of_the_arm_while_ticks_are_missed_is_told_as_the_machines(reason: str, late: dict[str, Any]) -> None:
-    told = [line for line in wrongs(diagnosed(mode="fault", reason=reason, **late)) if "mode" in line]
-    assert "this machine or the bench could not keep time" in told[0]
-    assert "thirdhand bench" in told[0]
-    other = wrongs(diagnosed(mode="fault", reason=reason))
-    assert not any("keep time" in line for line in other)
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"mode": "fault", "reason": "arm_silent"},
+        {"mode": "fault", "reason": "arm_error"},
+        {"sources": source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)},
+        {"sources": source("left", clock_ms=400.0)},
+        {"sources": source("right", rejected={"ahead": 90}, cause="ahead", refused="stamped 0.2 s after the newest")},
+    ],
+    ids=["silent", "error", "nothing comes", "clock", "ahead"],
+)
+def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(changed: dict[str, Any]) -> None:
+    words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
+    first, *others = wrongs(diagnosed(busy=words, **changed))
+    assert first.startswith(f"wrong  machine            too busy: {words}")
+    assert "thirdhand bench measures it" in first
+    assert others == wrongs(diagnosed(**changed))
+
+
+def test_a_machine_that_is_busy_while_nothing_is_wrong_is_a_note() -> None:
+    assert [finding.what for finding in diagnosed(busy="the loop was up to 60 ms late") if finding.level != "ok"] == [
+        "machine"
+    ]
+    assert rows(msgspec.structs.replace(HEALTHY, busy="the loop was up to 60 ms late"))["machine"].startswith(
+        "too busy"
+    )
 
 
 def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:
@@ -303,3 +347,13 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: it needs the left hand"
     assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: it needs both hands"
+
+
+def test_a_rejected_sample_is_followed_by_what_to_do_about_that_one() -> None:
+    told = {"refused": "stamped 2 s after the newest accepted one, which was held up for 2 s on its way"}
+    advice = "see what holds samples up"
+    seen = source("left", rejected={"ahead": 90, "older": 4}, cause="ahead", advice=advice, **told)
+    (found,) = [line for line in wrongs(diagnosed(sources=seen)) if "rejected as ahead" in line]
+    assert told["refused"] in found
+    assert advice in found
+    assert "clock" not in found

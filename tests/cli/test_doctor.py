@@ -40,7 +40,7 @@ fault_error_rad = 0.5
 frame = "optitrack"
 stale_ms = 500
 """
-OF_THE_MACHINE = {"loop", "real time", "memory", "disk"}
+OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 def template() -> ModuleType:
@@ -56,11 +56,9 @@ def template() -> ModuleType:
 @contextlib.contextmanager
 def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
     """The template's fake arm, driven on a session of its own."""
-    settings, stop = Settings(), threading.Event()
-    arm = own_arm.FakeArm(settings)
+    stop, arm = threading.Event(), own_arm.FakeArm(Settings())
     with open_session(connect=[endpoint]) as session:
-        options = {"tick_s": settings.period_s, "stop": stop}
-        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs=options)
+        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop})
         driver.start()
         try:
             yield arm
@@ -152,6 +150,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "set [hands] frame a")
             assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
             assert set(told["hands_m"]) == {"left", "right"}
+            time.sleep(1.5)  # for a line of the watch
             tracker.left = LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
             daemon.process.kill()

@@ -59,6 +59,32 @@ def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
     return process
 
 
+INTERRUPTED_AT_AN_IMPORT = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "MODULE":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from service.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "module", ["service.interrupt", "contextlib", "service.cli", "service.client", "service.cli.status"]
+)
+def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: str) -> None:
+    """At imports from the first line of the program on; Python's own come before that."""
+    code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace("MODULE", module)
+    command = [sys.executable, "-S", "-c", code, "status", "--connect", "tcp/127.0.0.1:1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT)
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (130, -signal.SIGINT)
+
+
 @pytest.mark.parametrize(
     ("name", "delay_s"),
     [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],

@@ -8,8 +8,10 @@ import contextlib
 import http.client
 import json
 import os
+import re
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -20,11 +22,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 
 from service import palette
-from service.cli.live_page import A_PICTURE, PATIENCE_S, SAMPLES, STREAM
+from service.cli.live_page import A_PICTURE, PATIENCE_S, SAMPLES, STREAM, UNKNOWN
 from service.cli.view import FRESH_S, screenshot
 from service.launch import free_port
 from support import chromium
@@ -65,10 +68,23 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
             yield Page(daemon, url)
 
 
+FROZEN = """
+import sys
+from service.__main__ import main
+from service.cli import live_page
+live_page.FROZEN_S = 2.0
+sys.exit(main())
+"""
+
+
 @contextlib.contextmanager
-def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
-    """The URL of a page that `thirdhand view live --web` serves."""
-    command = [sys.executable, "-m", "service", "view", "live", "--web", address, "--connect", daemon.endpoint]
+def server_of(
+    daemon: Daemon, address: str = "127.0.0.1:0", *, program: tuple[str, ...] = ("-m", "service")
+) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """The URL and the process of a page that `thirdhand view live --web` serves; it must end
+    without a word on standard error.
+    """
+    command = [sys.executable, *program, "view", "live", "--web", address, "--connect", daemon.endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
         clock = threading.Timer(TIMEOUT_S, server.kill)
         clock.start()
@@ -78,12 +94,20 @@ def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
             assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
             url = server.stdout.readline().strip()
             clock.cancel()
-            yield url
+            yield url, server
             server.terminate()
             assert server.wait(TIMEOUT_S) == 0
+            assert server.stderr.read() == ""
         finally:
             clock.cancel()
             server.kill()
+
+
+@contextlib.contextmanager
+def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
+    """The URL of such a page."""
+    with server_of(daemon, address) as (url, _):
+        yield url
 
 
 def token_in(text: str) -> str:
@@ -96,14 +120,21 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert code == 200
     assert page.ask("POST", "/hold")[0] == 403
     assert page.ask("POST", "/hold", X_Thirdhand_Token="guessed")[0] == 403
+    assert page.ask("POST", "/hold", X_Thirdhand_Token="gü\xff")[0] == 403
     token = token_in(text)
     assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin="http://elsewhere.example")[0] == 403
-    assert page.ask("GET", "/", Host="elsewhere.example")[0] == 403  # a name that was made to point here
-    assert page.ask("POST", "/shutdown", X_Thirdhand_Token=token)[0] == 404
+    for origin in ("null", "http://[", f"http://{page.host}.example"):
+        assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin=origin)[0] == 403
+    for host in ("elsewhere.example", '"@127.0.0.1', "[", ""):  # the first is a name that was made to point here
+        assert page.ask("GET", "/", Host=host)[0] == 403
+    for method, path in (("POST", "/shutdown"), ("GET", "/favicon.ico"), ("GET", "/hold"), ("DELETE", "/status")):
+        expected = 405 if path in ("/hold", "/status") else 404
+        assert page.ask(method, path, X_Thirdhand_Token=token) == (expected, UNKNOWN)
     assert page.ask("POST", "/hold", bytes(10_000), X_Thirdhand_Token=token)[0] == 413
     assert page.daemon.client.ask("status")["mode"] == "follow"
     code, text = page.ask("POST", "/hold", X_Thirdhand_Token=token)
-    assert (code, text.split(" ")[0]) == (200, "hold")
+    assert code == 200
+    assert re.fullmatch(r"hold carried out at tick \d+; mode then: hold \(operator\)", text)
     held = page.daemon.until(lambda status: status["mode"] == "hold")
     assert (held["reason"], held["remedy"]) == ("operator", "thirdhand resume")
     told = json.loads(page.ask("GET", "/status")[1])
@@ -112,12 +143,54 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     page.daemon.until(lambda status: status["mode"] == "follow")
 
 
+def test_clients_that_are_slow_or_leave_cost_no_thread_and_no_traceback(page: Page) -> None:
+    stream = f"POST {STREAM} HTTP/1.1\r\nHost: {{}}\r\nContent-Type: application/grpc-web+proto\r\n"
+    stream += "Content-Length: 5\r\n\r\n\0\0\0\0\0"
+    with server_of(page.daemon, program=("-c", FROZEN)) as (url, process), contextlib.ExitStack() as closing:
+        slow, parts, server = Page(page.daemon, url), urlsplit(url), psutil.Process(process.pid)
+
+        def client(sends: str, *, reads: int = 0) -> socket.socket:
+            connection = closing.enter_context(socket.create_connection((parts.hostname, parts.port), TIMEOUT_S))
+            connection.sendall(sends.format(parts.netloc).encode())
+            if reads:
+                assert connection.recv(reads)
+            return connection
+
+        assert slow.ask("GET", "/status")[0] == 200
+        before = server.num_threads()
+        unfinished = [client("GET / HTTP/1.1\r\nHost: {}\r\n") for _ in range(160)]
+        file = "GET /viewer/re_viewer_bg.wasm HTTP/1.1\r\nHost: {}\r\n\r\n"
+        unread = [*(client(stream) for _ in range(30)), *(client(file) for _ in range(10))]
+        for sends in (stream, file):
+            for _ in range(20):
+                leaving = client(sends, reads=100)
+                leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # by a reset
+                leaving.close()
+        assert slow.ask("GET", "/status")[0] == 200
+        assert server.num_threads() <= before + 2
+        assert all(connection.recv(100) == b"" for connection in unfinished)
+        with contextlib.suppress(ConnectionResetError):
+            while rest := unread[-1].recv(1 << 20):
+                assert not rest.endswith(b"0\r\n\r\n")  # the file is cut off before its end
+
+
 def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere(page: Page) -> None:
     code, text = page.ask("GET", "/viewer/?0.5")
     assert code == 200
     assert "re_viewer.js" in text
     assert "https:" not in text
     assert page.ask("GET", "/viewer/re_viewer.js")[0] == 200
+    for path in ("/", "/viewer/", "/nowhere"):  # whatever a script in them asks for, a browser fetches nothing else
+        connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
+        connection.request("GET", path)
+        policy = connection.getresponse().headers["Content-Security-Policy"].split("; ")
+        assert policy[0] == "default-src 'none'"
+        hosts = {source for part in policy for source in part.split(" ")[1:] if ":" in source and "//" in source}
+        assert hosts <= {
+            f"http://localhost:{page.host.split(':')[1]}",
+            f"http://localhost:{page.host.split(':')[1]}/viewer/",
+        }
+        connection.close()
     connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
     connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
     answer = connection.getresponse()
@@ -191,11 +264,24 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
             tab.ask(f"document.getElementById('{name}').click()")
             return tab.until(f"document.getElementById('mode').textContent == '{until}'")
 
+        def grey() -> list[str]:
+            found: list[str] = json.loads(
+                tab.ask("JSON.stringify([...document.querySelectorAll('button:disabled')].map(one => one.id))")
+            )
+            return found
+
         assert tab.until("document.getElementById('mode').className == 'follow'")
+        assert grey() == ["resume", "reset"]
+        tab.picture(tmp_path / "follow.png")
         click("hold", until="hold: operator")
-        assert tab.until("document.getElementById('answer').textContent").startswith("hold in force since tick ")
+        tab.until("document.getElementById('answer').textContent != 'hold ...'")
+        assert tab.ask("document.getElementById('answer').textContent").startswith("hold carried out at tick ")
+        assert grey() == ["reset"]
+        tab.picture(tmp_path / "hold.png")
         assert "What to do: press Resume" in tab.until("document.getElementById('why').textContent")
         click("resume", until="follow")
+        assert grey() == ["resume", "reset"]
+        tab.until("document.getElementById('answer').textContent == ''")  # the answer does not stay
         assert "/viewer/" in tab.ask("document.querySelector('iframe').src")
         tab.until("/^picture [0-9.]+ s old/.test(document.getElementById('picture').textContent)")
         tab.picture(tmp_path / "page.png")
@@ -226,6 +312,7 @@ def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_s
             tab.picture(tmp_path / "phone.png")
             first.close()
             assert tab.until("document.getElementById('mode').textContent == \"this page's server has ended\"")
+            assert tab.ask("document.querySelectorAll('button:enabled').length") == 0
             with served(page.daemon, address):
                 tab.until(f"token != '{tab.ask('token')}' && document.getElementById('mode').className == 'follow'")
                 tab.ask("document.getElementById('hold').click()")

@@ -55,7 +55,9 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     columns = np.linalg.norm(tasks[:3], axis=0)
     assert total == pytest.approx(columns @ (np.abs(dq) + ddq**2 / (2 * jerk)), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
-    error, fast = measured_error(parameters(measured=measured, measured_velocities=dq), here)
+    error, fast = measured_error(
+        parameters(measured=measured, measured_velocities=dq), here, parameters(per_rad=np.ones(len(dq)))
+    )
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
 

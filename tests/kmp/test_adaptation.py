@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kmp import KMP, Gaussians, ViaPointMissed
+from kmp import KMP, Gaussians, ViaPointMissed, named_arrays
 from support.primitives import database, kernel, properties, same_bits, seeds, skill, via
 
 
@@ -27,7 +27,7 @@ def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
     primitive = skill()
     inputs = np.stack([primitive.inputs[7] + 0.01, np.full(4, 9.0)])
     adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
-    assert list(adapted.changes.replaced) == [7]
+    assert list(adapted.inner.changes.replaced) == [7]
     assert len(adapted.inputs) == 31
     np.testing.assert_array_equal(adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs]))
     np.testing.assert_array_equal(adapted.via_inputs, inputs)
@@ -38,15 +38,15 @@ def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
 
 def test_only_the_nearest_of_the_points_within_the_tolerance_is_replaced():
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
-    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2).changes.replaced) == [0]
+    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2).inner.changes.replaced) == [0]
 
 
 def test_the_tolerance_itself_is_not_near_enough():
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
     point = Gaussians([[5.0]], [[[1e-6]]])
-    assert len(primitive.adapt([[0.25]], point, tolerance=0.25).changes.replaced) == 0
-    assert list(primitive.adapt([[0.25]], point, tolerance=0.26).changes.replaced) == [0]
-    assert list(primitive.adapt([[0.5]], point, tolerance=1).changes.replaced) == [0, 1]
+    assert len(primitive.adapt([[0.25]], point, tolerance=0.25).inner.changes.replaced) == 0
+    assert list(primitive.adapt([[0.25]], point, tolerance=0.26).inner.changes.replaced) == [0]
+    assert list(primitive.adapt([[0.5]], point, tolerance=1).inner.changes.replaced) == [0, 1]
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
@@ -63,7 +63,7 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
     for n in range(5):
         singly = singly.adapt(inputs[n : n + 1], points.take(slice(n, n + 1)), tolerance=tolerance)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
-    assert np.array_equal(together.changes.replaced, shuffled.changes.replaced)
+    assert np.array_equal(together.inner.changes.replaced, shuffled.inner.changes.replaced)
     np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
     found, wanted = shuffled.predict(queries).covariance, together.predict(queries).covariance
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
@@ -93,7 +93,7 @@ def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation)
     assert len(adapted.inputs) == 110
     queries = np.concatenate([inputs[:5], np.full((1, 4), -50.0)])
     before = primitive.predict(queries).covariance
-    for again in (adapted, KMP.from_arrays(adapted.to_arrays()), adapted.refitted(reference)):
+    for again in (adapted, named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted.refitted(reference)):
         np.testing.assert_allclose(again.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(again.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
 

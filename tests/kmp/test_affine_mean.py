@@ -5,7 +5,16 @@ import pickle
 import numpy as np
 import pytest
 
-from kmp import KMP, AffineMean, GaussianKernel, Gaussians, LinearConstraints, PeriodicKernel, VelocityKernel
+from kmp import (
+    KMP,
+    AffineMean,
+    GaussianKernel,
+    Gaussians,
+    LinearConstraints,
+    PeriodicKernel,
+    VelocityKernel,
+    named_arrays,
+)
 from kmp.functionals import Functionals
 from kmp.solution import mean_of
 
@@ -64,7 +73,7 @@ def test_it_is_as_if_what_is_left_had_been_learned(kernel, representation, how):
         v, a = np.random.default_rng(2).normal(size=(2, len(s)))
         for motion, left in (
             (one.predict_motion(s, v, a), rest.predict_motion(s, v, a)),  # compiled, where Numba is
-            (one.query.motion(s, v, a, covariance=True), rest.query.motion(s, v, a, covariance=True)),
+            (one.inner.query.motion(s, v, a, covariance=True), rest.inner.query.motion(s, v, a, covariance=True)),
         ):
             np.testing.assert_allclose(motion.mean, left.mean + prior.matrix @ s + prior.offset, **close)
             np.testing.assert_allclose(motion.velocity, left.velocity + prior.matrix @ v, **close)
@@ -76,8 +85,8 @@ def test_it_is_as_if_what_is_left_had_been_learned(kernel, representation, how):
         )
         np.testing.assert_allclose(one.jacobian(s), rest.jacobian(s) + prior.matrix, **close)
     slopes = Functionals(queries, np.ones_like(queries))
-    expected = mean_of(rest.solution, slopes) + slopes.along @ prior.matrix.T
-    np.testing.assert_allclose(mean_of(one.solution, slopes), expected, **close)
+    expected = mean_of(rest.inner.solution, slopes) + slopes.along @ prior.matrix.T
+    np.testing.assert_allclose(mean_of(one.inner.solution, slopes), expected, **close)
 
 
 def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
@@ -96,7 +105,11 @@ def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
 def test_it_is_stored_pickled_and_refitted_with_the_primitive(representation):
     prior, one, _ = both("one length", representation, "adapted")
     queries = one.inputs[:7] + 0.1
-    for other in (KMP.from_arrays(one.to_arrays()), pickle.loads(pickle.dumps(one)), one.refitted(one.base.reference)):
+    for other in (
+        named_arrays.from_arrays(named_arrays.to_arrays(one)),
+        pickle.loads(pickle.dumps(one)),
+        one.refitted(one.base.reference),
+    ):
         assert np.array_equal(other.mean(queries), one.mean(queries))
         assert np.array_equal(other.prior_mean.matrix, prior.matrix)
         assert np.array_equal(other.prior_mean.offset, prior.offset)

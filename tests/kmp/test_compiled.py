@@ -57,7 +57,7 @@ out = np.zeros(1000)
 compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
 s = random.normal(size=(37, 3))
-query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).query
+query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
 from kmp.compiled_query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))
@@ -75,6 +75,26 @@ def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
     )
     assert len(native) > 1000
     assert native == generic
+
+
+FIRST = """
+import numpy as np
+from kmp import KMP, GaussianKernel, Gaussians
+skill = KMP.fit([[0.0], [1.0]], Gaussians.of([[0.0], [1.0]], deviation=0.1), kernel=GaussianKernel(1.0), lambda_mean=1)
+print(skill.mean([[0.5]]), skill.jacobian([0.5]))
+"""
+
+
+def test_the_first_compilation_is_announced_once_and_what_is_cached_is_not(tmp_path):
+    command = [sys.executable, "-c", FIRST]
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True) for _ in range(2)
+    )
+    assert first.stderr.splitlines() == [
+        "kmp compiles its loops for this machine: some seconds, once; later runs load them from its cache."
+    ]
+    assert (second.stdout, second.stderr) == (first.stdout, "")
 
 
 def test_exponentials_are_right_to_a_unit_in_the_last_place():

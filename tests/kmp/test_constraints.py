@@ -22,6 +22,12 @@ def base(representation="dense", **options):
     return KMP.fit(T, REFERENCE, representation=representation, **options)
 
 
+def many():
+    inputs = np.linspace(0, 2, 3001)[:, None]
+    reference = Gaussians.of(np.hstack([np.sin(3 * inputs), np.cos(2 * inputs)]), deviation=0.03)
+    return KMP.fit(inputs, reference, kernel=GaussianKernel(5.0), lambda_mean=1.0)
+
+
 def violation(skill, constraints=LOW):
     slack = (skill.mean(constraints.inputs) * constraints.normals).sum(axis=1) - constraints.bounds
     return max(-slack.min(), 0.0)
@@ -123,6 +129,16 @@ def test_files_and_pickles_give_it_back_bit_for_bit(tmp_path, adapted):
         assert violation(again.adapt([[0.1]], Gaussians([[0.3, 0.9]], [1e-4 * np.eye(2)]), tolerance=0)) < 1e-9
 
 
+def test_a_low_rank_is_solved_anew_for_constraints():
+    via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
+    dense, low = (base(one).adapt(*via, tolerance=0) for one in ("dense", "low_rank"))
+    assert low.representation == "low_rank"
+    constrained = low.constrained(LOW)
+    assert violation(constrained) < 1e-9
+    np.testing.assert_allclose(constrained.mean(T), dense.constrained(LOW).mean(T), atol=1e-9)
+    assert np.array_equal(constrained.via_inputs, low.via_inputs)
+
+
 @pytest.mark.parametrize(
     ("call", "says"),
     [
@@ -131,7 +147,7 @@ def test_files_and_pickles_give_it_back_bit_for_bit(tmp_path, adapted):
             lambda: base().constrained(LinearConstraints([[1.0], [1.0]], [[0, 1], [0, -1]], [0.5, 0.5])),
             r"The constraints cannot be met together: \d is missed by",
         ),
-        (lambda: base("low_rank").constrained(LOW), 'representation "low_rank" given, "dense" needed'),
+        (lambda: many().constrained(LOW), "low rank primitive of 6002 numbers given, at most 6000 or the dense"),
         (lambda: base().constrained(LinearConstraints([[1.0]], [[1.0]], [0.0])), "1 outputs given, 2 needed"),
         (lambda: base().constrained(LinearConstraints([[1.0, 2.0]], [[1.0, 0]], [0.0])), "2 inputs given, 1 needed"),
         (lambda: LinearConstraints([[1.0]], [[0.0, 0.0]], [0.0]), r"normals\[0\] is 0, and must have a direction"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import kmp
-from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed
+from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed, named_arrays
 from kmp.functionals import Functionals
 from kmp.kernel import between, variances
 
@@ -83,7 +83,7 @@ def test_one_point_with_its_jacobian_says_what_thirteen_points_say():
 
 def naive(one, queries):
     """Equations (8) and (9) and the covariance of IJRR 2019 for functionals, as they stand."""
-    known, n = one.solution.database.functionals, len(one.inputs)
+    known, n = one.inner.solution.database.functionals, len(one.inputs)
     sigma = np.zeros((n, 3, n, 3))
     sigma[np.arange(n), :, np.arange(n)] = one.reference.covariance
     m = np.kron(between(one.kernel, known, known), np.eye(3)) + one.lambda_mean * sigma.reshape(3 * n, 3 * n)
@@ -127,7 +127,7 @@ def test_the_motion_of_one_query_is_that_of_finite_differences_compiled_or_not(r
     one, h = taught(base(representation, kernel)), 1e-4
     s, v, a = PLACE[0] + 0.03, *RANDOM.normal(size=(2, 4))
     behind, here, ahead = one.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
-    found, plain = one.predict_motion(s, v, a), one.query.motion(s, v, a, covariance=True)
+    found, plain = one.predict_motion(s, v, a), one.inner.query.motion(s, v, a, covariance=True)
     for motion in (found, plain):
         np.testing.assert_allclose(motion.mean, here, atol=1e-9)
         np.testing.assert_allclose(motion.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
@@ -174,7 +174,7 @@ def test_a_database_may_hold_derivatives_from_the_start(representation):
     near = S[:10] + 0.2
     a, b = (np.sqrt(((found.mean(near) - TRUTH(near)) ** 2).mean()) for found in (values, one))
     assert b < 0.5 * a
-    np.testing.assert_allclose(one.mean(near), KMP.from_arrays(one.to_arrays()).mean(near), atol=0)
+    np.testing.assert_allclose(one.mean(near), named_arrays.from_arrays(named_arrays.to_arrays(one)).mean(near), atol=0)
     again = one.refitted(one.reference)
     assert np.array_equal(again.mean(near), one.mean(near))
 

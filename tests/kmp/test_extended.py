@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from kmp import KMP, AffineMean, GaussianKernel, Gaussians, LinearConstraints, PeriodicKernel, VelocityKernel
+from kmp import (
+    KMP,
+    AffineMean,
+    GaussianKernel,
+    Gaussians,
+    LinearConstraints,
+    PeriodicKernel,
+    VelocityKernel,
+    named_arrays,
+)
 
 RANDOM = np.random.default_rng(0)
 
@@ -51,13 +60,13 @@ def test_it_is_the_fit_of_all_points_and_keeps_its_via_points(case):
     via = inputs[3:4] + 1e-3, place
     adapted = first.adapt(*via, tolerance=0.01).extended(inputs[40:], reference[40:])
     wanted = whole.adapt(*via, tolerance=0.01)
-    assert np.array_equal(adapted.changes.replaced, wanted.changes.replaced)
+    assert np.array_equal(adapted.inner.changes.replaced, wanted.inner.changes.replaced)
     assert_same(adapted, wanted, queries)
     assert_same(
         adapted.adapt(queries[:1], place, tolerance=0.0), wanted.adapt(queries[:1], place, tolerance=0.0), queries
     )
     assert_same(adapted.base, whole, queries)
-    assert_same(KMP.from_arrays(adapted.to_arrays()), adapted, queries)
+    assert_same(named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted, queries)
 
 
 def test_derivatives_and_constraints_go_with_it():

@@ -76,7 +76,7 @@ def test_a_pickle_leaves_out_the_factors_and_the_copy_makes_them_again(represent
     one = primitive(representation)
     again = pickle.loads(pickle.dumps(one))
     dropped = {"mean_factor", "covariance_factor"}
-    assert dropped & vars(one.base.solution).keys()
-    assert not dropped & vars(again.base.solution).keys()
+    assert dropped & vars(one.base.inner.solution).keys()
+    assert not dropped & vars(again.base.inner.solution).keys()
     more = ([[0.7]], REFERENCE.take(slice(3, 4)))
     assert np.array_equal(again.adapt(*more, tolerance=0.0).mean(T), one.adapt(*more, tolerance=0.0).mean(T))

@@ -98,7 +98,7 @@ def test_a_rhythmic_skill_has_no_seam(representation):
     kernel = PeriodicKernel(1.0, 2 * np.pi)
     one = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
     via = one.adapt([[2 * np.pi - 0.02]], Gaussians([[0.2, 0.9]], [1e-8 * np.eye(2)]), tolerance=0.06)
-    assert list(via.changes.replaced) == [0]  # the nearest round the circle
+    assert list(via.inner.changes.replaced) == [0]  # the nearest round the circle
     a, b = np.zeros((1, 1)), np.full((1, 1), 2 * np.pi)
     for skill in (one, via):
         assert np.array_equal(skill.mean(a), skill.mean(b))

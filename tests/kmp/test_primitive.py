@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel, named_arrays
 from support.primitives import database, kernel, naive, properties, same_bits, seeds, skill, via
 
 
@@ -121,9 +121,9 @@ def test_refitted_to_its_own_reference_it_is_the_same_bit_for_bit(count):
 def test_saved_arrays_give_the_primitive_back_bit_for_bit(tmp_path, lambda_covariance, count):
     base = skill(lambda_covariance=lambda_covariance, prior_mean=[0.1, 0.2, 0.3])
     primitive = base.adapt(*via(1, count), tolerance=1.5)
-    np.savez(tmp_path / "skill.npz", note=np.array("left alone"), **primitive.to_arrays())
+    np.savez(tmp_path / "skill.npz", note=np.array("left alone"), **named_arrays.to_arrays(primitive))
     with np.load(tmp_path / "skill.npz") as arrays:
-        again = KMP.from_arrays(arrays)
+        again = named_arrays.from_arrays(arrays)
     queries = np.random.default_rng(2).normal(size=(5, 4))
     assert same_bits(primitive, again, queries)
     assert same_bits(primitive.base, again.base, queries)
@@ -132,8 +132,8 @@ def test_saved_arrays_give_the_primitive_back_bit_for_bit(tmp_path, lambda_covar
 
 
 def test_saved_weights_are_used_and_not_fitted_again():
-    saved = skill().adapt(*via(0, 2), tolerance=0).to_arrays()
-    again = KMP.from_arrays(saved | {"base_weights": np.ones((30, 3)), "weights": np.full((32, 3), 2.0)})
+    saved = named_arrays.to_arrays(skill().adapt(*via(0, 2), tolerance=0))
+    again = named_arrays.from_arrays(saved | {"base_weights": np.ones((30, 3)), "weights": np.full((32, 3), 2.0)})
     np.testing.assert_array_equal(again.base.weights, np.ones((30, 3)))
     np.testing.assert_array_equal(again.weights, np.full((32, 3), 2.0))
 
@@ -147,11 +147,11 @@ def test_a_pickled_primitive_is_the_same_bit_for_bit_and_read_only():
         arrays = [
             one.inputs,
             one.weights,
-            one.changes.replaced,
+            one.inner.changes.replaced,
             one.prior_mean,
             one.reference.mean,
             one.via_inputs,
-            *one.solution.inverse_factor.bands,
+            *one.inner.solution.inverse_factor.bands,
         ]
         assert not any(array.flags.writeable for array in arrays)
 
@@ -213,6 +213,22 @@ def test_without_variability_all_uncertainty_is_distance():
     np.testing.assert_allclose(found, of_exact, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_with_rates_too_all_uncertainty_is_distance_without_variability(count, representation):
+    t, queries = np.linspace(0, 2, count)[:, None], np.linspace(-0.5, 2.5, 31)[:, None]
+    mean = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t)])
+    options = {"kernel": VelocityKernel(20.0), "lambda_mean": 2.0, "representation": representation}
+
+    def fit(variance):
+        return KMP.fit(t, Gaussians(mean, np.tile(variance * np.eye(2), (count, 1, 1))), **options)
+
+    found, of_exact = fit(0.01).uncertainty(queries), fit(1e-9).predict(queries).covariance
+    np.testing.assert_allclose(found.distance, of_exact, rtol=1e-3, atol=1e-6 * count)
+    total = fit(0.01).predict(queries).covariance
+    np.testing.assert_allclose(found.variability + found.distance, total, rtol=1e-6, atol=1e-6)
+
+
 def test_threads_may_share_a_primitive():
     primitive, queries = skill(count=60), np.random.default_rng(2).normal(size=(64, 1, 4))
     with ThreadPoolExecutor(4) as pool:
@@ -223,7 +239,7 @@ def test_threads_may_share_a_primitive():
 
 INPUTS, REFERENCE = database(count=3)
 TWINS = Gaussians(np.zeros((2, 1)), np.full((2, 1, 1), 1e-20))
-ARRAYS = skill().adapt(*via(0, 2), tolerance=1.5).to_arrays()
+ARRAYS = named_arrays.to_arrays(skill().adapt(*via(0, 2), tolerance=1.5))
 
 
 def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
@@ -263,16 +279,16 @@ def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
             "1 normals over 2 outputs given for 1 inputs; 1 over 3 needed",
         ),
         (
-            lambda: KMP.from_arrays({"ell": np.array(1.0)}),
+            lambda: named_arrays.from_arrays({"ell": np.array(1.0)}),
             "The primitive's arrays lack base_inputs, base_mean, .* Needed are",
         ),
         (
-            lambda: KMP.from_arrays(ARRAYS | {"lambda_mean": np.ones(2)}),
+            lambda: named_arrays.from_arrays(ARRAYS | {"lambda_mean": np.ones(2)}),
             r"lambda_mean: shape \(2,\) given, \(\) needed",
         ),
-        (lambda: KMP.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
+        (lambda: named_arrays.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
         (
-            lambda: KMP.from_arrays(ARRAYS | {"replaced": np.array([99])}),
+            lambda: named_arrays.from_arrays(ARRAYS | {"replaced": np.array([99])}),
             r"replaced: \[99\] given, ascending indices of the 30 base",
         ),
     ],

@@ -58,8 +58,8 @@ def test_one_call_gives_what_the_others_give_bit_for_bit(skill, monkeypatch):
 @pytest.mark.parametrize("seed", range(5))
 def test_compiled_loops_give_the_same_but_for_rounding(skill, seed):
     motion = moving(skill, seed)
-    found, plain = skill.predict_motion(*motion), skill.query.motion(*motion, covariance=True)
-    assert (skill.compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
+    found, plain = skill.predict_motion(*motion), skill.inner.query.motion(*motion, covariance=True)
+    assert (skill.inner.compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
     for name in plain._fields[:3] + plain._fields[4:]:
         size = np.abs(getattr(plain, name)).max()
         np.testing.assert_allclose(getattr(found, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
@@ -71,7 +71,7 @@ def test_compiled_loops_give_the_same_but_for_rounding(skill, seed):
 def test_compiled_means_and_jacobians_are_the_plain_ones_to_a_few_units_in_the_last_place(skill):
     """Of the sum of the terms' magnitudes: what cancels is lost either way."""
     queries = np.random.default_rng(3).normal(size=(20, skill.inputs.shape[1]))
-    found, one = skill.mean(queries), skill.query
+    found, one = skill.mean(queries), skill.inner.query
     for query, mean in zip(queries, found, strict=True):
         row = one.row(query)
         size = (np.abs(row.kernel) @ np.abs(one.weights)).ravel() + 1
@@ -139,7 +139,7 @@ def test_a_copy_in_another_process_gives_the_same_bits(skill):
 
 
 def test_what_one_query_touches_is_contiguous_and_read_only(skill):
-    query = skill.query
+    query = skill.inner.query
     for array in (query.centres, query.weights, query.weight_rows, query.stretch, query.prior_mean):
         assert array.flags.c_contiguous
         assert not array.flags.writeable

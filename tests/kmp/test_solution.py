@@ -6,8 +6,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel, named_arrays
 from kmp.dense import Dense
+from kmp.inner import Inner
 from kmp.linear_algebra import kron_identity
 from kmp.low_rank import LowRank
 from kmp.low_rank.conditioned import Conditioned
@@ -40,8 +41,8 @@ def primitive(request):
 
 
 def test_each_is_the_solution_that_is_meant():
-    assert {type(primitive.solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
-    assert all(type(primitive.solution) is kind for primitive, kind in SOLUTIONS.values())
+    assert {type(primitive.inner.solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
+    assert all(type(primitive.inner.solution) is kind for primitive, kind in SOLUTIONS.values())
 
 
 @pytest.mark.parametrize("kind", [Dense, LowRank, Conditioned])
@@ -54,13 +55,13 @@ def test_a_method_takes_what_the_protocol_says(kind):
 
 
 def test_all_that_the_protocol_names_is_there(primitive):
-    assert [name for name in MEMBERS if not hasattr(primitive.solution, name)] == []
+    assert [name for name in MEMBERS if not hasattr(primitive.inner.solution, name)] == []
 
 
 def test_counts_and_shapes_agree(primitive):
-    solution = primitive.solution
+    solution = primitive.inner.solution
     assert len(solution.database) == len(primitive.inputs) == len(primitive.reference)
-    assert primitive.query.covariance_scale == len(primitive.base.inputs) / primitive.lambda_covariance
+    assert primitive.inner.query.covariance_scale == len(primitive.base.inputs) / primitive.lambda_covariance
     assert solution.weights.shape == (len(solution.centres), 2)
     rows = primitive.kernel(S[:5], solution.centres)
     assert mean_at(solution, S[:5]).shape == (5, 2)
@@ -70,45 +71,48 @@ def test_counts_and_shapes_agree(primitive):
 
 
 def test_solving_again_gives_the_solution_itself(primitive):
-    assert primitive.solution.solved() is primitive.solution
+    assert primitive.inner.solution.solved() is primitive.inner.solution
 
 
 def test_an_adapted_solution_is_adapted_from_its_base(primitive):
-    changes = fitted("dense", VIA).changes
-    again, base = primitive.solution.adapted(changes).solved(), primitive.base.solution.adapted(changes).solved()
+    changes = fitted("dense", VIA).inner.changes
+    again, base = (
+        primitive.inner.solution.adapted(changes).solved(),
+        primitive.base.inner.solution.adapted(changes).solved(),
+    )
     assert np.array_equal(mean_at(again, S), mean_at(base, S))
 
 
 def test_weights_that_are_given_are_kept_and_the_solution_is_left_as_it_was(primitive):
-    solution, ones = primitive.solution, np.ones_like(primitive.weights)
+    solution, ones = primitive.inner.solution, np.ones_like(primitive.weights)
     other = solution.with_weights(ones)
     assert np.array_equal(other.weights, ones)
     assert not np.array_equal(solution.weights, ones)
 
 
 def test_each_is_stored_with_what_its_base_needs(primitive):
-    assert set(primitive.solution.to_arrays()) == set(primitive.base.solution.to_arrays())
+    assert set(primitive.inner.solution.to_arrays()) == set(primitive.base.inner.solution.to_arrays())
     assert primitive.representation == primitive.base.representation
-    again = KMP.from_arrays(primitive.to_arrays())
-    assert type(again.solution) is type(primitive.solution)
+    again = named_arrays.from_arrays(named_arrays.to_arrays(primitive))
+    assert type(again.inner.solution) is type(primitive.inner.solution)
     assert np.array_equal(again.mean(S), primitive.mean(S))
 
 
 @pytest.mark.parametrize("name", ["information", "features"])
 def test_an_array_of_the_low_rank_solution_that_lacks_is_named(name):
-    arrays = fitted("low_rank").to_arrays()
+    arrays = named_arrays.to_arrays(fitted("low_rank"))
     del arrays[name]
     with pytest.raises(ValueError, match=f"The primitive's arrays lack {name}. Needed are .*pivots"):
-        KMP.from_arrays(arrays)
+        named_arrays.from_arrays(arrays)
 
 
 def test_pivots_that_rounding_does_not_tell_apart_are_refused():
-    arrays = fitted("low_rank").to_arrays()
+    arrays = named_arrays.to_arrays(fitted("low_rank"))
     pivots = arrays["pivots"].copy()
     pivots[-1] = pivots[0]
     says = rf"pivots: {len(pivots)} given, and rounding tells only {len(pivots) - 1} apart"
     with pytest.raises(ValueError, match=says):
-        KMP.from_arrays(arrays | {"pivots": pivots})
+        named_arrays.from_arrays(arrays | {"pivots": pivots})
 
 
 def leaning(count):
@@ -128,8 +132,8 @@ def test_outputs_that_nothing_tells_apart_are_solved_as_one_with_the_same_result
     other[0, 0, 0] *= 1 + 1e-13
     options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 2.0, "representation": "dense"}
     one, apart = (KMP.fit(inputs, Gaussians(mean, c), **options) for c in (covariance, other))
-    assert (one.solution.apart, apart.solution.apart) == (1, 2)
-    assert 2 * len(one.solution.mean_factor) == len(apart.solution.mean_factor)
+    assert (one.inner.solution.apart, apart.inner.solution.apart) == (1, 2)
+    assert 2 * len(one.inner.solution.mean_factor) == len(apart.inner.solution.mean_factor)
     queries = inputs[:7] + 0.1
     adapted = [x.adapt(queries, via(7, o), tolerance=0) for x in (one, apart)]
     for a, b in ((one, apart), adapted):
@@ -156,9 +160,9 @@ def test_adapting_changes_whether_outputs_are_solved_as_one(first):
     points = Gaussians(np.ones((3, 2)), apart if first == "alike" else alike)
     where = S[:3] + 0.01 if first == "alike" else S[37:]  # in the place of those that tell them apart
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
-    assert (base.solution.apart, adapted.solution.apart) == ((1, 2) if first == "alike" else (2, 1))
+    assert (base.inner.solution.apart, adapted.inner.solution.apart) == ((1, 2) if first == "alike" else (2, 1))
     anew = KMP.fit(adapted.inputs, adapted.reference, **options)
-    assert adapted.solution.same > 0
+    assert adapted.inner.solution.same > 0
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
     one, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
     np.testing.assert_allclose(one, other, atol=1e-10)
@@ -169,9 +173,9 @@ def test_adapting_copies_no_factor_and_gives_what_a_fit_of_all_points_gives(lamb
     inputs = np.random.default_rng(1).normal(size=(600, 2))
     reference = Gaussians(np.sin(inputs), np.tile(0.01 * np.eye(2), (600, 1, 1)))
     one = KMP.fit(inputs, reference, kernel=GaussianKernel(1.0), lambda_mean=1.0, lambda_covariance=lambda_covariance)
-    factor = one.solution.mean_factor
+    factor = one.inner.solution.mean_factor
     tracemalloc.start()
-    adapted = one.adapt(inputs[:3] + 0.01, reference[:3], tolerance=0.0).solution
+    adapted = one.adapt(inputs[:3] + 0.01, reference[:3], tolerance=0.0).inner.solution
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < factor.nbytes / 4
@@ -198,8 +202,8 @@ def test_points_replaced_early_leave_the_factor_of_the_base_and_are_solved_as_a_
     base = KMP.fit(inputs, reference, **options)
     desired = Gaussians(reference.mean[replaced] + 0.1, reference.covariance[replaced])
     adapted = base.adapt(inputs[replaced] + 1e-3, desired, tolerance=0.01)
-    assert list(adapted.changes.replaced) == replaced
-    one = adapted.solution
+    assert list(adapted.inner.changes.replaced) == replaced
+    one = adapted.inner.solution
     assert list(one.gone) == replaced
     anew = Dense(one.hyperparameters, one.database)
     np.testing.assert_allclose(one.weights, anew.weights, rtol=0, atol=1e-9 * np.abs(anew.weights).max())
@@ -207,7 +211,7 @@ def test_points_replaced_early_leave_the_factor_of_the_base_and_are_solved_as_a_
     residual, usual = (np.abs(equation @ x.weights.ravel() - wanted.ravel()).max() for x in (one, anew))
     assert residual < 10 * usual + 1e-13
     queries = inputs[[*replaced, 60]] + 0.05
-    again = KMP(anew, adapted.changes, base)
+    again = KMP(Inner(anew, adapted.inner.changes, base.inner.count), base)
     assert np.array_equal(adapted.predict(queries).covariance, again.predict(queries).covariance)
     assert np.array_equal(adapted.refitted(reference).weights, adapted.weights)
 

@@ -25,6 +25,7 @@ from kmp import (
     OrientationKMP,
     PeriodicKernel,
     VelocityKernel,
+    named_arrays,
     orientation,
 )
 
@@ -51,9 +52,17 @@ LOCAL = LocalKMP.learn(PAIRS, FRAMES, S, **LEARN)
 LEARNED = kmp.learn(PAIRS, count=5, **LEARN)
 IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts": 2, "seed": 0}
 
+
+def regressor(*, ell, lambda_mean, lambda_covariance, noise, components, random_state):
+    """scikit-learn has a parameter checked where it is used."""
+    given = locals()
+    return kmp.KMPRegressor(**given).fit(S, S).predict(S, return_std=True)
+
+
 # What each public callable is rightly called with.
 RIGHT = {
     Gaussians: {"mean": R.mean, "covariance": R.covariance},
+    Gaussians.of: {"mean": R.mean, "deviation": np.ones(2)},
     R.affine: {"matrix": np.eye(2), "offset": np.zeros(2)},
     Gaussians.concatenated: {"parts": [R, R]},
     GaussianMixture: {"weights": np.ones(1), "means": np.zeros((1, 2)), "covariances": np.eye(2)[None]},
@@ -76,11 +85,16 @@ RIGHT = {
         "rank_tolerance": 1e-9,
     },
     ONE.adapt: {"inputs": S[:2], "desired": R[:2], "tolerance": 0.1, "directions": np.zeros((2, 2))},
+    ONE.adapt_many: {"points": [(S[:2], R[:2]), (S[2:3], R[2:3])], "tolerance": 0.1},
+    ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
+    ONE.via_point_reach: {"query": S[0], "share": 0.5},
+    ONE.save: {"path": "other.npz", "input_unit": "m", "output_unit": "m"},
+    KMP.load: {"path": "skill.npz"},
     ONE.adapt_jacobian: {"inputs": S[:1], "jacobians": np.eye(2)[None], "deviation": 0.1},
     ONE.constrained: {"constraints": LIMITS},
     ONE.extended: {"inputs": S[:2] + 1, "reference": R[:2], "directions": np.zeros((2, 2))},
     ONE.refitted: {"reference": R},
-    KMP.from_arrays: {"arrays": LOW.to_arrays()},
+    named_arrays.from_arrays: {"arrays": named_arrays.to_arrays(LOW)},
     ONE.mean: {"queries": S},
     LOW.mean: {"queries": S[:1]},
     ONE.predict: {"queries": S},
@@ -144,6 +158,14 @@ RIGHT = {
     kmp.save: {"path": "skill.npz", "value": ONE, "input_unit": "m", "output_unit": "m"},
     kmp.load: {"path": "skill.npz"},
     LEARNED.report: {"count": 3},
+    regressor: {
+        "ell": np.ones(2),
+        "lambda_mean": 1.0,
+        "lambda_covariance": 2.0,
+        "noise": 0.1,
+        "components": 2,
+        "random_state": 0,
+    },
     ONE.plot: {
         "queries": S,
         "plane": (0, 1),
@@ -161,6 +183,7 @@ OF_THE_KERNEL = {"check", "coordinates", "variances", "values", "blocks", "row",
 
 OPTIONAL = {"lambda_covariance", "prior_mean", "directions", "angular_velocities", "velocity_covariance"}
 WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
+LONGEST = 450  # characters of a message
 NO_NUMBERS = [
     *(None, "text", b"bytes", object(), object, {}, {"a": 1.0}, {1.0}, [["a"]], [[1.0], [1.0, 2.0]], 1j, [1j]),
     *(lambda: 0.0, np.array("1"), np.array([None]), np.datetime64("2020-01-01"), [{}], 10**400, [[[]]], slice(2)),
@@ -179,20 +202,30 @@ def wrong_arrays(array):
     wrong = [*NO_NUMBERS, spoilt * 0, spoilt, -spoilt, array[None], array[..., None], 1.0, [], array * 1j]
     wrong += [np.array(array, dtype=str), np.array(array, dtype=object), np.zeros((*array.shape, 0))]
     other = [np.concatenate([array, array[..., :1]], axis=-1), array[..., :0], array[:0], array[:-1], array[0]]
-    huge = [1e308 * np.sign(array), 1e160 * array, 1e-308 * array, -array, 0 * array, array > 0, array.tolist()]
+    huge = [
+        1e308 * np.sign(array),
+        1e160 * array,
+        1e200 * array,
+        np.full(array.shape, 1e155),
+        1e-308 * array,
+        -array,
+        0 * array,
+        array > 0,
+        array.tolist(),
+    ]
     return wrong, [*other, *huge]
 
 
 def wrong_values(name, right):
     """What is wrong for an argument like this, and what may be right."""
-    if name == "seed":
+    if name in {"seed", "random_state"}:
         return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
     if name in WHOLE:
         return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
     if name == "tolerance":
-        return [one for one in NO_SCALARS if one is not np.inf], [1e308, np.inf, 0, True]
+        return [one for one in NO_SCALARS if one is not None and one is not np.inf], [1e308, np.inf, 0, True]
     if isinstance(right, float):
-        return [*NO_SCALARS, 0.0], [1e308, 1e-308, True, np.array(1.0), 1e-160]
+        return [*NO_SCALARS, 0.0], [1e308, 1e200, 1e-308, True, np.array(1.0), 1e-160]
     if isinstance(right, np.ndarray):
         return wrong_arrays(right)
     objects = [*NO_NUMBERS, 1.0, -1, True, np.nan, S, [S], [], [None], R[:0], GaussianKernel, KMP]
@@ -219,10 +252,12 @@ def calls():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
             for one in wrong:
-                if function is GaussianKernel and isinstance(one, float):
+                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(one, float):
                     continue  # one for all inputs
+                if function is regressor and name == "components" and one is None:
+                    continue  # each sample is a point
                 if one is None and (
-                    name in OPTIONAL
+                    (name in OPTIONAL and function != ONE.with_lambda_covariance)
                     or function == ONE.plot
                     or (function is kmp.learn and name in {"kernel", "lambda_mean"})
                 ):
@@ -245,6 +280,8 @@ def fault(function, name, right, value, must_fail):
         named = any(re.search(rf"\b{one}\b", said) for one in ([name] if must_fail else near))
         if not named:
             return f"{what} does not name it: {said[:150]}"
+        if len(said) > LONGEST:
+            return f"{what} says {len(said)} characters: {said[:150]}"
         return f"{what} speaks NumPy: {said[:150]}" if NUMPYS.search(said) else None
     except OSError:
         return None if name == "path" else f"{what} ends in an OSError"
@@ -265,6 +302,7 @@ def test_every_wrong_call_ends_in_a_value_error_that_names_the_argument(tmp_path
 
 def test_each_right_call_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    ONE.save("skill.npz")
     for function, right in RIGHT.items():
         function(**right)
 
@@ -299,17 +337,21 @@ def test_every_argument_of_every_public_callable_is_among_them():
 
 @pytest.mark.parametrize("primitive", [LOW, ONE.adapt(S[:1], R[:1], tolerance=0.1), IN_TIME], ids=str)
 def test_every_array_that_is_spoilt_is_named(primitive):
-    arrays, faults = primitive.to_arrays(), []
-    for name, array in ((name, array) for name, array in arrays.items() if name != "prior_mean"):
+    arrays, faults = named_arrays.to_arrays(primitive), []
+    for name, array in arrays.items():
         for value in [
             None,
             "text",
             object(),
             {},
             np.full(array.shape, np.nan),
+            np.full(array.shape, 1e200),
             np.array(array, dtype=object),
             array[None],
+            array[None, None],
         ]:
-            said = fault(lambda **given: KMP.from_arrays(arrays | given), name, {name: array}, value, True)
+            may_work = np.ndim(array) == 0 and value is not None and np.size(value) == 1 and np.any(value == 1e200)
+            made = lambda **given: named_arrays.from_arrays(arrays | given)  # noqa: E731
+            said = fault(made, name, {name: array}, value, not may_work)
             faults += [said] if said else []
     assert not faults, "\n".join(faults)

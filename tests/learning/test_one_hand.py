@@ -15,14 +15,17 @@ from service.core.frame import Records, Tick
 from service.core.skill.staged import StagedKMP
 from service.demonstrations.demonstration_files import summary
 from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
+from service.demonstrations.pose_streams import PoseTopic
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures
+from service.learning.judgement import Figures, table
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
+from service.recording.mcap_file import RecordingError
 from sim.made_tasks import takes
 from support.circling import circling
 from support.in_process import ASSUMED, frames, hand
+from support.spoiled import Streams, streams_of, write_streams
 from support.wam import URDF
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
@@ -66,6 +69,8 @@ def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(s
     assert found.unsafe == ()
     assert found.all.error_mm < min(found.all.other_mm.values())
     assert found.beside > 80
+    assert f"holds {found.beside:.0f} % of the hand 30 cm beside\n" in table(found)
+    assert "swapped" not in table(found)
     again, still = decoded(skill.file, origin="a file"), np.zeros((2, 3))
     assert again.conductor == skill.conductor
     told = []
@@ -111,8 +116,45 @@ def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() ->
 
 
 def test_takes_of_different_hands_are_not_mixed() -> None:
-    with pytest.raises(SkillError, match="conducted by different hands: both, left"):
-        learn([led(0), circling(1)])
+    words = r"conducted by different hands: both, left; .*\(both: b; left: a\)"
+    with pytest.raises(SkillError, match=words):
+        learn([led(0), circling(1)], names=["a", "b"])
+
+
+def streams_of_one(side: str, take: Demonstration) -> Streams:
+    """The streams of a take without the other hand."""
+    return {name: stream for name, stream in streams_of(take).items() if name in (side, "tool")}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_hand_that_a_take_does_not_have_is_not_needed(side: str, tmp_path: Path) -> None:
+    """It has no topic, no sample, or is never seen; and the other hand is given as both."""
+    take, other = circling(0), "right" if side == "left" else "left"
+    path, said, whole = tmp_path / "a.mcap", list[str](), streams_of(take)
+    never = whole[other]._replace(poses=np.full_like(whole[other].poses, np.nan))
+    for streams in (streams_of_one(side, take), whole | {other: never}):
+        got = read_demonstration(write_streams(path, streams), say=said.append)
+        assert got.conducts == side
+        np.testing.assert_array_equal(got.hands, np.tile(getattr(take, side)[:, :3], 2))
+        assert any(f"the {side} hand conducts alone" in line for line in said)
+    write_streams(path, streams_of_one(side, take))
+    for topics in (
+        {other: PoseTopic(f"cell/hands/{side}")},
+        dict.fromkeys(("left", "right"), PoseTopic(f"cell/hands/{side}")),
+    ):
+        assert read_demonstration(path, topics=topics).conducts == side
+    skill = learn(
+        [read_demonstration(write_streams(path, streams_of_one(side, circling(i)))) for i in range(3)], points=60
+    )
+    assert skill.conductor == ("left", "right").index(side)
+
+
+def test_one_stream_for_both_hands_whose_name_says_neither_is_refused(tmp_path: Path) -> None:
+    streams = streams_of(circling(0))
+    path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
+    both = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
+    with pytest.raises(RecordingError, match=r"cell/tool/pose is given as left and as right: another topic needed"):
+        read_demonstration(path, topics=both)
 
 
 def served(

@@ -15,6 +15,7 @@ from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.skill import Skill
 from service.learning.ambiguity import SAME_M
 from service.learning.demonstration import Demonstration
+from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.pose import learned_pose
 from service.learning.skill_file import SkillError, decoded
@@ -138,3 +139,30 @@ def test_a_gripper_that_tells_millimetres_is_refused(shown: list[Demonstration])
     spoilt = [one._replace(gripper=80.0 * np.asarray(one.gripper)) for one in shown]
     with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
         learn(spoilt, components=5, points=60)
+
+
+@pytest.mark.parametrize("turn_deg", [200, 300, 400, 480])
+def test_a_tool_that_turns_by_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
+    """By each take alike, whichever signs its quaternions have."""
+    found = msgspec.json.decode(learn([spinning(seed, turn_deg) for seed in range(4)], points=60).figures, type=Figures)
+    assert found.orientation_error_deg < 15
+    assert found.unsafe == ()
+
+
+def test_a_tool_whose_turns_are_learned_wrongly_is_unsafe() -> None:
+    found = msgspec.json.decode(learn([spinning(seed, 1500) for seed in range(4)], points=60).figures, type=Figures)
+    assert any("up to 60° accepted: it turns by up to" in line for line in found.unsafe)
+
+
+def spinning(seed: int, turn_deg: float) -> Demonstration:
+    """A take in which the tool turns as the hands go, some degrees otherwise in each."""
+    random, t = np.random.default_rng(seed), np.arange(0.0, 8.0, 0.04)
+    way = 0.5 - 0.5 * np.cos(np.pi * t / 8)
+    ones, unturned = np.ones_like(t), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    left = np.stack([0.4 + 0.5 * way, 0.3 * ones, 0.3 + 0.05 * np.sin(3 * way)], axis=1) + 0.01 * random.normal(size=3)
+    right = np.stack([0.5 + 0.4 * way, -0.3 * ones, 0.3 * ones], axis=1) + 0.01 * random.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(turn_deg * way + 2 * random.normal())[:, None] * [0.0, 0.0, 1.0]).as_quat()
+    tool = 0.5 * (left + right) + [0.0, 0.0, 0.2]
+    seen = [at + 1e-3 * random.normal(size=at.shape) for at in (left, right, tool)]
+    turns = (unturned, unturned, turn * random.choice([-1.0, 1.0]))
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *map(np.hstack, zip(seen, turns, strict=True)))

@@ -143,7 +143,7 @@ def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp
     file = McapFile(path, joints=0)
     for i in range(total):
         for key in ("x/hands/left", "x/hands/right", "x/tool/pose"):
-            pose = PoseStamped(i * 10_000_000, "base", (0.1 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            pose = PoseStamped(i * 10_000_000, "base", (0.001 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
             file.put(key, POSE.type, encode_pose(pose), i * 10_000_000, i)
         if i % 50 == 49:
             file.flush()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.cli.view import last_followed, screenshot
+from service.cli.main import main
+from service.cli.view import RRD_MAGIC, last_followed, screenshot
 from service.config import WAM, Settings
 from service.contract.messages import SceneObject
+from service.contract.printable import as_markdown, printable
 from service.contract.records import Mode, Reason
 from service.contract.requests import encode_json
 from service.core.separation.body import body_of
@@ -20,6 +23,7 @@ from service.core.skill.skill import Skill
 from service.viewer.blueprint import blueprint
 from service.viewer.stream import Viewer
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views
+from support.wicked import WICKED, wicked_skill
 
 
 def viewer(**where: Any) -> Viewer:
@@ -132,3 +136,54 @@ def test_demonstrations_are_paler_and_thinner_than_the_ways_of_hands(tmp_path: P
 def opacity(colour: int) -> int:
     """How opaque a colour is, of 255."""
     return colour & 0xFF
+
+
+@pytest.mark.usefixtures("drawing")
+def test_of_several_files_the_last_is_pictured_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        one = viewer(rrd=tmp_path / f"{name}.rrd")
+        for tick, frame, timing in ticks(60):
+            one.add(frame, at_ns(tick.index), timing)
+        one.close()
+    files = [str(path) for path in sorted(tmp_path.glob("*.rrd"))]  # as a shell expands thirdhand-demo/*.rrd
+    assert main(["view", *files, "--screenshot", str(tmp_path / "scene.png")]) == 0
+    said = capsys.readouterr()
+    assert said.err == f"the picture is of {files[1]}, the last of 2 files\n"
+    with Image.open(tmp_path / "scene.png") as picture:
+        assert picture.width > 1000
+
+
+def test_without_vulkan_one_line_tells_what_a_picture_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, os.devnull)
+    (tmp_path / "a.rrd").write_bytes(RRD_MAGIC)
+    assert main(["view", str(tmp_path / "a.rrd"), "--screenshot", str(tmp_path / "a.png")]) == 1
+    error = capfd.readouterr().err
+    assert error.startswith("thirdhand view: a picture without a screen needs a Vulkan driver")
+    assert "apt install mesa-vulkan-drivers" in error
+    assert error.count("\n") == 1
+
+
+def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
+    thing = SceneObject(WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1))
+    one = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index == 10:
+            one.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
+            one.note("log", f"rejected: {WICKED}", at_ns(tick.index))
+            one.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))
+    assert values(rows[named], "Points3D:labels")[-1] == [printable(WICKED)]
+    log = [text for (text,) in values(rows["/log"], "TextLog:text")]
+    assert f"rejected: {printable(WICKED)}" in log
+    assert f"Skill {printable(WICKED)} is in force." in log
+    ((about,),) = values(rows["/about/skill"], "TextDocument:text")
+    assert as_markdown(WICKED) in about
+    assert all(line.isprintable() for text in (*log, about) for line in text.split("\n"))

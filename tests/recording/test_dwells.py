@@ -78,3 +78,25 @@ def test_a_rate_is_counted_only_while_the_hand_is_seen(taken: Demonstration, tmp
     for stream in listed(seen, tmp_path / "a.mcap").streams:
         assert stream.rate_hz == pytest.approx(1 / taken.period_s, rel=0.02)
         assert stream.gap_s == pytest.approx(3.0, abs=0.05)
+
+
+def test_what_is_left_out_is_no_rest(taken: Demonstration) -> None:
+    """Hands and tool that come back to where they were, after nobody saw them."""
+    seen = np.r_[0:3, 60 : len(taken.stamps_ns)]
+    same = {side: getattr(taken, side)[seen] for side in ("left", "right", "tool")}
+    for side in same:
+        same[side] = np.concatenate([same[side][:3], same[side][:1].repeat(3, axis=0), same[side][3:]])
+    stamps_ns = np.concatenate([taken.stamps_ns[:3], taken.stamps_ns[57:]])
+    one = taken._replace(stamps_ns=stamps_ns, **same)
+    assert any(begin_s < 0.1 for begin_s, _ in dwells(one))
+    assert not any(begin_s < 0.1 for begin_s, _ in dwells(one._replace(begins=(3,))))
+
+
+@pytest.mark.parametrize("end", ["begins", "ends"])
+def test_a_take_that_begins_or_ends_in_motion_is_warned_of(end: str, taken: Demonstration, tmp_path: Path) -> None:
+    at = int(np.argmax(np.linalg.norm(np.gradient(taken.right[:, :3], axis=0), axis=1)))
+    rows = slice(at, None) if end == "begins" else slice(None, at)
+    cut = Demonstration._make(part[rows] if isinstance(part, np.ndarray) else part for part in taken)
+    (remark,) = [line for line in listed(cut, tmp_path / "a.mcap").remarks if "in motion" in line]
+    assert remark.startswith(f"it {end} in motion: ")
+    assert "right 0." in remark

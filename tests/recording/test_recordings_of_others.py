@@ -191,5 +191,7 @@ def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None
     assert re.search(
         r"tool found from .*joints/state by the arm's URDF; \d+ of \d+ poses are none, or farther", said[0]
     )
-    assert len(got.stamps_ns) > 1000
+    assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in said)
+    assert got.seconds[got.begins[0]] - got.seconds[got.begins[0] - 1] == pytest.approx(0.51)
+    assert len(got.stamps_ns) > 1800
     assert np.abs(got.tool[:, :3]).max() < 1.0

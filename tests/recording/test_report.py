@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from service.cli.main import main
 from service.config import Settings
 from service.contract.records import Flag, Mode, Reason
 from service.contract.requests import Percentiles, Status, ViaPoint, encode_json
@@ -23,16 +24,17 @@ from service.core.frame import STAGES, Event, Tick, order, timed
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.status import CellStatus
-from service.learning.skill_file import with_file
+from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
 from service.report.columns import runs
-from service.report.report import Report, differing_settings, reported, why_missed
+from service.report.report import Report, Span, differing_settings, reported, why_missed
 from service.report.stages import LEAST_S
 from service.report.tables import verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
+from support.wicked import wicked_skill
 
 SETTINGS = Settings()
 PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
@@ -94,10 +96,11 @@ class Told:
     def inbox(self, k: int) -> Iterable[Event]:
         late = k >= FAULT_AT
         if k % 5 == 0 and not (late and self.what == "left alone"):
-            yield hand("left", LEFT, k + 1)
-            yield hand("right", RIGHT, k + 1)
+            stamp_ns = k + 1 + (10**10 if k >= FAULT_AT - 20 and self.what == "stepped" else 0)
+            yield hand("left", LEFT, stamp_ns)
+            yield hand("right", RIGHT, stamp_ns)
         if k % 2 == 0 and not (
-            (self.what == "silent" and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+            (self.what in ("silent", "stepped") and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
         ):
             q, dq = list(self.joints), [0.0] * 7
             if late and self.what == "pushed":
@@ -130,7 +133,8 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
     # made in process, without a status: what the first frame of each holds
     assert re.fullmatch(r"the left hand was last seen [23]\d\d ms ago", held[Reason.STALE_HAND].why)
-    assert (held[Reason.OPERATOR].why, held[Reason.OPERATOR].remedy) == ("somebody asked for it", "thirdhand resume")
+    asked = held[Reason.OPERATOR]
+    assert (asked.why, asked.remedy) == ("a hold was requested, or the daemon was stopped", "thirdhand resume")
     far = re.fullmatch(
         r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
@@ -247,6 +251,43 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
     assert fault.why in missed
 
 
+def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path: Path) -> None:
+    Told(skill, tmp_path / "a.mcap", "stepped")
+    said = reported(tmp_path / "a.mcap").faults[0].before
+    words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
+    assert words in said
+
+
+def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
+    def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
+        found, at_s = [], 0.0
+        for lasts_s, mode, reason in parts:
+            found.append(Span(at_s, lasts_s, mode, reason))
+            at_s += lasts_s
+        return tuple(found)
+
+    hold, follow, fault = Mode.HOLD, Mode.FOLLOW, Mode.FAULT
+    waits, ends = (6.0, hold, Reason.NO_HANDS), [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
+    moves, stops = (4.0, follow, Reason.NONE), (1.0, hold, Reason.STALE_HAND)
+    said = {
+        "a bench": (waits, moves, *ends),
+        "a stop": (waits, moves, stops, moves, *ends),
+        "a fault at the end": (moves, (1.0, fault, Reason.SERVICE)),
+        "never": (waits,),
+        "on": (waits, moves),
+    }
+    found, one = {}, reported(golden)
+    for name, parts in said.items():
+        one.spans, one.lasts_s = spans(*parts), sum(part[0] for part in parts)
+        found[name] = verdict(one)
+    assert found["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
+    assert found["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
+    assert found["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
+    assert "with no holds and 1 fault; the worst was fault: service" in found["a fault at the end"]
+    assert "It followed 0 % of 6.0 s, with 1 hold and no faults; the worst was hold: no_hands" in found["never"]
+    assert "It followed 40 % of 10.0 s, from 6.0 s on, with no holds and no faults" in found["on"]
+
+
 def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: Path) -> None:
     session = Told(skill, tmp_path / "a.mcap", "left alone")
     first, *_, alone, last = reported(tmp_path / "a.mcap").spans
@@ -287,6 +328,21 @@ def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Repo
     told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
     best_m = session.best_m("glass")
     assert best_m is not None
-    assert told.startswith("the arm followed; with the hands where 'glass' was taught the tool came within")
-    assert told.endswith(f" {1000 * best_m:.0f} mm")
+    assert told.startswith("with the hands where 'glass' was taught, the tool came only within")
+    assert told.endswith(f" {1000 * best_m:.0f} mm of it")
     assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
+
+
+def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "$\\frac$ <b>\x1b[31m.mcap"
+    Told(decoded(wicked_skill(), origin="wicked"), path)
+    html_path = tmp_path / "page.html"
+    assert main(["report", str(path), "--html", str(html_path)]) == 0
+    shown, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
+    for text in (shown, page):
+        assert all(line.isprintable() for line in text.splitlines())
+    assert r"skill a\nb\x1b[31mred" in shown
+    assert "<b>" not in page
+    assert r"$\frac$ &lt;b&gt;\x1b[31m" in page

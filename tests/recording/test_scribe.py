@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -16,8 +17,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
+from service import child
+from service.child import Child, Progress
 from service.config import Files, Settings
 from service.core.frame import Event, Tick, encode
 from service.recording.protocol import pack, unpack
@@ -34,6 +38,7 @@ def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
     one = Scribe(settings, **where)
     try:
         one.start(skill=SKILL, state=state_after(-1))
+        assert one.ready(60.0) == bool(where)
         yield one
     finally:
         one.close(10)
@@ -103,10 +108,10 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
 
         def told_again() -> bool:
             nonlocal index
-            sent = one.status()["sent"]
+            lost = one.status()["lost"]
             tell(one, 1, first=index, skill=b"another skill")
             index += 1
-            return one.status()["sent"] > sent
+            return one.status()["lost"] == lost
 
         until(told_again)
         lost = one.status()["lost"]
@@ -123,19 +128,35 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp
         os.kill(killed, signal.SIGKILL)
         until(lambda: not one.status()["alive"])
         one.supervise()
-        tell(one, 5, first=20)
-        assert one.ready(20)
-        tell(one, 30, first=25, skill=b"another skill")
+        tell(one, 35, first=20, skill=b"another skill")
+        assert one.ready(60)
         status = one.status()
         assert status["pid"] != killed
-        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 25)  # 20 were not yet on disk
+        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)  # those not yet on disk
         assert status["errors"] == ["the scribe ended with code -9"]
     recording = Recording.open(tmp_path / "a-2.mcap")
     steps = list(recording.steps())
     assert recording.skill == b"another skill"
-    assert [step.tick for step in steps] == list(range(25, 55))
-    assert steps[0].lost == 25
-    assert encode(steps[0].state) == encode(state_after(25))
+    assert [step.tick for step in steps] == list(range(20, 55))
+    assert steps[0].lost == 20
+    assert encode(steps[0].state) == encode(state_after(20))
+
+
+def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> None:
+    """Also where the process that it is forked from has to import all again."""
+    for process in psutil.Process().children():
+        if "service.child" in process.cmdline():
+            process.kill()
+            process.wait(10)
+    one = Scribe(SETTINGS, folder=tmp_path)
+    began = time.perf_counter()
+    one.start(skill=SKILL, state=state_after(-1))
+    tell(one, 400)
+    assert time.perf_counter() - began < 0.5
+    assert not one.ready(0.0)
+    assert one.close(60) == ""
+    (path,) = tmp_path.glob("*.mcap")
+    assert [step.tick for step in Recording.open(path).steps()] == list(range(-1, 400))
 
 
 def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Path) -> None:
@@ -172,7 +193,7 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
 
         until(replaced)
         status = one.status()
-        assert "the scribe was silent for 1 s and is replaced" in status["errors"]
+        assert "the scribe made no progress for 1 s and is replaced" in status["errors"]
         assert status["restarts"] == 1
         with pytest.raises(ProcessLookupError):
             os.kill(stopped, 0)
@@ -184,16 +205,86 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
     assert [step.tick for step in rest] == list(range(start.tick + 1, told))
 
 
-def test_a_process_that_is_slow_to_listen_is_given_more_time_and_listens_at_last(tmp_path: Path) -> None:
-    with scribe(folder=tmp_path, restart_s=0.0, ready_s=0.02) as one:
+SLOW = """
+import socket, time
+def run(channel):
+    channel.recv(1)
+    end = time.process_time() + {busy}
+    while time.process_time() < end:
+        pass
+    {then}
+"""
 
-        def listens() -> bool:
-            one.supervise()
-            time.sleep(0.01)
-            return bool(one.status()["alive"])
 
-        until(listens, timeout_s=60.0)
-        assert one.status()["restarts"] > 1
+@pytest.fixture
+def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Child]]:
+    """Children that compute for so long, and then do something, with a fork server of their own."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    started: list[Child] = []
+
+    def begun(busy: float, then: str) -> Child:
+        name = f"slow_{len(started)}"
+        (tmp_path / f"{name}.py").write_text(SLOW.format(busy=busy, then=then))
+        started.append(child.start("slow", name, socket.SOCK_STREAM))
+        assert started[-1].has_begun(60.0)
+        return started[-1]
+
+    yield begun
+    for one in started:
+        one.kill()
+        one.wait()
+        one.socket.close()
+    server.close()
+
+
+def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(slow_child: Callable[..., Child]) -> None:
+    """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
+
+    def seconds_until_hung(one: Child, limit_s: float, most_s: float) -> float:
+        progress, began = Progress(one), time.monotonic()
+        one.socket.send(b"0")
+        while not progress.is_hung(limit_s) and time.monotonic() - began < most_s and one.poll() is None:
+            time.sleep(0.02)
+        return time.monotonic() - began
+
+    slow = slow_child(0.4, "channel.recv(1)")
+    assert slow.pid is not None
+    os.sched_setaffinity(slow.pid, {min(os.sched_getaffinity(0))})
+    busy = f"import os\nos.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\nwhile True: pass"
+    hogs = [subprocess.Popen([sys.executable, "-c", busy], start_new_session=True) for _ in range(25)]
+    try:
+        assert seconds_until_hung(slow, 1.0, 4.0) > 3.9
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
+    assert 1.0 < seconds_until_hung(slow_child(0.1, "channel.recv(1)"), 1.0, 20.0) < 15.0
+    assert 1.0 < seconds_until_hung(slow_child(1e9, "pass"), 1.0, 60.0) < 50.0
+    stopped = slow_child(1e9, "pass")
+    stopped.send_signal(signal.SIGSTOP)
+    assert 1.0 < seconds_until_hung(stopped, 1.0, 20.0) < 15.0
+
+
+def test_exit_codes_of_children_are_those_of_the_operating_system(slow_child: Callable[..., Child]) -> None:
+    killed, ended, failed = slow_child(1e9, "pass"), slow_child(0.0, "pass"), slow_child(0.0, "raise SystemExit(3)")
+    killed.kill()
+    for one in (ended, failed):
+        one.socket.send(b"0")
+    assert [one.wait(20) for one in (killed, ended, failed)] == [True] * 3
+    assert [one.returncode for one in (killed, ended, failed)] == [-signal.SIGKILL, 0, 1]
+    assert Path(f"/proc/{os.getpid()}").exists()
+
+
+def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    one = child.start("none", "no_such_module_anywhere", socket.SOCK_STREAM)
+    assert one.wait(60)
+    assert (one.pid, one.returncode) == (None, child.NOT_STARTED)
+    one.socket.close()
+    server.close()
 
 
 DAEMON = """
@@ -204,6 +295,7 @@ from service.recording.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
 one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))
+assert one.ready(60)
 pid = one.status()["pid"]
 if sys.argv[2] == "stopped":
     os.kill(pid, signal.SIGSTOP)

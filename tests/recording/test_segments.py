@@ -22,10 +22,13 @@ from service.config import Files, Settings
 from service.core.controller import Controller, run
 from service.core.frame import TIMING, Frame, Tick, blank
 from service.core.skill.skill import Skill
+from service.recording import segments
 from service.recording.paths import RecordingPaths
+from service.recording.protocol import TickMessage
 from service.recording.recording import Recording
 from service.recording.replay import replay
 from service.recording.scribe import Scribe
+from service.recording.segments import Segments
 from sim.scene import Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, ticks_of
@@ -114,6 +117,9 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
     os.utime(old[2].with_suffix(".rrd"), (0, 0))
     aged = RecordingPaths(msgspec.structs.replace(CELL, files=Files(keep_hours=1)), str(tmp_path), None, None)
     assert sorted(aged.prune(current)) == sorted([old[2], old[2].with_suffix(".rrd")])
+    assert aged.keep_mb_left == pytest.approx(50_000, rel=0.01)
+    assert places.keep_mb_left is not None
+    assert 0.0 < places.keep_mb_left < 0.32
 
 
 class Session:
@@ -148,9 +154,34 @@ def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
     one = Session(settings, **where)
     try:
         one.scribe.start(skill=SKILL, state=state_after(-1))
+        assert one.scribe.ready(60)
         yield one
     finally:
         one.missing = one.scribe.close(10)
+
+
+def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segments, "LEAST_GROWTH_S", 0.5)
+    settings = msgspec.structs.replace(CELL, files=Files(rerun=False, segment_mb=0.3))
+    paths = RecordingPaths(settings, str(tmp_path), None, None)
+    one = Segments(settings, paths, say=print, draw=print)
+    one.begin(SKILL, state_after(-1))
+    one.flush()
+    assert one.mb_per_hour() is None
+    begin_s, before, told = time.monotonic(), sum(path.stat().st_size for path in tmp_path.iterdir()), list(ticks(40))
+    for i in range(2000):
+        tick, frame, timing = told[i % 40]
+        state = state_after(i) if i % 50 == 49 else None
+        one.write(TickMessage(Tick(i, tick.inbox), frame, timing, state, None, 0))
+        if i % 20 == 0:
+            time.sleep(0.01)
+            one.flush()
+    one.flush()
+    grown_mb = (sum(path.stat().st_size for path in tmp_path.iterdir()) - before) / 1e6
+    assert len(list(tmp_path.iterdir())) > 2
+    assert one.mb_per_hour() == pytest.approx(grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1)
+    assert one.keep_mb_left is not None
+    one.close()
 
 
 def accounted(paths: list[Path], told: int) -> tuple[int, int]:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from service.cli.main import main
 from service.cli.usage import UsageError
 from service.cli.view import convert, moment, screenshot
-from service.config import WAM, Settings
+from service.config import WAM, Settings, parse
 from service.contract import cdr
 from service.contract.messages import JointState, SceneObject
 from service.contract.records import Mode, Reason
@@ -33,6 +33,7 @@ from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
 from service.viewer.stream import Viewer, ViewerError
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
+from support.turning import sliding_cell
 from support.wam import JOINT_NAMES
 
 
@@ -53,6 +54,43 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
     assert len(names) == len(JOINT_NAMES)
     work = [row["Scalars:scalars"][0] for row in rows["/timing/work"] if "tick" in row]
     assert work == pytest.approx([timing["work_us"] for *_, timing in told])
+
+
+@pytest.mark.parametrize(("rate_hz", "mb_per_hour"), [(500, 200.0), (1000, 200.0), (500, 100.0)])
+def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
+    tmp_path: Path, rate_hz: int, mb_per_hour: float
+) -> None:
+    """One of 30 s with hands that tremble; every tick of it would take more than 1.7 GB an hour."""
+    settings, random = Settings(rate_hz=rate_hz), np.random.default_rng(1)
+    one = Viewer(urdf=WAM, settings=settings, mb_per_hour=mb_per_hour, rrd=tmp_path / "a.rrd")
+    period_ns = 1_000_000_000 // rate_hz
+    (_, frame, timing), *_ = list(ticks(600))[-1:]
+    changes, latest, sizes = [], 0.0, []
+    for i in range(30 * rate_hz):
+        shown, measured = frame.copy(), timing.copy()
+        shown["tick"], measured["tick"] = i, i
+        for name in ("joints", "joint_velocities", "joint_accelerations", "hands", "target", "tool", "setpoint"):
+            shown[name] += random.normal(0, 0.002, shown[name].shape)
+        if i % 7001 == 6000:  # for one tick
+            shown["mode"], shown["reason"] = Mode.HOLD, Reason.OPERATOR
+            changes.append(i)
+        measured["lateness_us"] = latest = 5000.0 if i == 8003 else 40.0
+        one.add(shown, i * period_ns, measured)
+        if i % (10 * rate_hz) == 10 * rate_hz - 1:
+            one.flush()
+            sizes.append((tmp_path / "a.rrd").stat().st_size)
+    one.close()
+    assert latest == 40.0
+    assert one.problems == []
+    begins, grows = sizes[0] / 1e6, (sizes[2] - sizes[1]) / 1e6
+    assert 6 * begins + 360 * grows < mb_per_hour  # an hour of files of ten minutes
+    assert 360 * grows > 0.5 * mb_per_hour  # and it is made use of
+    rows = drawn(tmp_path / "a.rrd")
+    at = [row["tick"] for row in rows["/joints/position"] if "tick" in row]
+    assert {*changes, *(i + 1 for i in changes)} <= set(at)
+    late = {row["tick"]: row["Scalars:scalars"][0] for row in rows["/timing/lateness"] if "tick" in row}
+    (peak,) = [tick for tick, value in late.items() if value > 4000]
+    assert 8003 <= peak < 8003 + rate_hz
 
 
 def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
@@ -152,6 +190,42 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
     assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
     assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
+
+
+def test_an_arm_that_slides_is_drawn_in_metres_where_it_is(tmp_path: Path) -> None:
+    cell = sliding_cell(tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"], frame["joints"][0] = 1, 0.002 * tick.index
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(frame["joints"] + 0.02), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    (names,) = values(rows["/joints/velocity"], "SeriesLines:names")
+    assert (names[0], names[1]) == ("rail [m/s]", "shoulder pan [rad/s]")
+    places = np.array(values(rows["/arm/joints/0"], "Transform3D:translation"), np.float64).reshape(-1, 3)
+    assert np.ptp(places[:, 1]) == pytest.approx(0.002 * 95, abs=1e-5)
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
+
+
+def test_turns_of_a_continuous_joint_are_no_error(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(WAM.read_text().replace('type="revolute"', 'type="continuous"', 1))
+    posture, limits = list(Settings().arm.posture), f"acceleration = {[5.0] * 7}\njerk = {[200.0] * 7}"
+    text = f'[arm]\nurdf = "arm.urdf"\nplate = "tool_plate"\nposture = {posture}\n[joints]\n{limits}\n'
+    cell = parse(text, origin="cell.toml", folder=tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"] = 1
+        frame["joints"][0] += 20.0
+        position = frame["joints"] + 0.02
+        position[0] = np.remainder(position[0] + np.pi, 2 * np.pi) - np.pi
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(position), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    found = values(drawn(tmp_path / "a.rrd")["/joints/error"], "Scalars:scalars")
+    assert np.ravel(found) == pytest.approx(np.full(100, 0.02))
 
 
 def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
@@ -369,6 +443,8 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
         (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
         (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
         (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["live", "a.rrd"], "live beside 1 files; either live alone or files needed"),
+        (["press.npz", "a.rrd"], "press.npz is neither"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
         (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),

@@ -315,6 +315,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     [
         ([], 2, "a take's name needed, or --list"),
         (["a", "--list"], 2, "a take's name needed, or --list"),
+        (["--list", "--folder", "nofolder"], 1, "nofolder does not exist: a folder of takes needed (--folder)"),
         (["../a", "--show"], 2, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
         (["there"], 1, "is there already: another name needed, or --delete it first"),
@@ -334,7 +335,8 @@ def test_what_cannot_be_meant_is_said(
     arguments = [str(tmp_path / "places.json") if one == "PLACES" else one for one in arguments]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.cli.record.CONNECT_TIMEOUT_S", 0.2)
-        assert main(["record", *arguments, "--folder", str(tmp_path)]) == code
+        folder = [] if "--folder" in arguments else ["--folder", str(tmp_path)]
+        assert main(["record", *arguments, *folder]) == code
     assert words in capsys.readouterr().err
 
 

@@ -220,6 +220,9 @@ def test_places_out_of_reach_are_moved_into_it_and_said() -> None:
     assert moved.robot_start == SCENE.robot_start
     with pytest.raises(SceneError, match=r"out of the arm's reach: handover: .* lies 0.176 m from the nominal"):
         SCENE.in_reach(Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.45))
+    for sides in ({"min_x": 0.6}, {"min_z": 0.2}):
+        with pytest.raises(SceneError, match=r"out of the arm's reach: (handover|glass): the tool at .* accepted"):
+            SCENE.in_reach(Reach(**sides))
 
 
 # --- an arm that is elsewhere ---------------------------------------------------------------------

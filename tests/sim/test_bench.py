@@ -229,8 +229,10 @@ class Service:
         pose = cdr.decode_pose(sample.payload.to_bytes())
         self.hands[str(sample.key_expr).rpartition("/")[2]].append(pose)
         if self.joints is not None:
-            command = messages.JointState(pose.stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL)
-            attachment = messages.Attachment(len(self.hands["left"]), time.time_ns(), pose.stamp_ns)
+            tick = len(self.hands["left"])
+            stamp_ns = 10_000_000 * tick  # of 100 Hz, however late this machine is
+            command = messages.JointState(stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL)
+            attachment = messages.Attachment(tick, time.time_ns(), pose.stamp_ns)
             self._command.put(cdr.encode_joints(command), attachment=cdr.encode_attachment(attachment))
 
 

@@ -29,6 +29,7 @@ from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array, ExperimentError
 from sim.experiments.scenes import draw
 from sim.experiments.statistics import wilson
+from sim.experiments.table import METHODS
 from sim.experiments.writing import recorded, write
 from sim.scene import MOST_MOVED, Scene
 from support.paths import ROOT
@@ -143,6 +144,23 @@ class TestExperiments:
             # begun at the one number and kept there, learning returns nothing worse
             assert trial["begun_at_c"]["cost_rad"] <= trial["constant"]["cost_rad"]
 
+    def test_each_run_of_the_search_lowers_the_cost_and_keeps_the_via_point(self, tmp_path: Path) -> None:
+        found = numbers("runs", tmp_path)
+        assert found["runs"] == found["runs_that_fell"] >= 2
+        assert len(found["mean_cost_rad"]) == found["updates"] + 1
+        assert found["largest_miss_of_the_via_point_cm"] < 0.02
+
+    def test_what_each_method_can_be_given(self, tmp_path: Path) -> None:
+        found = numbers("table", tmp_path)["modelled"]
+        largest = {
+            who: {one: found[who][f"largest_miss_of_{one}_cm"] for one in ("start", "via", "end")} for who in METHODS
+        }
+        for who in ("kmp", "promp"):
+            assert max(largest[who].values()) < 0.02
+        assert largest["dmp"]["start"] < 0.02
+        assert largest["dmp"]["end"] < 0.1
+        assert min(largest["dmp"]["via"], *largest["gmm"].values()) > 1
+
     def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
         found = numbers("hands", tmp_path)
         assert found["figures"] == ["hands-stages.png", "hands.png"]
@@ -192,6 +210,8 @@ def test_every_experiment_has_a_test() -> None:
         "promp",
         "separation",
         "correlation",
+        "runs",
+        "table",
         "hands",
         "statistics",
         "phase",

@@ -41,11 +41,12 @@ class Cell:
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
-        tell = {"status": lambda: requests.encode_json(self.status()), "frame": self.frame}
+        tell = {"status": lambda *, published: requests.encode_json(self.status()), "frame": self.frame}
         tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
-        self.requests = Queryables(near, self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
+        self.requests = Queryables(self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
+        self.requests.open(near)
         self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
         self.session = far
         self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles

@@ -25,6 +25,7 @@ RESEARCH = (
     "sim/test_made_tasks.py",
     "sim/test_partners.py",
     "sim/test_people.py",
+    "sim/test_rates.py::test_the_demo_succeeds_at_every_rate_with_every_arm_in_every_engine",
     "test_replay.py::test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units",
 )
 UNCOMPILED = (  # what runs while the others wait for what is compiled, the longest first
@@ -36,6 +37,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
     "test_hand_sample.py",
     "test_architecture.py",
     "test_config.py",
+    "test_ci.py",
     "contract",
 )
 SLOW = (  # the longest first: so they begin first
@@ -57,6 +59,9 @@ SLOW = (  # the longest first: so they begin first
     "cli/test_own_task.py",
     "sim/test_bench.py",
     "sim/test_arms.py",
+    "sim/test_rates.py",
+    "arms/test_first_cell.py",
+    "test_odd_urdfs.py",
     "sim/test_engines.py",
     "cli/test_interrupt.py",
     "daemon/test_fuzzed_daemon.py",
@@ -69,6 +74,7 @@ SLOW = (  # the longest first: so they begin first
     "daemon/test_skill_worker.py",
     "cli/test_report_command.py",
     "test_examples.py",
+    "test_readme.py",
     "kmp/test_distribution.py",
     "kmp/test_compiled.py",
     "test_site.py",
@@ -85,6 +91,7 @@ SLOW = (  # the longest first: so they begin first
     "kmp/test_low_rank.py",
     "kmp/test_tutorial.py",
     "recording/test_sinks.py",
+    "recording/test_drawings.py::test_of_several_files_the_last_is_pictured_and_that_is_said",
     "recording/test_lerobot.py",
     "recording/test_damage.py",
     "daemon/test_via_point_requests.py",

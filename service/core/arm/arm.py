@@ -15,6 +15,7 @@ from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe
 from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.separation import Separation
+from service.urdf import Urdf
 
 REACH_M = 0.88  # of the WAM, on which the next four were chosen; they are scaled by the arm's own
 TURN_LEVER = 0.0115  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
@@ -27,12 +28,16 @@ POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_ra
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
+# [s²] more, times the square of the tool's velocity that constraints take away: where several of
+# them leave few directions free, the least motion of the arm would else change the solution much.
+KEPT_DAMPING = 4.0
 HORIZON_S = 0.008  # for reaching the joint velocities that an orientation step needs; else it is scaled down
 SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
 # Of the joints' speed, acceleration and jerk that a plan may use: closing in needs the rest.
 PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
 
+FARTHEST_RAD = 1e4  # beyond it a joint is not calculated with
 MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
@@ -111,8 +116,8 @@ class Arm:
     """
 
     def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
-        self._model = _chain(pin.buildModelFromXML(urdf), settings.joints.names)
-        plate = self._model.frames[self._model.getFrameId(settings.arm.plate)]
+        self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
+        plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
         unit = np.array(quaternion) / math.hypot(*quaternion)
         plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
@@ -135,6 +140,7 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
+            kept_damping=KEPT_DAMPING,
             max_tool_speed=TOOL_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
             position_gain=min(POSITION_GAIN, POSITION_GAIN_SHARE * rate),
@@ -150,6 +156,8 @@ class Arm:
             max_velocity=np.array(limits.velocity, np.float64),
             acceleration=acceleration,
             posture=np.array(settings.arm.posture, np.float64),
+            is_continuous=np.array([int(kind == "continuous") for kind in limits.every_kind]),
+            per_rad=np.array(limits.per_rad),
             scale=scale,
             spared=spared,
             planned_limits=PLANNED_SHARE[:, None]
@@ -180,8 +188,8 @@ class Arm:
         self._unseparated = Separation.constraints_for(joints, 0)
 
     def at(self, q: Vector) -> Kinematics:
-        """The arm at joints q (J,) [rad]."""
-        q = np.minimum(np.maximum(q, -1e3), 1e3)
+        """The arm at joints q (J,) [rad, m]."""
+        q = np.minimum(np.maximum(q, -FARTHEST_RAD), FARTHEST_RAD)
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
@@ -248,12 +256,6 @@ class Arm:
 def _solution(found: Vector, flags: int) -> Solution:
     found.setflags(write=False)
     return Solution(found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
-
-
-def _chain(model: pin.Model, names: tuple[str, ...]) -> pin.Model:
-    """The model with the named joints only, the others locked at 0."""
-    locked = [model.getJointId(name) for name in model.names[1:] if name not in names]
-    return pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
 
 
 def acceleration_rate(limits: JointSettings) -> float:

@@ -236,11 +236,14 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     said, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
-        if min(low, high) < NEAR_LIMIT:
+        if min(low, high) < NEAR_LIMIT * arm.per_rad[j]:
             said |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
-        home[j] = min(max(POSTURE_GAIN * (arm.posture[j] - here.joints[j]), -POSTURE_SPEED), POSTURE_SPEED) / scale[j]
+        off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED * arm.per_rad[j]
+        if arm.is_continuous[j]:  # in whichever turn; 0 half a turn away, as no direction is shorter there
+            off = math.sin(off)
+        home[j] = min(max(POSTURE_GAIN * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
     rows, limits = np.empty((count, joints)), np.empty(count)
@@ -252,6 +255,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     kept = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     if kept:
         said |= SEPARATED
+        damping += arm.kept_damping * _missing(scaled, wanted, velocity)
+        solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     near = _can_have(arms, goals, velocity)
     scaled[3:], wanted[3:] = 0.0, 0.0
     if not near:  # it turns as far as costs its position nothing
@@ -273,6 +278,20 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         for order in range(2):
             out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
     return said | SPEED if excess > 1.0 + ROUNDING else said
+
+
+@compiled
+def _missing(tasks: Vector, wanted: Vector, x: Vector) -> float:
+    """The square of the tool's velocity [m²/s²] that a solution x (J,) lacks: |wanted - tasks x|²,
+    over the first three rows of tasks (N, J).
+    """
+    total = 0.0
+    for i in range(3):
+        lacks = wanted[i]
+        for j in range(len(x)):
+            lacks -= tasks[i, j] * x[j]
+        total += lacks * lacks
+    return total
 
 
 @compiled

@@ -62,7 +62,9 @@ class Decision:
             max_error_rad=float(settings.arm.fault_error_rad),
             fault_speed=float(settings.tool.fault_speed),
             max_speed=float(settings.tool.max_speed),
+            per_rad=np.array(limits.per_rad),
         )
+        self._return_speed = RETURN_RADPS * np.array(limits.per_rad)
         self._way_out = WayOut(settings)
         self.measured = (0.0, 0.0)
 
@@ -87,7 +89,7 @@ class Decision:
         if state["arm_ready"] == RETURNING and state["reason"] == NOT_READY and not state["operator_hold"]:
             q = state["joints"][0]
             inward: Vector = (q < self._lower).astype(np.float64) - (q > self._upper)
-            return RETURN_RADPS * inward
+            return self._return_speed * inward
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def take(self, state: Record, event: Event) -> None:
@@ -189,7 +191,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
             state.stuck_tick = state.tick
         if not inside or (state.tick - state.stuck_tick) * given.period_s > FREED_S:
             state.arm_ready, state.leaves = READY, 0
-    error, speed = measured_error(states, heres)
+    error, speed = measured_error(states, heres, parameters)
     if error > given.max_error_rad:
         return 0, ARM_ERROR, error, speed
     if speed <= given.fault_speed:
@@ -233,14 +235,15 @@ def _is_outside(joints: Vector, parameters: Records) -> bool:
 
 
 @compiled
-def measured_error(states: Records, heres: Records) -> tuple[float, float]:
-    """How far the joints are from where they are measured, the farthest [rad]; how fast the tool is
-    measured [m/s], by the tasks at the commanded joints, no farther than that error from there.
+def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
+    """How far the joints are from where they are measured, the farthest by `per_rad` [rad]; how
+    fast the tool is measured [m/s], by the tasks at the commanded joints, no farther than that
+    error from there.
     """
     state, here = states[0], heres[0]
     error = speed = 0.0
     for joint in range(len(here.joints)):
-        error = max(error, abs(here.joints[joint] - state.measured[joint]))
+        error = max(error, abs(here.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
     for axis in range(3):
         along = 0.0
         for joint in range(len(here.joints)):

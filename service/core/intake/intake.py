@@ -15,8 +15,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import Settings
 from service.contract.channels import BY_KEY
-from service.contract.messages import BASE, JointState, PoseStamped, WireError, in_order
-from service.contract.records import SIDES, SOURCES, Cause, Reason
+from service.contract.joint_states import measured
+from service.contract.messages import BASE, JointState, PoseStamped, WireError
+from service.contract.records import SIDES, SOURCES, Cause, Mode, Reason
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.core.geometry import rotation
 from service.core.intake import KEPT
@@ -28,6 +29,7 @@ from service.core.intake.arm_samples import (
     STILL_RAD,
     compared,
     still_ticks,
+    unwrap,
 )
 from service.core.intake.hand_estimator import (
     LATE_S,
@@ -47,7 +49,7 @@ UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # of `hands.unit`
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
 JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
-TWO_SOURCES = int(Reason.TWO_SOURCES)
+TWO_SOURCES, FAULT = int(Reason.TWO_SOURCES), int(Mode.FAULT)
 FARTHEST_M = 5.0  # a hand farther from the base plate is a mistake of units
 HANDS_KNOWN = 1  # what a step says: both hands are seen
 ARM_HEARD = 2  # the arm has reported its joints lately enough
@@ -79,11 +81,14 @@ def _stale_ticks(key: str, settings: Settings) -> int:
 
 
 class Refused(NamedTuple):
-    """A sample that was rejected, and the stamp [ns] of the newest one accepted before."""
+    """A sample that was rejected, the stamp [ns] of the newest one accepted before, and for the arm
+    the joints that one measured.
+    """
 
     cause: Cause
     sample: PoseStamped | JointState
     newest_ns: int
+    joints: tuple[float, ...] = ()
 
 
 class Intake:
@@ -102,7 +107,8 @@ class Intake:
         # from the sample before to one that is late, and from that to now
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(LATE_S / settings.period_s) + 1)
-        limits = np.array([settings.joints.lower, settings.joints.upper])
+        joints = settings.joints
+        limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
         self._parameters = parameters(
             period_s=settings.period_s,
             stale_ticks=self.stale_ticks,
@@ -112,8 +118,10 @@ class Intake:
             jump=float(hands.jump),
             jump_speed=float(hands.jump_speed),
             swapped_s=float(hands.swapped_s),
-            joint_jump_speed=max(JUMP_RADPS, JUMP_SPEEDS * max(settings.joints.velocity)),
-            plausible_joints=limits + FARTHEST_OUTSIDE * np.array([[-1.0], [1.0]]),
+            joint_jump_speed=max(JUMP_RADPS, JUMP_SPEEDS * float((np.array(joints.velocity) / per_rad).max())),
+            plausible_joints=limits + FARTHEST_OUTSIDE * per_rad * np.array([[-1.0], [1.0]]),
+            per_rad=per_rad,
+            is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
         self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
@@ -169,7 +177,7 @@ class Intake:
     def take_arm(self, state: Record, sample: JointState) -> None:
         """The arm's sample into the state, or counted as rejected."""
         try:
-            position, velocity = in_order(sample, self._names)
+            position, velocity = measured(sample, self._names)
         except WireError:
             state["rejected"][Cause.INCOMPLETE] += 1
             self._note(state, ARM, Cause.INCOMPLETE, sample)
@@ -180,7 +188,8 @@ class Intake:
 
     def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
         newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
-        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns)
+        joints = tuple(state["measured"].tolist()) if source == ARM else ()
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
         self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other
 
 
@@ -265,6 +274,10 @@ def _take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vec
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
         return NOT_FINITE
+    # Before it is ready, and after a silence, an arm is in the turn that it reports: it may have
+    # started anew. While it is commanded, its turns go on.
+    if fresh or (state.arm_ready and state.mode != FAULT):
+        unwrap(states, parameters, position)
     near, off, moved = compared(states, parameters, position, velocity)
     cause = -1 if near else OUT_OF_RANGE
     if near:

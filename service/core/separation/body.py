@@ -32,7 +32,8 @@ def own_clearance(settings: Settings) -> float:
 class Body(NamedTuple):
     """Capsules of an arm of J joints, and how they move.
 
-    `frames` (J, 3, 4): each joint in the frame of the one before, at 0; `axes` (J, 3) in its own.
+    `frames` (J, 3, 4): each joint in the frame of the one before, at 0; `axes` (J, 4) in its own,
+    then 1 for a joint that slides along it, 0 for one that turns about it.
     `capsules` (N,): `link`, how many joints move it; `ends` (2, 3) [m] in the frame of the last of
     these joints, or in base; `radius` [m]; `max_speed` [m/s], which no point of its axis passes.
     `pairs` (P, 2): capsules that are kept apart.
@@ -66,15 +67,20 @@ def body_of(settings: Settings, description: str) -> Body:
         if number not in known:
             end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
             found.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
+            if number < len(chain) and chain[number].kind == "prismatic":  # what guides the next link
+                travel = np.outer(
+                    [chain[number].lower, chain[number].upper], frames[number][:, :3] @ chain[number].axis
+                )
+                found.append((number, end + travel, settings.arm.link_radius))
     tool = np.array(settings.tool.plate_from_tool[:3])
     if math.hypot(*tool) > LEAST_TOOL:
         found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
     found.sort(key=lambda one: one[0])
     capsules = structured(len(found), CAPSULE)
     capsules[:] = [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in found]
-    axes = np.array([joint.axis for joint in chain])
+    axes = np.array([[*joint.axis, float(joint.kind == "prismatic")] for joint in chain])
     body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
-    postures = np.array([settings.arm.posture, settings.joints.lower, settings.joints.upper])
+    postures = np.array([settings.arm.posture, *_ends_of_motion(settings)])
     placed, near = np.empty((len(postures), len(capsules), 2, 3)), np.empty(9)
     for q, ends in zip(postures, placed, strict=True):
         place(q, body.frames, body.axes, capsules, ends)
@@ -91,11 +97,27 @@ def body_of(settings: Settings, description: str) -> Body:
 
 def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> float:
     """A bound of the speed [m/s] of any point between the ends (2, 3) [m]."""
-    lever, speed = float(np.linalg.norm(ends, axis=1).max()), 0.0
+    lever, speed, joints = float(np.linalg.norm(ends, axis=1).max()), 0.0, settings.joints
     for joint in range(link - 1, -1, -1):
-        speed += settings.joints.velocity[joint] * lever
+        if joints.every_kind[joint] == "prismatic":
+            speed += joints.velocity[joint]
+            lever += max(abs(joints.lower[joint]), abs(joints.upper[joint]))
+        else:
+            speed += joints.velocity[joint] * lever
         lever += float(np.linalg.norm(frames[joint][:, 3]))
     return speed
+
+
+def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
+    """Two postures (J,) [rad, m] on both sides of the configured one: the limits; of a joint that
+    turns on and on, a part of a turn, as others may be the same.
+    """
+    posture, is_continuous = np.array(settings.arm.posture), np.array(settings.joints.every_kind) == "continuous"
+    lower, upper = np.array(settings.joints.lower), np.array(settings.joints.upper)
+    return (
+        np.where(is_continuous, np.maximum(posture - 1.9, lower), lower),
+        np.where(is_continuous, np.minimum(posture + 2.3, upper), upper),
+    )
 
 
 def _origin(joint: Joint) -> Vector:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kmp import KMP, Gaussians
 from kmp.compiled import compiled
+from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.geometry import round_to
@@ -136,7 +137,7 @@ class HandsKMP:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> HandsKMP:
-        return cls(KMP.from_arrays(arrays), "turned" in arrays)
+        return cls(from_arrays(arrays), "turned" in arrays)
 
 
 @compiled

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kmp import KMP
 from kmp.immutable import Immutable, frozen
+from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
@@ -260,4 +261,4 @@ class StagedKMP:
         errors = np.hstack([arrays["seen"], arrays["errors"]])
         off, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
         nominal = NamedViaPoints(task.names, arrays["nominal"])
-        return cls(KMP.from_arrays(arrays), task, nominal, off, errors, delay_s, via_points)
+        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points)

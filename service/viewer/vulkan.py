@@ -1,16 +1,19 @@
-"""How many devices Vulkan finds, without which the viewer draws nothing off screen; as a program,
-prints it.
+"""The number of Vulkan devices of this machine; the viewer draws a picture without a screen only
+where there is one.
 """
 
 from __future__ import annotations
 
 import ctypes
+import subprocess
+import sys
+from pathlib import Path
 
 CREATE_INSTANCE = 1  # VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO
 
 
 class InstanceCreateInfo(ctypes.Structure):
-    """VkInstanceCreateInfo, but for layers and extensions, of which none is asked for."""
+    """VkInstanceCreateInfo without layers and extensions."""
 
     _fields_ = (
         ("type", ctypes.c_uint32),
@@ -37,5 +40,10 @@ def devices() -> int:
     return count.value if found == 0 else 0
 
 
-if __name__ == "__main__":
-    print(devices())
+def is_there() -> bool:
+    """Whether a device is found, by a process of its own: a driver brings libraries of its own."""
+    if not sys.platform.startswith("linux"):
+        return True  # elsewhere the viewer draws by the system's own interface
+    program = Path(__file__).read_text(encoding="utf-8") + "\nprint(devices())"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    return found.stdout.strip() not in {"", "0"}

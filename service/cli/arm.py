@@ -1,0 +1,149 @@
+"""`thirdhand arm`: what is understood of an arm's URDF, and a first cell for it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from service.arms.arm_picture import draw
+from service.arms.first_cell import JERK_RATE, RISE_S, TORQUE_SHARE, Proposal, proposed, written
+from service.cli.usage import check_writable
+from service.config import load
+from service.contract.explain import ExplainedError
+from service.described_arm import SettingsError
+
+DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
+
+
+class ExistsError(ExplainedError):
+    """A file that is there already is not overwritten."""
+
+
+def arm(args: argparse.Namespace) -> int:
+    """Exit code 0 once the cell is written and loads.
+
+    Raises SettingsError, UrdfError, ExistsError, OSError.
+    """
+    cell: Path = args.output
+    picture, standing = cell.with_suffix(".png"), cell.with_name(f"{cell.stem}.urdf")
+    check_writable(cell, ".toml")
+    for file in (cell, picture):
+        if file.exists():
+            raise ExistsError(f"{file} is there already: name another one by --output, or remove it")
+    proposal = proposed(
+        args.urdf,
+        plate=args.plate,
+        packages=tuple(str(Path(folder).absolute()) for folder in args.packages or ()),
+        stand=None if args.at is None else tuple(args.at),
+    )
+    if proposal.text and standing.exists():
+        raise ExistsError(f"{standing} is there already: name another cell by --output, or remove it")
+    if proposal.text:
+        standing.write_text(proposal.text, encoding="utf-8")
+    urdf = standing if proposal.text else args.urdf
+    cell.write_text(written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8")
+    try:
+        load(cell)
+    except SettingsError:
+        cell.unlink()
+        if proposal.text:
+            standing.unlink()
+        raise
+    draw(proposal, picture)
+    print(text(proposal, args.urdf))
+    print(f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}")
+    print(f"next:    thirdhand {'serve --config' if proposal.unmet else 'demo --arm'} {cell}")
+    return 0
+
+
+def _named(urdf: Path, folder: Path) -> str:
+    """The file's name from a folder, where it is inside, or its full path."""
+    try:
+        return str(urdf.absolute().relative_to(folder.absolute()))
+    except ValueError:
+        return str(urdf.absolute())
+
+
+def text(proposal: Proposal, path: Path) -> str:
+    """What was understood, and what is proposed, for people to read."""
+    urdf, settings, body, shell = proposal.urdf, proposal.settings, proposal.body, proposal.shell
+    others = [leaf for leaf in urdf.leaves if leaf != proposal.plate]
+    lines = [
+        f"{path.name}: {len(urdf.joints) + 1} links, {len(settings.joints.names)} joints before the plate",
+        f"  plate     {proposal.plate}" + (f"; other ends: {', '.join(others[:4])}" if others else ""),
+        f"  units     metres and radians, as a URDF has them: the chain is {_length(proposal):.2f} m long",
+        "",
+        f"  {'joint':<28} {'kind':<10} {'lower':>8} {'upper':>8} {'velocity':>9} {'acceleration':>13} {'jerk':>6}",
+    ]
+    limits = settings.joints
+    for joint in proposal.chain:
+        if joint.name in limits.names:
+            i = limits.names.index(joint.name)
+            lines.append(
+                f"  {joint.name:<28} {joint.kind:<10} {limits.lower[i]:8.2f} {limits.upper[i]:8.2f} "
+                f"{limits.velocity[i]:9.2f} {limits.acceleration[i]:13.2f} {limits.jerk[i]:6.0f}"
+            )
+    lines.append("  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: from rest to full speed in")
+    basis = (
+        f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts" if proposal.efforts else "no efforts in the URDF"
+    )
+    lines.append(f"  {RISE_S:g} s or more, {basis}, jerk {JERK_RATE:g}/s of it. The data sheet knows better")
+    revolute = {joint.name for joint in proposal.chain if joint.kind == "revolute"}
+    if wide := [
+        name for name, upper in zip(limits.names, limits.upper, strict=True) if name in revolute and upper > DEGREES
+    ]:
+        lines.append(f"  limits of {', '.join(wide)} are more than a turn: a URDF has radians, not degrees")
+    radii = body.capsules["radius"]
+    bare = sorted(set(range(len(limits.names) + 1)) - {_link(proposal, shape.link) for shape in urdf.shapes})
+    lines += [
+        "",
+        f"  body      {len(radii)} capsules, {radii.min():.3f} to {radii.max():.3f} m thick at most; "
+        f"{len(body.pairs)} pairs are kept apart",
+    ]
+    if bare:
+        lines.append(
+            f"            no collision shape moves with joint {', '.join(map(str, bare))}: [arm] link_radius = "
+            f"{settings.arm.link_radius:g} m stands for it"
+        )
+    x, y, z = shell.centre
+    posture = ", ".join(f"{value:.3f}" for value in settings.arm.posture)
+    lines += [
+        f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), above z = "
+        f"{settings.reach.min_z:g} m and before x = {settings.reach.min_x:g} m",
+        f"  posture   [{posture}] rad",
+        f"            the tool is {math.degrees(proposal.tilt):.0f}° from straight down, the arm "
+        f"{100 * proposal.clearance:.0f} cm clear of the table and itself, and the nearest limit "
+        f"{100 * proposal.margin:.0f} % of half a range away",
+    ]
+    if any(settings.tool.plate_from_tool[3:6]):
+        lines.append(
+            "  tool      the plate's +z does not lead away from the arm: [tool] plate_from_tool turns it, "
+            f"({', '.join(f'{value:g}' for value in settings.tool.plate_from_tool[3:])}) as x y z w"
+        )
+    if proposal.text:
+        x, y, z = proposal.stand
+        lines.append(
+            f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base, so that it reaches the demo's "
+            "places; --at 0 0 0 leaves it at the origin"
+        )
+    if proposal.unmet:
+        lines.append(
+            f"  demo      out of reach: {', '.join(proposal.unmet)}. The demo moves places by 15 cm at most; teach "
+            "tasks of this arm's own size (docs/tutorial.md)"
+        )
+    return "\n".join(lines)
+
+
+def _length(proposal: Proposal) -> float:
+    return sum(math.hypot(*joint.translation) for joint in proposal.chain)
+
+
+def _link(proposal: Proposal, link: str) -> int:
+    """How many joints of the chain move a link."""
+    names = proposal.settings.joints.names
+    while (joint := proposal.urdf.above(link)) is not None:
+        if joint.name in names:
+            return names.index(joint.name) + 1
+        link = joint.parent
+    return 0

@@ -1,0 +1,20 @@
+"""What a daemon publishes or answers as JSON, checked, with its texts fit to be shown."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import msgspec
+
+from service.client.session import RefusedError
+from service.contract.printable import printable_values
+
+T = TypeVar("T")
+
+
+def decoded(data: bytes, kind: type[T]) -> T:
+    """The value of this type in JSON bytes, each of its texts printable. Raises RefusedError."""
+    try:
+        return msgspec.convert(printable_values(msgspec.json.decode(data)), kind)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        raise RefusedError(f"not a {kind.__name__}: {error}. Is the daemon of this version?") from None

@@ -1,0 +1,46 @@
+"""Text from files and from the network, made fit to be shown to people.
+
+A name may hold anything: line breaks, escape sequences that move a terminal's cursor, characters
+that reverse the direction of what follows. Each reader of a file or of the network passes texts
+through here, so that terminal, log, viewer, report and web page show them as one line without
+effects. Where a text becomes HTML or Markdown it is escaped for that language as well.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_MARKDOWN = re.compile(r"[\\`*_\[\]<>|#&!~$]")
+
+
+def printable(text: str) -> str:
+    r"""The text on one line, with characters that cannot be printed as escapes: `\n`, `\x1b`,
+    `\u202e`. The result is a fixed point: applying this twice changes nothing more.
+    """
+    if text.isprintable():
+        return text
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
+def printable_lines(text: str) -> str:
+    """The same of a message that may have several lines."""
+    return "\n".join(map(printable, text.splitlines()))
+
+
+def as_markdown(text: str) -> str:
+    """The same, so that Markdown shows it letter by letter: without emphasis, links or HTML."""
+    return _MARKDOWN.sub(r"\\\g<0>", printable(text))
+
+
+def printable_values(value: Any) -> Any:
+    """The same of each text in what JSON held, keys included."""
+    match value:
+        case str():
+            return printable(value)
+        case list():
+            return [printable_values(one) for one in value]
+        case dict():
+            return {printable_values(key): printable_values(one) for key, one in value.items()}
+        case _:
+            return value

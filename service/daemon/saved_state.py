@@ -1,0 +1,50 @@
+"""Files that a daemon reads as it starts: none of them, however damaged, keeps it from starting."""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+log = logging.getLogger("thirdhand")
+LARGEST_BYTES = 32_000_000
+T = TypeVar("T")
+
+
+def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str) -> T:
+    """The value that `read` makes of a file's content; `otherwise` where there is no file.
+
+    A file that cannot be read, or of which `read` makes an exception of whatever kind, is set aside
+    under another name, which the log reports, and `otherwise` is returned.
+    """
+    try:
+        return read(_content(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return otherwise
+    except Exception as error:
+        aside = path.with_suffix(".damaged")
+        reason = error.strerror if isinstance(error, OSError) else str(error) or type(error).__name__
+        try:
+            path.replace(aside)
+        except OSError as failure:
+            where = f"cannot be set aside ({failure.strerror})"
+        else:
+            where = f"is kept as {aside}"
+        log.warning(
+            "%s in %s cannot be used: %s; the file %s, and the daemon goes on without it", what, path, reason, where
+        )
+        return otherwise
+
+
+def _content(path: Path) -> bytes:
+    """The content of a regular file of at most LARGEST_BYTES. Raises OSError, ValueError."""
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:  # never waits for a pipe
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise ValueError("it is not a file")
+        if about.st_size > LARGEST_BYTES:
+            raise ValueError(f"it has {about.st_size} bytes, at most {LARGEST_BYTES} accepted")
+        return file.read(LARGEST_BYTES)

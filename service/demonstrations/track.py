@@ -1,0 +1,47 @@
+"""A track: the poses of one hand, or of the tool, as recorded."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.frame import Vector
+from service.core.intake.hand_estimator import LATE_S
+
+WINDOW = 3  # stamps that are compared with as many before them
+
+Stamps = NDArray[np.int64]
+Rows = NDArray[np.intp]
+
+
+class Track(NamedTuple):
+    """Poses (N, 7) of one stream, x y z and quaternion x y z w, in `frame`; their stamps (N,) [ns]
+    and the times at which they were recorded (N,) [ns].
+    """
+
+    name: str
+    source: str
+    stamps_ns: Stamps
+    logged_ns: Stamps
+    poses: Vector
+    frame: str
+
+    def at(self, rows: Rows | NDArray[np.bool_]) -> Track:
+        """The track with these of its poses only."""
+        return self._replace(stamps_ns=self.stamps_ns[rows], logged_ns=self.logged_ns[rows], poses=self.poses[rows])
+
+
+def clock_parts(stamps: Stamps) -> list[Rows]:
+    """The indices of stamps (N,) [ns], in the order of recording, divided where their clock begins
+    anew: where three of them are older than the three before by more than any delay. A single stamp
+    that is wrong divides nothing.
+    """
+    if len(stamps) < 2 * WINDOW:
+        return [np.arange(len(stamps))]
+    windows = np.lib.stride_tricks.sliding_window_view(stamps, WINDOW)
+    before, behind = np.median(windows[:-WINDOW], axis=1), windows[WINDOW:].max(axis=1)
+    is_anew = behind < before - 1e9 * LATE_S
+    is_anew[1:] &= ~is_anew[:-1]
+    return np.split(np.arange(len(stamps)), np.flatnonzero(is_anew) + WINDOW)

@@ -1,0 +1,76 @@
+"""The tree of a robot's links: each link has one parent, but for the root. Anything else is refused
+in words, and in a time that grows with the number of links alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+MAX_LINKS = 1000  # a humanoid with its hands has 200
+SHOWN = 4  # names in a message
+
+
+class Edge(Protocol):
+    """A joint, by the links that it connects."""
+
+    @property
+    def name(self) -> str:
+        """The joint's own name."""
+
+    @property
+    def parent(self) -> str:
+        """The link that carries it."""
+
+    @property
+    def child(self) -> str:
+        """The link that it carries."""
+
+
+def root_of(links: Sequence[str], joints: Sequence[Edge]) -> str:
+    """The link that all others hang on. Raises ValueError where links and joints are no tree."""
+    if len(links) > MAX_LINKS:
+        raise ValueError(f"{len(links)} links; up to {MAX_LINKS} accepted: leave out what does not belong to the arm")
+    for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
+        if "" in names:
+            raise ValueError(f"a {what} without a name")
+        if twice := _named([name for name, count in Counter(names).items() if count > 1]):
+            raise ValueError(f"{what} {twice} is declared twice; each name once needed")
+    declared, above = set(links), {joint.child: joint for joint in joints}
+    for joint in joints:
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if not link:
+                raise ValueError(f"joint {joint.name!r} names no {role} link")
+            if link not in declared:
+                raise ValueError(f"joint {joint.name!r}: its {role} {link!r} is not declared; a <link> of it needed")
+        if (other := above[joint.child]) is not joint:
+            raise ValueError(
+                f"link {joint.child!r} is the child of two joints, {joint.name!r} and {other.name!r}; one needed: arms "
+                "with closed loops are not supported, cut the loop where it does not carry the tool"
+            )
+    roots = [link for link in links if link not in above]
+    if len(roots) > 1:
+        raise ValueError(f"no joint connects {_named(roots)}; one root needed: connect them by fixed joints")
+    reached, below = set(roots), _children(joints)
+    waiting = list(roots)
+    while waiting:
+        found = below.get(waiting.pop(), [])
+        reached.update(found)
+        waiting += found
+    if lost := [link for link in links if link not in reached]:
+        raise ValueError(f"the joints above {_named(lost)} form a cycle; a tree with one root needed")
+    return roots[0]
+
+
+def _children(joints: Iterable[Edge]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for joint in joints:
+        found.setdefault(joint.parent, []).append(joint.child)
+    return found
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first few of some names, for a message."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(map(repr, names[:SHOWN])) + more

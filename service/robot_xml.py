@@ -1,0 +1,147 @@
+"""The XML of a robot's description, as the world writes it, read in bounded time.
+
+Undeclared prefixes are accepted, because other readers of URDF accept them: elements with a prefix
+hold nothing that a URDF defines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+Element = ElementTree.Element
+MAX_DEPTH = 64  # of elements in each other; a URDF needs 6
+MAX_ELEMENTS = 100_000  # an arm with a hand has about 1000
+ANY_LIMIT = {"lower": "-1e4", "upper": "1e4", "velocity": "1e4", "effort": "0"}  # other readers need one
+LARGEST = 1e6  # of any number of a link or joint
+NUMERIC = {  # attributes with numbers, besides xyz and rpy, by element
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "sphere": ("radius",),
+    "mesh": ("scale",),
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+}
+MACROS = "its macros are not expanded: make a URDF of it first, by `xacro arm.urdf.xacro > arm.urdf`"
+
+
+def element_of(text: str | bytes) -> Element:
+    """The outermost element, without elements and attributes that have a prefix.
+
+    Bytes are decoded as their XML declaration says. Raises ValueError for what is no XML, too deep,
+    too long, or holds macros of xacro.
+    """
+    builder = ElementTree.TreeBuilder()
+    encoded = text if isinstance(text, bytes) else text.encode("utf-8", "replace")
+    parser = expat.ParserCreate(None if isinstance(text, bytes) else "utf-8")
+    parser.buffer_text = True
+    open_tags: list[str] = []
+    count, foreign = 0, 0  # elements so far; how many of the open ones are in one with a prefix
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count, foreign
+        count += 1
+        open_tags.append(tag)
+        if len(open_tags) > MAX_DEPTH:
+            raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_DEPTH} elements in each other")
+        if count > MAX_ELEMENTS:
+            raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_ELEMENTS} elements")
+        matters = len(open_tags) > 1 and open_tags[1] in ("link", "joint")
+        if tag.startswith("xacro:") or (matters and any("${" in one or "$(" in one for one in attributes.values())):
+            raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
+        if foreign or ":" in tag:
+            foreign += 1
+        else:
+            builder.start(tag, {name: value for name, value in attributes.items() if ":" not in name})
+
+    def end(tag: str) -> None:
+        nonlocal foreign
+        open_tags.pop()
+        if foreign:
+            foreign -= 1
+        else:
+            builder.end(tag)
+
+    def characters(data: str) -> None:
+        if not foreign and open_tags:
+            builder.data(data)
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, characters
+    try:
+        parser.Parse(encoded, True)
+    except (expat.ExpatError, LookupError) as error:  # LookupError: an encoding that nobody knows
+        raise ValueError(f"no XML: {error}") from None
+    return builder.close()
+
+
+def readable(data: bytes) -> str:
+    """The text of a file as every reader of XML accepts it: as it is, or, with undeclared prefixes
+    or in another encoding than UTF-8, written anew. Raises ValueError.
+    """
+    robot = element_of(data)
+    try:
+        text = data.decode("utf-8-sig")
+        expat.ParserCreate("utf-8", " ").Parse(text, True)
+    except (UnicodeDecodeError, expat.ExpatError):
+        return ElementTree.tostring(robot, encoding="unicode")
+    return text
+
+
+def numbers(element: Element | None, name: str, default: str) -> tuple[float, ...]:
+    """The finite numbers in an attribute. Raises ValueError."""
+    text = default if element is None else element.get(name, default)
+    try:
+        found = tuple(float(number) for number in text.split())
+    except ValueError:
+        found = (math.nan,)
+    if element is not None and not all(abs(number) <= LARGEST for number in found):
+        raise ValueError(f"<{element.tag} {name}={text!r}>: finite numbers up to {LARGEST:g} needed")
+    return found
+
+
+def three(element: Element | None, name: str, default: str) -> tuple[float, float, float]:
+    """The three finite numbers in an attribute. Raises ValueError."""
+    found = numbers(element, name, default)
+    if len(found) != 3:
+        assert element is not None
+        raise ValueError(f"<{element.tag} {name}={element.get(name)!r}>: {len(found)} numbers, 3 needed")
+    return found[0], found[1], found[2]
+
+
+def check_numbers(robot: Element) -> None:
+    """Raises ValueError for a number of a link or joint that is not finite, or far too large."""
+    for part in (*robot.findall("link"), *robot.findall("joint")):
+        for element in part.iter():
+            for name in element.attrib:
+                if name in ("xyz", "rpy") or name in NUMERIC.get(element.tag, ()):
+                    try:
+                        numbers(element, name, "")
+                    except ValueError as error:
+                        raise ValueError(f"{part.tag} {part.get('name', '')!r}: {error}") from None
+
+
+def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]]) -> str:
+    """The links and joints of a robot alone, as a URDF: without shapes, masses and all else that
+    does not say where links are. Joints that are not `moving`, about these axes, are fixed; those
+    that are have limits that mean nothing, and continuous ones are revolute.
+    """
+    out = Element("robot", name="arm")
+    for link in robot.findall("link"):
+        ElementTree.SubElement(out, "link", name=link.get("name", ""))
+    for joint in robot.findall("joint"):
+        name, kind = joint.get("name", ""), "fixed"
+        if name in moving:
+            kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
+        kept = ElementTree.SubElement(out, "joint", name=name, type=kind)
+        for tag in ("parent", "child", "origin"):
+            if (given := joint.find(tag)) is not None:
+                part = ElementTree.SubElement(kept, tag, given.attrib)
+                for number in part.attrib.keys() & {"xyz", "rpy"}:
+                    part.set(number, " ".join(map(repr, numbers(given, number, ""))))
+        if name in moving:
+            ElementTree.SubElement(kept, "axis", xyz=" ".join(map(repr, moving[name])))
+            ElementTree.SubElement(kept, "limit", ANY_LIMIT)
+    return ElementTree.tostring(out, encoding="unicode")

@@ -1,0 +1,145 @@
+"""A first cell from a URDF alone: the plate, a posture, rates, and a demo that meets its places."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.arms.first_cell import PLACES, Proposal, plate_of, proposed, rates, turn_of_tool, written
+from service.config import load, robot_description
+from service.core.arm.arm import Arm
+from service.core.separation.separation import Separation
+from service.described_arm import description
+from service.learning.via_points import adapted
+from service.shipped import shipped_skill
+from service.urdf import Urdf
+from sim.experiments.rehearsal import rehearse
+from sim.scene import Scene
+from sim.script import HandScript
+from support.paths import ROOT
+
+SHIPPED = ROOT / "service" / "arms"
+SAWYER = Path(__file__).with_name("sawyer.urdf")
+
+
+def published(name: str) -> Path:
+    """A description of `example-robot-data`; who asks is skipped where that is not installed."""
+    try:
+        return next(Path(str(one.locate())) for one in files("example-robot-data") or () if one.name == name)
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data, whose descriptions these are, is not installed")
+
+
+def iiwa() -> Path:
+    found = importlib.util.find_spec("pybullet_data")
+    if found is None or found.origin is None:
+        pytest.skip("pybullet_data, whose description this is, is not installed")
+    return Path(found.origin).with_name("kuka_iiwa") / "model.urdf"
+
+
+ARMS: dict[str, tuple[Callable[[], Path], str]] = {
+    "iiwa": (iiwa, "lbr_iiwa_link_7"),
+    "xarm7": (lambda: published("xarm7.urdf"), "link_eef"),
+    "sawyer": (lambda: SAWYER, "right_hand"),
+    "z1": (lambda: published("z1.urdf"), "gripperStator"),
+    "ur3": (lambda: published("ur3_robot.urdf"), "tool0"),
+    "ur10": (lambda: published("ur10_robot.urdf"), "tool0"),
+    "kinova": (lambda: published("kinova.urdf"), "j2s6s200_end_effector"),
+    "panda": (lambda: published("panda.urdf"), "panda_hand_tcp"),
+    "wam": (lambda: SHIPPED / "wam.urdf", "tool_plate"),
+}
+
+
+def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
+    """The cell as the command writes it."""
+    if proposal.text:
+        (folder / "arm.urdf").write_text(proposal.text)
+    urdf = "arm.urdf" if proposal.text else str(path)
+    (folder / "cell.toml").write_text(written(proposal, urdf, path.name))
+    return folder / "cell.toml"
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name: str, tmp_path: Path) -> None:
+    where, plate = ARMS[name]
+    path = where()
+    proposal = proposed(path)
+    assert proposal.plate == plate
+    cell = load(in_folder(proposal, path, tmp_path))
+    robot = robot_description(cell)
+    arm, posture = Arm(cell, robot), np.array(cell.arm.posture)
+    here = arm.at(posture)
+    assert here.rotation[2, 2] < -math.cos(math.radians(50.0))
+    low = [cell.table.centre[i] - cell.table.half_size[i] for i in range(2)]
+    high = [cell.table.centre[i] + cell.table.half_size[i] for i in range(2)]
+    assert (here.position[:2] > low).all()
+    assert (here.position[:2] < high).all()
+    assert 0.1 < here.position[2] < 0.8
+    assert Separation(cell, robot).clearance(posture, np.empty((0, 3)))[0] > 0.0  # beyond what is kept
+    lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
+    assert (np.minimum(posture - lower, upper - posture) > 0.05 * (upper - lower)).all()
+
+    scene, moved = Scene().in_reach(cell.reach)
+    assert moved == ()
+    taught = adapted(shipped_skill(), scene.via_points(), tolerance=0.001).for_loop()
+    run = rehearse(HandScript(scene, seed=1), lambda _: taught, settings=cell, rate_hz=100)
+    assert run.events.success
+    assert max(run.errors_mm) < 12.0, run.errors_mm
+
+
+def test_the_places_are_those_of_the_demo() -> None:
+    scene = Scene()
+    places = {"start": scene.robot_start, "handover": scene.offer, "glass": scene.glass, "soldering": scene.carry}
+    for name, place in PLACES.items():
+        assert place == pytest.approx(places.pop(name))
+    assert not places
+
+
+@pytest.mark.parametrize(
+    ("name", "plate"),
+    [("baxter.urdf", "right_gripper"), ("so101.urdf", "gripper_frame_link"), ("ur5_gripper.urdf", "")],
+)
+def test_the_plate_is_beyond_the_last_joint_that_is_no_grippers(name: str, plate: str) -> None:
+    urdf = Urdf(description(published(name), cover=False))
+    found = plate_of(urdf)
+    assert plate in ("", found)
+    moving = [joint.name for joint in urdf.chain(found) if joint.kind != "fixed"]
+    assert not [one for one in moving if "finger" in one or "knuckle" in one or "jaw" in one]
+    assert len(moving) == {"baxter.urdf": 7, "so101.urdf": 5, "ur5_gripper.urdf": 6}[name]
+
+
+def test_the_tool_of_a_plate_that_points_along_its_x_is_turned() -> None:
+    z1 = Urdf(description(published("z1.urdf"), cover=False))
+    assert turn_of_tool(z1.chain("gripperStator")) == pytest.approx((0.0, 0.5**0.5, 0.0, 0.5**0.5), abs=1e-6)
+    for arm, plate in (("wam", "tool_plate"), ("ur5", "tool0"), ("fr3", "fr3_hand_tcp")):
+        urdf = Urdf((SHIPPED / f"{arm}.urdf").read_text())
+        assert turn_of_tool(urdf.chain(plate)) == (0.0, 0.0, 0.0, 1.0), arm
+
+
+def test_accelerations_follow_from_velocities_and_less_where_efforts_are_small(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    text = (SHIPPED / "ur5.urdf").read_text()
+    moving = Urdf(text).movable("tool0")
+    acceleration, jerk, by_effort = rates(text, moving)
+    velocity = np.array([joint.velocity for joint in moving])
+    assert by_effort
+    assert (np.array(acceleration) <= np.minimum(velocity / 0.25, 15.0) + 0.05).all()
+    np.testing.assert_allclose(jerk, np.minimum(40.0 * np.array(acceleration), 500.0), rtol=0.01)
+    weaker = text.replace('effort="150', 'effort="50').replace('effort="28', 'effort="9')
+    assert max(rates(weaker, moving)[0]) < min(acceleration)
+    for without in (
+        re.sub(r' effort="[^"]*"', "", text),
+        re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL),
+    ):
+        found, _, by_effort = rates(without, moving)
+        assert not by_effort
+        np.testing.assert_allclose(found, np.minimum(velocity / 0.25, 15.0), rtol=0.01)
+    assert capfd.readouterr().err == ""

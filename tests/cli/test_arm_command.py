@@ -1,0 +1,87 @@
+"""`thirdhand arm`: what it prints, what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from service.config import Settings, load
+from support.cell import told
+from support.paths import ROOT
+
+UR5 = ROOT / "service" / "arms" / "ur5.urdf"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a first cell for a UR5, and what was printed."""
+    folder = tmp_path_factory.mktemp("arm")
+    shutil.copy(UR5, folder / "my.urdf")
+    done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return folder, done.stdout
+
+
+def test_it_prints_what_was_understood(made: tuple[Path, str]) -> None:
+    folder, text = made
+    for wanted in (
+        "my.urdf: 8 links, 6 joints before the plate",
+        "plate     tool0",
+        "shoulder_pan_joint           revolute      -6.28     6.28      3.14",
+        "are a guess",
+        "capsules",
+        "reach     0.36 to 0.91 m from (0.00, 0.00, 0.09)",
+        "posture   [",
+        f"next:    thirdhand demo --arm {folder / 'cell.toml'}",
+    ):
+        assert wanted in text, wanted
+
+
+def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
+    folder, _ = made
+    cell = load(folder / "cell.toml")
+    assert isinstance(cell, Settings)
+    assert 'urdf = "my.urdf"  # beside this file' in (folder / "cell.toml").read_text()
+    with Image.open(folder / "cell.png") as picture:
+        assert min(picture.size) > 500
+        assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20  # something is drawn
+
+
+def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
+    folder, _ = made
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
+    assert (done.returncode, "cell.toml is there already: name another one by --output" in done.stderr) == (1, True)
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (("nowhere.urdf",), 2, "cannot read nowhere.urdf"),
+        ((str(UR5), "--plate", "hand"), 1, "no link 'hand'; the last ones of the arm are tool0"),
+        ((str(UR5), "--output", "cell.txt"), 2, "cell.txt: a name that ends in .toml needed"),
+        ((str(UR5), "--at", "9", "0", "0"), 2, "9 given, -3 to 3 needed"),
+        ((str(UR5), "--at", "-2", "0", "0"), 2, "no posture found with the tool at"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_sentence(
+    options: tuple[str, ...], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = told("arm", *options)
+    assert (done.returncode, said in done.stderr) == (code, True), done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_arm_stands_where_it_is_told_with_its_meshes(tmp_path: Path) -> None:
+    shutil.copy(UR5, tmp_path / "my.urdf")
+    told("arm", str(tmp_path / "my.urdf"), "--at", "0.1", "-0.3", "0.05", "--output", str(tmp_path / "c.toml"))
+    cell = load(tmp_path / "c.toml")
+    assert cell.reach.centre == pytest.approx((0.1, -0.3, 0.139), abs=1e-3)
+    assert cell.arm.urdf == str(tmp_path / "c.urdf")

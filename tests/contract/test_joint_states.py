@@ -1,0 +1,134 @@
+"""Joint states as robots publish them: which messages give the state of an arm, and when."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from service.contract.joint_states import JointStates, measured
+from service.contract.messages import JointState, WireError
+
+NAMES = ("a", "b", "c")
+NAN = math.nan
+STATE = JointState(1, NAMES, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("message", "velocity"),
+    [
+        (STATE, (0.1, 0.2, 0.3)),
+        (STATE._replace(velocity=()), (0.0, 0.0, 0.0)),
+        (STATE._replace(velocity=(NAN,) * 3, effort=(NAN,) * 3), (0.0, 0.0, 0.0)),
+        (STATE._replace(velocity=(0.1, NAN, 0.3)), (0.1, 0.0, 0.3)),
+        (STATE._replace(velocity=(0.1, 0.2)), (0.0, 0.0, 0.0)),
+        (STATE._replace(velocity=(0.1,) * 9), (0.0, 0.0, 0.0)),
+        (STATE._replace(velocity=(0.1, math.inf, 0.3)), (0.1, math.inf, 0.3)),
+        (JointState(1, ("c", "x", "a", "b"), (3.0, NAN, 1.0, 2.0), (0.3, NAN, 0.1, 0.2)), (0.1, 0.2, 0.3)),
+    ],
+)
+def test_a_velocity_that_is_not_measured_is_zero_and_all_else_is_as_given(
+    message: JointState, velocity: tuple[float, ...]
+) -> None:
+    assert measured(message, NAMES) == ((1.0, 2.0, 3.0), velocity)
+
+
+@pytest.mark.parametrize("message", [STATE._replace(position=(1.0, 2.0)), JointState(1, ("a",), (1.0,), ())])
+def test_joints_or_positions_that_are_missing_are_an_error(message: JointState) -> None:
+    with pytest.raises(WireError):
+        measured(message, NAMES)
+
+
+def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
+    return JointState(stamp_ns, tuple(names), (value,) * len(names), (NAN,) * len(names))
+
+
+def test_a_message_with_all_joints_passes_as_it_is_whatever_else_it_carries() -> None:
+    states = JointStates(NAMES, 0.1)
+    message = JointState(1, ("finger", "c", "b", "a"), (9.0, 3.0, 2.0, 1.0), ())
+    assert states.take(message, 0.0) is message
+
+
+def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_comes() -> None:
+    states, fingers = JointStates(NAMES, 0.1), part("xy", 1)
+    for k in range(300):
+        at_s = k / 1000
+        assert states.take(fingers, at_s) is None
+        assert states.incomplete(fingers, at_s) is None
+        assert states.take(STATE._replace(position=()), at_s) is None  # velocities only
+        if k % 10 == 0:
+            assert states.take(STATE, at_s) is STATE
+    for k in range(300, 500):
+        assert states.take(fingers, k / 1000) is None
+    assert states.incomplete(fingers, 0.5) is fingers
+
+
+@pytest.mark.parametrize("split", ["a bc", "c ba", "a b c", "ab bc ca", "ax by cz"])
+def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(split: str) -> None:
+    states, found, parts = JointStates(NAMES, 0.1), [], split.split()
+    dice = random.Random(1)
+    for k in range(500):
+        at_s = k / 1000
+        for number in dice.sample(range(len(parts)), len(parts)):
+            if k % (1 + 9 * (number == 0)) == 0:  # the first publishes at 100 Hz, the others at 1000 Hz
+                state = states.take(part(parts[number], k + 1, value=at_s), at_s)
+                found += [] if state is None else [(at_s, state)]
+    assert len(found) >= 49
+    for at_s, state in found:
+        assert state.names == NAMES
+        assert all(at_s - value <= 0.011 for value in state.position)
+        assert state.velocity == (0.0, 0.0, 0.0)
+    stamps = [state.stamp_ns for _, state in found]
+    assert stamps == sorted(stamps)
+    assert len(set(stamps)) == len(stamps) or split == "ab bc ca"  # two publishers of a joint may repeat a stamp
+
+
+def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> None:
+    states = JointStates(NAMES, 0.1)
+    for k in range(400):
+        at_s = k / 1000
+        state = states.take(part("ab", k + 1), at_s)
+        assert state is None
+        whole = states.take(part("c", k + 1), at_s) if k < 100 else None
+        assert (whole is not None) == (k < 100)
+    assert at_s > 0.3
+    lacking = states.incomplete(part("ab", 400), at_s)
+    assert lacking is not None
+    with pytest.raises(WireError, match=r"joints \['c'\] missing among 2, a, b"):
+        measured(lacking, NAMES)
+
+
+def test_after_a_pause_nothing_is_missing_at_once() -> None:
+    states = JointStates(NAMES, 0.1)
+    assert states.take(STATE, 0.0) is STATE
+    for message in (part("xy", 2), part("a", 2)):
+        assert states.take(message, 5.0) is None
+        assert states.incomplete(message, 5.0) is None
+
+
+def test_parts_that_are_too_old_are_not_assembled() -> None:
+    states = JointStates(NAMES, 0.1)
+    assert states.take(part("a", 1), 0.0) is None
+    assert states.take(part("bc", 2), 60.0) is None
+    assert states.take(part("a", 3), 60.05) is not None
+
+
+def test_a_stamp_that_does_not_advance_shows_in_the_state() -> None:
+    states = JointStates(NAMES, 0.1)
+    stamps = set()
+    for k in range(1, 50):
+        states.take(part("ab", 7), k / 1000)
+        state = states.take(part("c", 7 + k), k / 1000)
+        assert state is not None
+        stamps.add(state.stamp_ns)
+    assert stamps == {7}
+
+
+def test_a_joint_without_a_measured_position_is_taken_from_who_measures_it() -> None:
+    states = JointStates(NAMES, 0.1)
+    assert states.take(part("ab", 1, value=NAN), 0.0) is None
+    assert states.take(part("bc", 1), 0.0) is None
+    state = states.take(part("a", 2), 0.001)
+    assert state is not None
+    assert state.position == (0.5, 0.5, 0.5)

@@ -1,0 +1,65 @@
+"""Text from files and the network is shown without effects: in the terminal, the log, the viewer,
+the report and on the web page.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.cli.main import main
+from service.cli.serve import PrintableFormatter
+from service.client import RefusedError, decoded
+from service.contract.printable import as_markdown, printable, printable_lines, printable_values
+from service.contract.requests import Status
+from service.learning.skill_file import SkillError
+from service.learning.skill_file import decoded as skill_of
+from service.viewer.learned import about, skill_contents
+from support.wicked import WICKED, wicked_skill
+
+
+@given(st.text())
+def test_any_text_becomes_one_printable_line_and_stays_so(text: str) -> None:
+    shown = printable(text)
+    assert shown.isprintable()
+    assert printable(shown) == shown
+    assert shown == text or not text.isprintable()
+    assert all(line.isprintable() for line in printable_lines(text).split("\n"))
+
+
+def test_letters_of_all_languages_stay_and_controls_are_named() -> None:
+    assert printable("Löten – 焊接 ±") == "Löten – 焊接 ±"
+    assert printable(WICKED) == r"a\nb\x1b[31mred\x07\u202egnirts\r<b>|`*_$x$"
+    assert printable_lines("one\ntwo\x1b[2J") == "one\ntwo\\x1b[2J"
+    assert printable("\udc80") == r"\udc80"
+    assert printable_values({"a\n": ["\x00", 1, None]}) == {r"a\n": [r"\x00", 1, None]}
+    assert as_markdown("<b>a|b</b>") == r"\<b\>a\|b\</b\>"
+
+
+def test_names_inside_a_skill_are_escaped_where_the_skill_is_read_and_drawn() -> None:
+    assert skill_of(wicked_skill(), origin="a file").name == printable(WICKED)
+    contents = skill_contents(wicked_skill())
+    assert contents.name == printable(WICKED)
+    text = about(contents, 0)
+    assert text.count(as_markdown(WICKED)) == 3  # heading, a row of the table, a warning
+    assert "\x1b" not in text
+    assert "<b>" not in text
+
+
+def test_errors_logs_and_replies_quote_without_effects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert str(SkillError(f"no array {WICKED}")) == "\n".join(map(printable, f"no array {WICKED}".splitlines()))
+    record = logging.LogRecord("", logging.INFO, "", 0, WICKED, (), None)
+    assert "\x1b" not in PrintableFormatter("%(message)s").format(record)
+    assert main(["replay", str(tmp_path / "no\x1b[31m such.mcap")]) == 1
+    error = capsys.readouterr().err
+    assert r"no\x1b[31m such.mcap" in error
+    assert "\x1b" not in error
+    for data in (b"[", b"{}", b'"\\u001b"', b"[" * 100_000, b"\xff"):
+        with pytest.raises(RefusedError, match="not a Status"):
+            decoded(data, Status)
+    assert decoded(msgspec.json.encode({"a": WICKED}), dict) == {"a": printable(WICKED)}

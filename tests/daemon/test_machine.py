@@ -1,0 +1,112 @@
+"""A machine that is too busy: told from one that keeps time, and remembered as of when the arm
+stopped.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+from service.cli.demo import too_busy
+from service.cli.status import rows
+from service.contract.incidents import Evidence, explained
+from service.contract.records import Mode, Reason
+from service.contract.requests import Source
+from service.daemon.machine import Machine
+from support.cell import Tracker, serving
+
+FOLLOWS, SILENT = (Mode.FOLLOW, Reason.NONE), (Mode.FAULT, Reason.ARM_SILENT)
+
+
+class Watched:
+    """A machine of which 500 ticks a second are told, each tenth of one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._pressure, self._now_s, self._tick, self._missed, self._waited_s = folder / "cpu", 0.0, 0, 0, 5.0
+        self.machine = Machine(self._pressure)
+
+    def goes_on(
+        self,
+        seconds: float,
+        *,
+        missed: int = 0,
+        late_ms: float = 0.3,
+        waiting: float = 0.2,
+        outcome: tuple[Mode, Reason] = FOLLOWS,
+    ) -> None:
+        for _ in range(round(10 * seconds)):
+            self._now_s, self._tick, self._missed = self._now_s + 0.1, self._tick + 50, self._missed + missed
+            self._waited_s += 0.1 * waiting
+            waited_us = round(1e6 * self._waited_s)
+            self._pressure.write_text(f"some avg10=1.00 avg60=0.00 avg300=0.00 total={waited_us}\nfull total=0\n")
+            self.machine.update(self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=outcome)
+
+
+def test_a_machine_that_keeps_time_is_not_blamed(tmp_path: Path) -> None:
+    watched = Watched(tmp_path)
+    watched.goes_on(5.0, late_ms=2.0, waiting=0.6)
+    watched.goes_on(1.0, outcome=SILENT)
+    assert (watched.machine.now, watched.machine.at_stop) == ("", "")
+
+
+def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
+    watched = Watched(tmp_path)
+    watched.goes_on(5.0, missed=2)
+    assert watched.machine.now == "40 of 1000 deadlines were missed"
+    watched.goes_on(5.0, late_ms=45.0)
+    assert watched.machine.now == "the loop was up to 45 ms late"
+    watched.goes_on(5.0, waiting=0.95)
+    assert watched.machine.now == "processes waited for a processor 95% of the time"
+    watched.goes_on(5.0)
+    assert watched.machine.now == ""
+
+
+def test_where_the_system_tells_nothing_the_loop_alone_is_judged(tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "nothing")
+    for k in range(30):
+        machine.update(k / 10, tick=50 * k, missed=k, late_ms=1.0, outcome=FOLLOWS)
+    assert machine.now == "20 of 1000 deadlines were missed"
+
+
+def test_it_is_remembered_as_long_as_the_arm_stands_for_it(tmp_path: Path) -> None:
+    watched = Watched(tmp_path)
+    watched.goes_on(3.0, waiting=1.0)
+    watched.goes_on(60.0, outcome=SILENT)
+    assert (watched.machine.now, watched.machine.at_stop[:16]) == ("", "processes waited")
+    watched.goes_on(3.0)
+    assert watched.machine.at_stop == ""
+
+
+def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
+    seen = Evidence(busy="the loop was up to 45 ms late")
+    for reason in Reason:
+        blamed = explained(reason, seen).why.startswith("this machine was too busy, the loop was up to 45 ms late; ")
+        assert blamed == (reason in (Reason.STALE_HAND, Reason.ARM_ERROR, Reason.ARM_SILENT))
+        assert blamed == ("see what else runs on this machine" in explained(reason, seen).remedy)
+    refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'")
+    assert "busy" not in explained(Reason.STALE_HAND, seen._replace(sources={"left": refused})).why
+
+
+def test_a_service_that_stood_still_names_the_machine_before_the_tracker(tmp_path: Path) -> None:
+    with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as tracker:
+        daemon.until(lambda status: status["mode"] == "follow", timeout_s=60.0)
+        daemon.process.send_signal(signal.SIGSTOP)
+        tracker.left = tracker.right = None
+        time.sleep(0.5)
+        daemon.process.send_signal(signal.SIGCONT)
+        daemon.until(lambda status: status["reason"] == "stale_hand")
+        time.sleep(3.0)  # longer than what is looked at
+        status = daemon.client.status()
+    assert status.because.startswith("this machine was too busy, ")
+    assert "deadlines were missed" in status.busy
+    assert "hand was last seen" in status.because
+    assert rows(status)["machine"] == f"too busy: {status.busy}"
+
+
+def test_a_bench_that_skips_periods_is_told_by_the_demo() -> None:
+    calm = {"periods": 5000, "skipped": 20, "longest_pause_ms": 12.0}
+    assert too_busy(calm) == ""
+    assert too_busy(calm | {"skipped": 400, "longest_pause_ms": 90.0}) == (
+        "the bench missed 400 of its 5000 periods, the bench stood still for 90 ms"
+    )

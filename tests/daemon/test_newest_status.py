@@ -1,0 +1,111 @@
+"""A status that comes after a request was answered shows what that request did, whatever way it
+comes.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.client import Client
+from service.daemon.newest_status import NewestStatus
+from sim.scene import Scene
+from support.cell import Daemon, Tracker, serving
+
+ROUNDS = 12
+
+
+def test_a_status_is_begun_after_it_was_requested_and_a_flood_shares_one() -> None:
+    newest, made = NewestStatus(), 0
+    answers: list[bytes] = []
+    first = threading.Thread(target=lambda: answers.append(newest.requested()))
+    newest.begin()  # before any request: not new enough for one
+    first.start()
+    while not first.ident or not newest._is_wanted:  # noqa: SLF001
+        time.sleep(0.001)
+    newest.end(b"old")
+    first.join(0.05)
+    assert answers == []
+    crowd = [threading.Thread(target=lambda: answers.append(newest.requested(published=True))) for _ in range(20)]
+    for one in crowd:
+        one.start()
+    while len(answers) < 21:
+        newest.wait(1.0)
+        time.sleep(0.01)
+        assert newest.begin() == (made == 0)
+        made += 1
+        newest.end(b"new %d" % made)
+        time.sleep(0.01)
+    assert made <= 2
+    newest.close()
+    assert newest.requested() == b"new %d" % made
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder: Path = tmp_path_factory.mktemp("newest")
+    with serving(folder, "--arm", "assumed") as running, Tracker(running.session):
+        running.until(lambda status: status["mode"] == "follow")
+        yield running
+
+
+def shown(status: dict[str, Any], request: str, reply: dict[str, Any]) -> bool:
+    """Whether a status shows what a request did."""
+    if request in ("hold", "resume", "reset"):
+        return status["tick"] >= reply["tick"] and (status["reason"] == "operator") == (request == "hold")
+    if request == "stage":
+        return bool(status["stage"]) and status["stage"][0] == "glass"
+    return status["places"] == [point["name"] for point in reply["points"]]
+
+
+PLACES = [{"name": p.name, "left": p.left, "right": p.right, "tool": p.tool, "std": 0.01} for p in Scene().via_points()]
+REQUESTS: list[tuple[str, dict[str, Any]]] = [
+    ("hold", {}),
+    ("resume", {}),
+    ("hold", {}),
+    ("reset", {}),
+    ("resume", {}),
+    ("stage", {"name": "glass"}),
+    ("via_points", {"op": "add", "points": PLACES[:1]}),
+    ("via_points", {"op": "remove", "names": [PLACES[0]["name"]]}),
+    ("via_points", {"op": "add", "points": PLACES[1:2]}),
+    ("via_points", {"op": "clear"}),
+    ("skill", {"name": "soldering"}),
+]
+
+
+@pytest.mark.parametrize("way", ["queryable", "Client", "published"])
+def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -> None:
+    published: list[dict[str, Any]] = []
+    subscriber = daemon.session.declare_subscriber(
+        "thirdhand/status", lambda sample: published.append(json.loads(sample.payload.to_bytes()))
+    )
+    client = Client(daemon.session)
+    for round_ in range(ROUNDS if way != "published" else 4):
+        for request, body in REQUESTS if round_ == 0 else REQUESTS[:5]:
+            if request == "reset":
+                continue  # there is no fault; it is answered like the others
+            reply = daemon.client.ask(request, body)
+            if way == "queryable":
+                (answer,) = daemon.session.get("thirdhand/status", timeout=10.0)
+                assert answer.ok is not None
+                status = json.loads(answer.ok.payload.to_bytes())
+            elif way == "Client":
+                status = json.loads(json.dumps(client.ask("status")))
+            else:
+                before = len(published)
+                end = time.monotonic() + 5.0
+                while len(published) < before + 3 and time.monotonic() < end:
+                    time.sleep(0.01)
+                assert all(one["tick"] >= reply["tick"] for one in published[before:]), request
+                status = published[before]
+                if request != "stage":  # which the hands tell anew
+                    assert all(shown(one, request, reply) for one in published[before:]), request
+            assert shown(status, request, reply), (request, status)
+            time.sleep(0.013 * round_ % 0.1)  # at every phase of the published ones
+    subscriber.undeclare()

@@ -1,0 +1,101 @@
+"""A running daemon and joint states as robots publish them: the arm is found among whatever else
+its topic carries, and what is missing is named.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from service.config import Settings
+from service.contract import cdr
+from service.contract.messages import JointState
+from support.cell import Daemon, serving, told
+
+JOINTS = Settings().joints.names
+AT = dict(zip(JOINTS, Settings().arm.posture, strict=True))
+NAN = math.nan
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with serving(tmp_path_factory.mktemp("joints")) as running:
+        yield running
+
+
+def state(*names: str, velocity: tuple[float, ...] | None = None, **others: float) -> JointState:
+    """A state of joints of the arm at its posture, and of `others`."""
+    named = {name: AT[name] for name in names} | others
+    unmeasured = (NAN,) * len(named)
+    given = unmeasured if velocity is None else velocity
+    return JointState(time.time_ns(), tuple(named), tuple(named.values()), given, unmeasured)
+
+
+CASES: dict[str, Callable[[int], list[JointState]]] = {
+    "positions only": lambda k: [state(*JOINTS)],
+    "fewer velocities than joints": lambda k: [state(*JOINTS, velocity=(0.0,) * 7, left_finger=0.1, right_finger=NAN)],
+    "a gripper between": lambda k: [state(left_finger=0.1) for _ in range(4)] + [state(*JOINTS[::-1])] * (k % 5 == 0),
+    "two publishers": lambda k: [state(*JOINTS[:4])] * (k % 2) + [state(finger=1.0), state(*JOINTS[4:], finger=1.0)],
+    "a joint each": lambda k: [state(name) for name in JOINTS],
+    "every joint twice": lambda k: [state(name) for name in (*JOINTS[:3], *JOINTS[:3], *JOINTS)],
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_arm_is_found_whatever_else_its_topic_carries(daemon: Daemon, case: str) -> None:
+    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
+    daemon.until(lambda now: now["reason"] == "arm_not_ready")
+    before = daemon.client.status().rejected
+
+    def publish() -> None:
+        k = 0
+        while not ended.wait(0.004):
+            for message in CASES[case](k):
+                publisher.put(cdr.encode_joints(message))
+            k += 1
+
+    with_publisher = threading.Thread(target=publish)
+    with_publisher.start()
+    try:
+        found = daemon.until(lambda now: now["reason"] == "no_hands")
+    finally:
+        ended.set()
+        with_publisher.join()
+        publisher.undeclare()
+    lost = {cause: n - before.get(cause, 0) for cause, n in found["rejected"].items()}
+    assert not any(lost.values()), lost
+
+
+def test_a_part_of_the_arm_that_nobody_publishes_is_named(daemon: Daemon) -> None:
+    publisher = daemon.session.declare_publisher("thirdhand/joints/state")
+    end = time.monotonic() + 1.5
+    while time.monotonic() < end:
+        publisher.put(cdr.encode_joints(state(*JOINTS[:3], finger=0.0)))
+        publisher.put(cdr.encode_joints(state(*JOINTS[4:])))
+        because = daemon.client.status().because
+        time.sleep(0.01)
+    assert because == (
+        f"what comes of the arm is rejected as incomplete: joints ['{JOINTS[3]}'] missing among 6, "
+        + ", ".join(name for name in JOINTS if name != JOINTS[3])
+    )
+
+
+def test_doctor_names_the_number_that_was_wrong(daemon: Daemon) -> None:
+    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
+
+    def publish() -> None:
+        while not ended.wait(0.004):
+            publisher.put(cdr.encode_joints(state(*JOINTS, velocity=(0.0,) * 6 + (math.inf,))))
+
+    with_publisher = threading.Thread(target=publish)
+    with_publisher.start()
+    try:
+        said = told("doctor", "--connect", daemon.endpoint, "--seconds", "1").stdout
+    finally:
+        ended.set()
+        with_publisher.join()
+    assert f"rejected as not_finite: {JOINTS[6]} at inf rad/s; a finite number needed" in said

@@ -1,0 +1,59 @@
+"""Arms with continuous and sliding joints, and with joints beyond the plate, do the soldering task
+at the bench in every engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.config import Settings
+from service.contract.records import Mode
+from service.launch import ENGINES
+from service.learning.via_points import adapted
+from service.shipped import shipped_skill
+from sim.bench import Bench
+from sim.engines import world_of
+from sim.experiments.rehearsal import rehearse
+from sim.scene import Scene
+from sim.script import HandScript
+from support.turning import BEYOND, cell_in, continuous_cell, continuous_urdf, sliding_cell
+
+SCENE = Scene()
+
+
+def with_gripper(folder: Path) -> Settings:
+    """A cell whose arm has a gripper with <mimic>, and a wheel and a cart beside it."""
+    posture = continuous_cell(folder).arm.posture
+    return cell_in(folder, continuous_urdf().replace("</robot>", BEYOND + "</robot>"), posture=posture)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("made", [continuous_cell, sliding_cell, with_gripper])
+def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engine: str) -> None:
+    cell = made(tmp_path)
+    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
+    world = world_of(engine)
+    run = rehearse(HandScript(SCENE, seed=1), lambda _: taught, settings=cell, rate_hz=100, keep=True, world=world)
+    assert run.events.success
+    assert max(run.errors_mm) <= 3.0, run.errors_mm
+    frames, limits = run.frames, cell.joints
+    assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
+    assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
+    assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
+    assert np.abs(np.diff(frames["joints"], axis=0)).max() < 0.03
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_bench_has_the_tool_where_the_core_has_it(tmp_path: Path, engine: str) -> None:
+    cell = sliding_cell(tmp_path)
+    posture = (0.2, *cell.arm.posture[1:])
+    with (
+        Bench(HandScript(SCENE, seed=1), settings=cell, world=world_of(engine)) as at_zero,
+        Bench(HandScript(SCENE, seed=1), settings=cell, posture=posture, world=world_of(engine)) as moved,
+    ):
+        before, after = at_zero.observe().tool.position, moved.observe().tool.position
+    np.testing.assert_allclose(np.subtract(after, before), [0.0, 0.2, 0.0], atol=1e-4)

@@ -1,0 +1,64 @@
+"""The demo at any rate, with any arm and in both engines: the bench plays commands back at the pace
+at which the service gives them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+
+from service.launch import ENGINES
+from service.shipped import ARMS, cell_of
+from sim.experiments.rehearsal import rehearse
+from sim.network import BenchError
+from sim.script import HandScript
+from support.demo import SCENE, Played, played, taught
+
+RATES_HZ = (100, 250, 500, 700, 1000)
+LAG_TICKS = 2.0  # of the arm behind its command
+SPEED_RADPS = 0.75  # of the fastest joint in this scene, about
+
+
+def done(rate_hz: int, arm: str, engine: str, bench_hz: int | None = None) -> Played:
+    if importlib.util.find_spec(engine) is None:
+        pytest.skip(f"{ENGINES[engine]} is not installed")
+    return played(cell_of(arm, rate_hz=rate_hz), engine, bench_hz=bench_hz)
+
+
+def assert_succeeded(run: Played, rate_hz: int, bench_hz: int | None = None) -> None:
+    assert run.events.success
+    assert run.followed
+    for name in ("handover", "grasp", "carry"):
+        assert getattr(run.events, name).error_mm < 1.0
+    assert run.error_rad < SPEED_RADPS * (LAG_TICKS / rate_hz + LAG_TICKS / (bench_hz or rate_hz))
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "arm", "engine"),
+    [(100, "ur5", "mujoco"), (250, "franka", "pybullet"), (700, "ur5", "pybullet"), (1000, "wam", "mujoco")],
+)
+def test_the_demo_succeeds_at_other_rates(rate_hz: int, arm: str, engine: str) -> None:
+    assert_succeeded(done(rate_hz, arm, engine), rate_hz)
+
+
+@pytest.mark.parametrize(("rate_hz", "bench_hz"), [(1000, 250), (100, 500)])
+def test_a_bench_of_another_rate_follows_the_service_at_its_own_pace(rate_hz: int, bench_hz: int) -> None:
+    assert_succeeded(done(rate_hz, "wam", "pybullet", bench_hz), rate_hz, bench_hz)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_the_demo_succeeds_at_every_rate_with_every_arm_in_every_engine(rate_hz: int, engine: str, arm: str) -> None:
+    assert_succeeded(done(rate_hz, arm, engine), rate_hz)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_at_50_hz_the_loop_does_the_task_and_a_follower_says_why_it_cannot(arm: str) -> None:
+    cell = cell_of(arm, rate_hz=50)
+    run = rehearse(HandScript(SCENE, seed=1), lambda _: taught(), settings=cell)
+    assert run.events.success
+    assert max(run.errors_mm) < 1.0
+    with pytest.raises(BenchError, match=r"50 Hz is too slow: .* an arm brakes 20 ms after its last command; 67 Hz"):
+        played(cell)

@@ -1,0 +1,95 @@
+"""The demo in process and faster than real time: the service's core, its published commands, and
+the bench that plays them back, each at its own rate.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from service.config import Settings, robot_description
+from service.contract.cdr import encode_attachment
+from service.contract.messages import Attachment
+from service.contract.records import SIDES, Mode
+from service.core.controller import Controller, outgoing
+from service.core.frame import Event, Tick
+from service.core.skill.skill import Skill
+from service.learning.via_points import adapted
+from service.shipped import shipped_skill
+from sim.bench import Bench, TaskEvents
+from sim.closed_loop import HANDS_HZ, START_NS, begin_when_settled, hand_event, joints_event
+from sim.engines import world_of
+from sim.network import Commands, Gripper, Led
+from sim.scene import Scene
+from sim.script import HandScript
+
+SCENE = Scene()
+
+
+class Played(NamedTuple):
+    """How the task went, the largest joint error against the command [rad], and whether the service
+    followed from the script's beginning to its end.
+    """
+
+    events: TaskEvents
+    error_rad: float
+    followed: bool
+
+
+class _Bytes:
+    """Bytes as Zenoh hands them over."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+
+class _Sample(NamedTuple):
+    payload: _Bytes
+    attachment: _Bytes
+
+
+@functools.cache
+def taught() -> Skill:
+    """The shipped skill with the nominal scene's places."""
+    return adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
+
+
+def played(settings: Settings, engine: str | None = None, *, bench_hz: int | None = None) -> Played:
+    """One demo of the nominal scene; the bench's rate is the settings' unless another is given.
+
+    Raises BenchError.
+    """
+    period_s, names = settings.period_s, settings.joints.names
+    at_bench = msgspec.structs.replace(settings, rate_hz=bench_hz or settings.rate_hz)
+    controller = Controller(settings, taught(), urdf=robot_description(settings))
+    error_rad, followed, index = 0.0, True, 0
+    with Bench(HandScript(SCENE, seed=1), settings=at_bench, world=world_of(engine)) as bench:
+        commands = Commands(names)
+        led, every = Led(bench, commands, Gripper()), max(1, round(at_bench.rate_hz / HANDS_HZ))
+        while not bench.finished:
+            inbox: list[Event] = []
+            while bench.tick * bench.period_s <= index * period_s + 1e-9:
+                begin_when_settled(bench)
+                seen = led.step()[0]
+                stamp_ns = START_NS + round(bench.tick * bench.period_s * 1e9)
+                if bench.tick % every == 0:
+                    for side, pose in zip(SIDES, bench.script.sample(seen.time_s), strict=True):
+                        x, y, z, *orientation = pose.tolist()
+                        inbox.append(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))  # type: ignore[arg-type]
+                inbox.append(joints_event(names, seen.joints, seen.joint_velocities, stamp_ns))
+            frame = controller.step(Tick(index, tuple(inbox)))
+            tick_ns = START_NS + round(index * period_s * 1e9)
+            for key, payload in outgoing(frame, tick_ns, names):
+                if key == "joints/command":
+                    attachment = _Bytes(encode_attachment(Attachment(index, tick_ns, 0)))
+                    commands.receive(_Sample(_Bytes(payload), attachment))  # type: ignore[arg-type]
+                    error_rad = max(error_rad, float(np.abs(frame["joints"] - seen.joints).max()))
+            followed &= bool(bench.waiting or frame["mode"] == Mode.FOLLOW)
+            index += 1
+        return Played(bench.events(), error_rad, followed)

@@ -1,0 +1,113 @@
+"""Takes with a stretch in which the track of a hand, or of the tool, is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.contract import cdr
+from service.contract.channels import POSE
+from service.contract.messages import BASE, PoseStamped
+from service.learning.demonstration import Demonstration
+from service.recording.mcap_file import McapFile
+
+KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
+START_NS = 10**18
+
+
+class Stream(NamedTuple):
+    """Poses (N, 7) of one stream, their stamps and times of recording (N,) [ns]."""
+
+    stamps_ns: np.ndarray
+    logged_ns: np.ndarray
+    poses: np.ndarray
+
+
+Streams = dict[str, Stream]
+Spoil = Callable[[Streams, str, np.ndarray, np.random.Generator], None]
+"""Spoils the stream of this name in place in the samples of a mask (N,)."""
+
+
+def streams_of(take: Demonstration, *, delay_s: float = 0.004) -> Streams:
+    """The streams of a take, each sample recorded a moment after its stamp."""
+    stamps = START_NS + take.stamps_ns - take.stamps_ns[0]
+    logged = stamps + round(1e9 * delay_s)
+    return {name: Stream(stamps.copy(), logged.copy(), np.array(getattr(take, name))) for name in KEYS}
+
+
+def write_streams(path: Path, streams: Mapping[str, Stream], cell: str = "cell") -> Path:
+    """A file of these streams, in the order of recording."""
+    rows = sorted(
+        (int(stream.logged_ns[i]), name, i) for name, stream in streams.items() for i in range(len(stream.poses))
+    )
+    with McapFile(path, joints=0, attached=False) as file:
+        for logged_ns, name, i in rows:
+            row = streams[name].poses[i].tolist()
+            pose = PoseStamped(int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:]))
+            file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
+    return path
+
+
+def _moved(streams: Streams, name: str, mask: np.ndarray, by: np.ndarray) -> None:
+    streams[name].poses[mask, :3] += by
+
+
+def jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The track is elsewhere, and moves there as it did."""
+    way = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.25, 0.8) * way / np.linalg.norm(way))
+
+
+def spikes(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """Each third sample is somewhere else each time."""
+    rows = np.flatnonzero(mask)[::3]
+    way = random.normal(size=(len(rows), 3))
+    streams[name].poses[rows, :3] += 0.5 * way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def nans(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker publishes NaN."""
+    streams[name].poses[mask, : random.integers(1, 8)] = np.nan
+
+
+def far(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The track is in millimetres."""
+    streams[name].poses[mask, :3] *= 1000.0
+
+
+def zeros(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker publishes poses of zeros."""
+    streams[name].poses[mask] = 0.0
+
+
+def origin(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker publishes its own origin."""
+    streams[name].poses[mask] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def freeze(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker repeats its last pose."""
+    streams[name].poses[mask] = streams[name].poses[max(int(np.argmax(mask)) - 1, 0)]
+
+
+def gap(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker publishes nothing."""
+    streams[name] = Stream(*(part[~mask] for part in streams[name]))
+
+
+def swap(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The tracker takes each hand for the other."""
+    left, right = (streams[side].poses for side in ("left", "right"))
+    left[mask], right[mask] = right[mask], left[mask].copy()
+
+
+def two_sources(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """Every other sample is of another tracker, which is 30 cm off."""
+    rows = np.flatnonzero(mask)[::2]
+    streams[name].poses[rows, :3] += [0.0, 0.0, 0.3]
+
+
+SPOILS: tuple[Spoil, ...] = (jump, spikes, nans, far, zeros, origin, freeze, gap, swap, two_sources)

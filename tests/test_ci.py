@@ -1,0 +1,69 @@
+"""The script that runs all checks: each part runs, whatever failed before it, and the end names
+what failed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from support.paths import ROOT
+
+PARTS = ("the README's tests", "research", "a newer Python")
+
+
+def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
+    """A checkout whose README has this test command and whose Pythons are this shell script; the
+    environment for its script.
+    """
+    (folder / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
+    (folder / "README.md").write_text(f"# A\n\n<!-- test -->\n```sh\n{readme}\n```\n", encoding="utf-8")
+    newer = "pythons/versions/3.13.1/bin"
+    for path in (".venv/bin/python", f"{newer}/python", *(f".venv-newer/bin/{name}" for name in ("pip", "thirdhand"))):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(f'#!/bin/sh\necho "$0 $*" >> "{folder}/calls"\n{python}\n', encoding="utf-8")
+        (folder / path).chmod(0o755)
+    shutil.copy(folder / ".venv/bin/python", folder / ".venv-newer/bin/python")
+    (folder / newer / "python3.13").symlink_to("python")
+    return {"PATH": f"{folder / newer}:{os.environ['PATH']}", "PYENV_ROOT": str(folder / "pythons")}
+
+
+@pytest.mark.parametrize(
+    ("readme", "python", "failed"),
+    [
+        ("true", "exit 0", ()),
+        ("echo wrong; exit 3", "exit 0", PARTS[:1]),
+        ("true", 'case "$*" in *"-m research"*) exit 1;; esac', PARTS[1:2]),
+        ("true", 'case "$*" in demo*) exit 1;; esac', PARTS[2:]),
+        ("false", "exit 1", PARTS),
+    ],
+)
+def test_every_part_runs_and_the_end_names_those_that_failed(
+    readme: str, python: str, failed: tuple[str, ...], tmp_path: Path
+) -> None:
+    environment = checkout(tmp_path, readme=readme, python=python)
+    done = subprocess.run(
+        ["bash", ".ci/run"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == (1 if failed else 0), done.stderr
+    for part in PARTS:
+        assert f"== {part}\n" in done.stdout
+        assert f"\n{part}: " in done.stdout
+    assert [line.removeprefix("failed: ") for line in done.stderr.splitlines() if "failed: " in line] == list(failed)
+    calls = (tmp_path / "calls").read_text(encoding="utf-8")
+    assert ("replay --exact recordings/golden.mcap" in calls) == ("a newer Python" not in failed or "demo" in python)
+
+
+def test_a_part_that_cannot_run_has_failed(tmp_path: Path) -> None:
+    environment = checkout(tmp_path, readme="true", python='[ "$1" != -c ]')  # a Python that cannot make environments
+    (tmp_path / "README.md").write_text("# A\n", encoding="utf-8")
+    done = subprocess.run(
+        ["bash", ".ci/run"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert "README.md has no test command" in done.stderr

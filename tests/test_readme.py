@@ -1,0 +1,51 @@
+"""The README's program runs as it stands, and its first commands come in an order that works."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from support.cell import serving
+from support.paths import ROOT
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def program() -> str:
+    """The program that is marked as one."""
+    found = re.findall(r"<!-- program -->\n```python\n(.*?)```", README, re.DOTALL)
+    assert len(found) == 1
+    return str(found[0])
+
+
+def test_the_program_runs_as_it_stands_and_the_service_follows_its_hands(tmp_path: Path) -> None:
+    assert len([line for line in program().splitlines() if line]) <= 10
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        environment = os.environ | {"THIRDHAND_CONNECT": daemon.endpoint, "PYTHONPATH": str(ROOT)}
+        for _ in range(3):  # a busy machine may leave the hands stale for a moment
+            done = subprocess.run(
+                [sys.executable, "-c", program()],
+                env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            if done.stdout.startswith("mode follow"):
+                break
+    number = r"-?\d+\.\d+"
+    place = rf"\({number}, {number}, {number}\)"
+    assert re.fullmatch(rf"mode follow: the tool is at {place}, its target at {place}\n", done.stdout)
+
+
+def test_the_environment_is_activated_before_the_first_bare_command() -> None:
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
+    first = next(i for i, line in enumerate(lines) if line.startswith("thirdhand "))
+    assert ". .venv/bin/activate" in lines[:first]
+
+
+def test_the_two_commands_have_the_form_that_programs_look_for() -> None:
+    for name, last in (("run", ".venv/bin/thirdhand demo"), ("test", "-m 'timed and not research'")):
+        (command,) = re.findall(rf"^<!-- {name} -->\n```sh\n(.*)\n```$", README, re.MULTILINE)
+        assert command.startswith("python3.11 -m venv .venv && ")
+        assert command.endswith(last)
