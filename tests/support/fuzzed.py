@@ -19,7 +19,8 @@ from service.core.frame import Frame, Vector
 from service.learning.skill_file import decoded
 from service.recording.recording import Recording
 from service.recording.replay import replay, ticks
-from support.bounds import bounds_hold
+from support.arm_geometry import ArmGeometry
+from support.bounds import Session, broken
 from support.explained import explained_controller
 from support.hostile_bytes import mutated
 from support.in_process import LEFT, RIGHT
@@ -68,13 +69,29 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
     result = replay(path)
     assert result.exact, result.text()
     recording = Recording.open(path)
+    settings, urdf = recording.settings, robot_description(recording.settings)
     skill = decoded(recording.skill, origin=str(path), recorded=True)
-    controller = explained_controller(recording.settings, skill, urdf=robot_description(recording.settings))
+    controller = explained_controller(settings, skill, urdf=urdf)
     frames: list[Frame] = []
     measured: list[Vector] = []
     for tick in ticks(recording):
         frames.append(controller.step(tick))
         measured.append(controller.state["measured"].copy())
-    assert len(frames) == result.ticks
-    bounds_hold(np.array(frames), np.array(measured), box=skill.workspace)
-    return np.array(frames)
+    count = len(frames)
+    assert count == result.ticks
+    session = Session(
+        settings=settings,
+        geometry=ArmGeometry(settings, urdf),
+        frames=np.array(frames),
+        measured=np.array(measured),
+        boxes=np.tile(skill.workspace, (count, 1, 1)),
+        receiving=np.zeros((count, 2), bool),
+        hands=np.zeros((count, 2, 3)),
+        still_s=np.zeros((count, 2)),  # where the hands were is not recorded, only what was reported
+        noise_m=0.0,
+        quiet_from=count,
+        arm_follows=False,
+        deadlines_kept=False,
+    )
+    assert not broken(session), broken(session)
+    return session.frames
