@@ -28,9 +28,9 @@ POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_ra
 CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
 CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
 FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-# [s²] more, times the square of the tool's velocity that constraints take away: where several of
-# them leave few directions free, the least motion of the arm would else change the solution much.
-KEPT_DAMPING = 4.0
+# [m/s] of the tool that constraints take away, at which half of SINGULAR_DAMPING is added. Where
+# several of them leave few directions free, the least motion would else change the solution much.
+KEPT_SPEED = 0.02
 HORIZON_S = 0.008  # for reaching the joint velocities that an orientation step needs; else it is scaled down
 SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
 TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
@@ -140,7 +140,7 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
-            kept_damping=KEPT_DAMPING,
+            kept_speed=KEPT_SPEED,
             max_tool_speed=TOOL_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
             position_gain=min(POSITION_GAIN, POSITION_GAIN_SHARE * rate),

@@ -255,7 +255,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     kept = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     if kept:
         said |= SEPARATED
-        damping += arm.kept_damping * _missing(scaled, wanted, velocity)
+        missing = _missing(scaled, wanted, velocity)
+        damping += arm.singular_damping * missing / (missing + arm.kept_speed * arm.kept_speed)
         solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     near = _can_have(arms, goals, velocity)
     scaled[3:], wanted[3:] = 0.0, 0.0
