@@ -258,7 +258,7 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "urdf", "URDF", "the arm's description", type=Path)
     option(c, "--plate", "LINK", "the link that carries the tool (default: the likely one)")
-    at = "where its root stands in frame base [m] (default: 0 0 0, or nearby where it reaches the demo's places)"
+    at = "position of its root in frame base [m] (default: 0 0 0, or nearby if it reaches the demo's places from there)"
     c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=at)
     option(c, "--packages", "DIR", "a folder with packages of ROS, for its meshes; may be repeated", action="append")
     option(c, "--output", "FILE", "the cell's settings; the picture is beside it", Path("cell.toml"), type=Path)

@@ -82,13 +82,13 @@ def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path) -> None:
 
 
 def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(tmp_path: Path) -> None:
-    config, demonstration = tmp_path / "cell.toml", str(RECORDINGS / "demonstration-1.mcap")
+    config, takes = tmp_path / "cell.toml", [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
     config.write_text("rate_hz = 3\n")
     missing = str(tmp_path / "none.toml")
     for command in (
         ("serve",),
         ("record", "--list"),
-        ("learn", demonstration, "--output", str(tmp_path / "skill.npz")),
+        ("learn", *takes, "--output", str(tmp_path / "skill.npz")),
     ):
         for path, expected in ((str(config), 2), (missing, 1)):
             done = told(*command, "--config", path)
@@ -98,14 +98,15 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
 @pytest.mark.parametrize(
     ("code", "words", "arguments"),
     [
-        (0, "", ("record", "--list", "--folder", "nowhere")),
+        (1, "nowhere does not exist: a folder of takes needed", ("record", "--list", "--folder", "nowhere")),
         (1, "is a daemon running", ("status", *NOBODY)),
         (1, "", ("doctor", *NOBODY)),
         (1, "", ("cells", *NOBODY)),
         (1, "is a daemon running", ("hold", *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
-        (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
+        (1, "nowhere.mcap", ("learn", "nowhere.mcap", "nowhere-2.mcap", "--output", "nowhere.npz")),
+        (1, "at least 2 needed", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
         (1, "no such user's folder", ("status", "--certificate", "~nobody-of-this-name/x")),
         (2, "--cell: $.cell", ("status", "--cell", "*")),
         (2, "$.cell: ", ("serve", "--cell", "*")),

@@ -54,6 +54,8 @@ def test_a_reason_is_named_where_it_is_decided_and_explained_and_hardly_elsewher
         ("cli/diagnosis.py", "TWO_SOURCES"),  # that `doctor` foresees
         ("daemon/daemon.py", "ARM_NOT_READY"),  # before the first tick
         ("daemon/status.py", "NONE"),
+        ("demonstrations/track_check.py", "NONE"),  # takes are checked as live hands are
+        ("demonstrations/track_check.py", "TWO_SOURCES"),
     }
 
 

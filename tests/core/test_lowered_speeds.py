@@ -69,7 +69,9 @@ def test_legal_hands_and_a_lowered_speed_never_fault(seed: int) -> None:
         orientation=str(random.choice(["full", "direction"])),
     )
     rate_hz = int(random.choice([500, 500, 100, 250, 1000]))
-    settings = msgspec.structs.replace(settings, tool=tool, rate_hz=rate_hz)
+    slower = float(random.choice([0.1, 1.0, 1.0]))  # docs/hardware.md: the joints' velocities to a tenth
+    joints = msgspec.structs.replace(settings.joints, velocity=tuple(slower * v for v in settings.joints.velocity))
+    settings = msgspec.structs.replace(settings, tool=tool, joints=joints, rate_hz=rate_hz)
     skill = replace(skills()[random.integers(2)], threshold=float("inf"))
     controller = Controller(settings, skill, urdf=robot_description(settings))
     stops = set(random.integers(0, round(SECONDS * rate_hz), 2).tolist())
@@ -85,4 +87,4 @@ def test_legal_hands_and_a_lowered_speed_never_fault(seed: int) -> None:
     following = np.array([frame["mode"] == Mode.FOLLOW for frame in frames[1:]])
     assert speeds[following].max() <= 1.001 * tool.max_speed
     assert speeds.max() <= RISE * tool.max_speed + RISE_MPS
-    assert speeds.max() >= 0.3 * tool.max_speed  # the arm did move
+    assert speeds.max() >= 0.3 * slower * tool.max_speed  # the arm did move

@@ -136,7 +136,9 @@ def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: 
     assert said == [f"  starting: {i}" for i in range(8)]
 
 
-@pytest.mark.parametrize("command", ["status", "doctor", "hold", "cells", "follow simulated", "via-points list"])
+@pytest.mark.parametrize(
+    "command", ["status", "doctor", "hold", "cells", "follow simulated --wait 1", "via-points list"]
+)
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
     at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = f"import sys\nfrom service.cli.main import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"

@@ -22,7 +22,8 @@ ROUNDING = 1e-9  # of numbers in SI units, and relative
 POSITION_ROUNDING_M = 1e-6
 AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
 SPEED_ROUNDING_MPS = 1e-6
-STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop
+STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop, beyond its speed limit
+OTHERS_RISE_MPS = 0.025  # beyond its speed at the start of the stop, for other arms and rates than a WAM at 500 Hz
 BEHIND_M = 0.25  # the tool may be so far from its setpoint
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
 SLIP_MPS = 0.01  # joints that start one after the other approach so fast
@@ -281,16 +282,20 @@ def tool_speed_is_within_its_limit_while_following(session: Session) -> Vector:
 
 
 def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
-    """Below 1.01 times the greater of its speed and the speed it was coming to, plus 10 mm/s."""
+    """Below 1.01 times the greater of its speed and the speed it was coming to, plus 10 mm/s for a
+    WAM at 500 Hz, plus 25 mm/s for others; and always below 1.01 times its limit, plus 10 mm/s.
+    """
     (speed, crest), following = session.tool_speeds, _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
     allowed = np.full(len(speed), limit)
     is_over = ~session.frames["joint_velocities"].any(axis=1)
     is_over |= session.frames["reason"] == Reason.BLOCKED  # or on a way out, which is no stop
     stop_limit = limit
+    is_usual = not session.settings.arm.urdf and session.settings.rate_hz == 500
+    rise_mps = STOP_RISE_MPS if is_usual else OTHERS_RISE_MPS
     for k in range(len(speed)):
         if following[k]:
-            stop_limit = STOP_RISE * max(speed[k], crest[k]) + STOP_RISE_MPS
+            stop_limit = STOP_RISE * max(speed[k], crest[k]) + rise_mps
         elif is_over[k]:
             stop_limit = limit
         allowed[k] = min(limit, stop_limit) if not following[k] else np.inf

@@ -299,8 +299,8 @@ def _frozen(moved: Vector, *, limited: bool) -> Limited:
 
 NEAR_SPEED = 0.8  # share of the tool's speed limit; what the joints turn in a stop changes it by less than the rest
 # Joints end their accelerations at different times in a stop, so their motions cancel less of each
-# other: the tool gains at most this share of the sum of what they contribute (0.07 seen).
-CANCELLED_SHARE = 0.15
+# other: the tool gains at most this share of the sum of what they contribute (0.16 seen).
+CANCELLED_SHARE = 0.3
 STOP_SHARE = 0.99  # of that speed, from which it stops: what is left out in finding it adds to that in long ticks
 
 
