@@ -34,7 +34,7 @@ from service.recording.segments import Segments
 if TYPE_CHECKING:
     from service.viewer.stream import Viewer
 
-CATCH_UP_NICE = -10  # of a recording that is behind, where that is granted: 9 times an ordinary process's weight
+CATCH_UP_NICE = 0  # of a recording that is behind: an ordinary process's weight, so that no arm's driver waits for it
 QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
 FLUSH_S = 0.5  # what a kill can lose
 DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
@@ -203,9 +203,7 @@ class ScribeProcess:
         drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
 
     def catch_up(self, waiting: int) -> None:
-        """While the recording is behind, it goes before drawing, and before other processes where
-        that is granted.
-        """
+        """While the recording is behind, drawing pauses, and the process has an ordinary weight."""
         if waiting <= BEHIND / 10 if self._is_behind else waiting > BEHIND:
             self._is_behind = not self._is_behind
             _run_with(CATCH_UP_NICE if self._is_behind else child.NICE)
