@@ -32,7 +32,7 @@ class Inner(Immutable):
 
     @cached_property
     def query(self) -> Query:
-        """What a single query reads, laid out for it."""
+        """Arrays of a single query, in the layout that the compiled loops read."""
         return Query.of(self.solution, self.count)
 
     @cached_property

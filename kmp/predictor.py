@@ -41,7 +41,7 @@ class Predictor(Immutable):
     """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
 
     inner: Inner
-    """What is not for users of the package: its arrays and solutions, which may change."""
+    """Access to arrays and solutions for other packages of this project; these may change."""
 
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).

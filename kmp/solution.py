@@ -138,7 +138,7 @@ def check_resolved(
 
 
 def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
-    """Whether both lambda Sigma are above the rounding of k(s, s)."""
+    """True if both lambda Sigma are above the rounding of k(s, s)."""
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     return bool((penalty * _least_shares(parameters, points) >= _RESOLVED).all())
 

@@ -53,7 +53,7 @@ def solved(
 
 
 def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
-    """Whether the low rank solution may be the faster one, before any feature is made."""
+    """True if the low rank may be the faster solution, judged before any feature is computed."""
     size, kernel = database.reference.mean.size, parameters.kernel
     if size <= _TINY or size > _SMALL:
         return size > _SMALL

@@ -55,7 +55,7 @@ class Child:
         self._lock = threading.Lock()
 
     def has_begun(self, timeout_s: float = 0.0) -> bool:
-        """Whether the process exists or has existed; waits for it for `timeout_s` [s] at most."""
+        """True once the process exists or has existed; waits for it for at most `timeout_s`."""
         with self._lock:
             if self.pid is None and self.returncode is None:
                 poll = select.poll()  # select() knows no descriptor above 1023
@@ -83,7 +83,7 @@ class Child:
         return self.returncode
 
     def wait(self, timeout_s: float = float("inf")) -> bool:
-        """Whether the process ends within `timeout_s` [s]."""
+        """True if the process ends within `timeout_s` [s]."""
         end = time.monotonic() + timeout_s
         while self.poll() is None:
             if time.monotonic() > end:
@@ -129,7 +129,7 @@ class Progress:
         self._reported_s, self._moved_s = self._used_s, time.monotonic()
 
     def is_hung(self, limit_s: float, *, busy_s: float | None = None) -> bool:
-        """Whether the child hangs; `busy_s` is another limit of the processor's time."""
+        """True if the child makes no progress; `busy_s` replaces the limit of processor time."""
         if self._child.working_pid != self._pid:  # it was forked since
             self.report()
         (state, used_s), now_s = _activity(self._pid), time.monotonic()

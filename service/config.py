@@ -172,7 +172,7 @@ class JointSettings(Section, frozen=True):
 
     @property
     def per_rad(self) -> tuple[float, ...]:
-        """How much of each joint's unit a tolerance of 1 rad stands for."""
+        """Tolerance of each joint, in its own unit, for a tolerance of 1 rad."""
         return tuple(PRISMATIC_M if kind == "prismatic" else 1.0 for kind in self.every_kind)
 
 

@@ -51,7 +51,7 @@ def simulated(settings: Settings, **compiler: str) -> str:
 
 
 def _is_massive(link: Element) -> bool:
-    """Whether a link has a mass and its moments of inertia."""
+    """True if a link has a mass and moments of inertia."""
     mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
     return mass is not None and inertia is not None and float(mass.get("value", "0")) > 0.0
 

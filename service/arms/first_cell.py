@@ -63,7 +63,7 @@ GRIPPER = re.compile(r"finger|gripper|jaw|knuckle|claw|thumb", re.IGNORECASE)
 
 
 class Proposal(NamedTuple):
-    """What was understood of an arm, and the settings proposed for it."""
+    """Description of an arm as it was understood, and the settings proposed for it."""
 
     urdf: Urdf
     settings: Settings

@@ -66,7 +66,7 @@ def _named(urdf: Path, folder: Path) -> str:
 
 
 def text(proposal: Proposal, path: Path) -> str:
-    """What was understood, and what is proposed, for people to read."""
+    """Report for people: the arm as it was understood, and the proposed settings."""
     urdf, settings, body, shell = proposal.urdf, proposal.settings, proposal.body, proposal.shell
     others = [leaf for leaf in urdf.leaves if leaf != proposal.plate]
     lines = [
@@ -140,7 +140,7 @@ def _length(proposal: Proposal) -> float:
 
 
 def _link(proposal: Proposal, link: str) -> int:
-    """How many joints of the chain move a link."""
+    """Number of joints of the chain that move a link."""
     names = proposal.settings.joints.names
     while (joint := proposal.urdf.above(link)) is not None:
         if joint.name in names:

@@ -97,7 +97,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 
 
 def too_busy(report: dict[str, Any]) -> str:
-    """How this machine was too busy for the bench, by its report; empty where it was not."""
+    """Sentence on a machine that was too busy for the bench; empty if it was not."""
     periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
     found = []
     if skipped > MISSED_SHARE * periods:

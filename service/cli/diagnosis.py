@@ -295,7 +295,7 @@ def _privileges_and_recording(now: Status) -> Iterator[Finding]:
 
 
 def _disk(free_mb: float, mb_per_hour: float | None, keep_mb_left: float | None) -> Finding:
-    """How long the disk lasts where the cell records."""
+    """Free space where the cell records, and how long it lasts."""
     told, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
     if mb_per_hour:
         told += f", {mb_per_hour / 1000:.2g} GB an hour written"

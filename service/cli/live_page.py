@@ -210,7 +210,7 @@ class LivePage:
         return response
 
     def _is_foreign(self, host: str, origin: str | None) -> bool:
-        """Whether a request is from another site, or to another host's name."""
+        """True for a request from another site, or to the name of another host."""
         try:
             if origin is not None and urlsplit(origin).netloc != host:
                 return True

@@ -75,7 +75,7 @@ def view(args: argparse.Namespace) -> int:
 
 
 def _kind(path: Path) -> bytes:
-    """How a file begins that can be shown: RRD_MAGIC or MCAP0_MAGIC. Raises ExplainedError."""
+    """First bytes of a file that can be shown: RRD_MAGIC or MCAP0_MAGIC. Raises ExplainedError."""
     if not path.exists():
         raise ExplainedError(f"no such file: {path}")
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""What a daemon publishes or answers as JSON, checked, with its texts fit to be shown."""
+"""Published and answered JSON of a daemon, checked, with its texts made printable."""
 
 from __future__ import annotations
 

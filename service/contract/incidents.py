@@ -345,7 +345,7 @@ def _contest(seen: Evidence) -> str:
 
 
 def _is_seldom(seen: Evidence) -> bool:
-    """Whether states of the arm go on coming, but not often enough to go by."""
+    """True if states of the arm still arrive, but too seldom to follow by."""
     source = seen.sources.get("arm")
     if source is None or source.age_ms is None or _is_refused(source):
         return False
@@ -354,7 +354,7 @@ def _is_seldom(seen: Evidence) -> bool:
 
 
 def _of_rate(seen: Evidence) -> str:
-    """What to do about states that come too seldom; empty where they do not."""
+    """Remedy for states that arrive too seldom; empty if they do not."""
     return "publish `joints/state` more often, or raise `[arm] silent_ms`" if _is_seldom(seen) else ""
 
 

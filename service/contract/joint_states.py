@@ -62,8 +62,8 @@ class JointStates:
         return found
 
     def incomplete(self, message: JointState, at_s: float) -> JointState | None:
-        """What is known of the arm, or else the message, where no state has come for `patience_s`:
-        it names what is missing.
+        """The newest incomplete state, if no whole one was found for `patience_s`: it names what is
+        missing.
         """
         if at_s - self._state_s <= self._patience_s:
             return None

@@ -48,8 +48,8 @@ class Arrivals:
         self.count += 1
 
     def held_up_s(self, accepted_ns: int, stamp_ns: int) -> float | None:
-        """How much longer than a message with the second stamp the one with the first, accepted
-        before it, was on its way [s]; None where a clock stepped ahead between them.
+        """Extra delay [s] of the message with the first stamp, accepted before the one with the
+        second; None if a clock stepped ahead between them.
 
         A delay is at least that of the quickest message: a message that seems to be quicker than
         all before it has a stamp of another clock. Before there are others, clocks are assumed to

@@ -134,7 +134,7 @@ def frames(settings: Settings) -> tuple[str, ...]:
 
 
 def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
-    """What is known of a sample that was rejected, and that arrived with others of its source."""
+    """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
     seen = Evidence(sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
@@ -160,7 +160,7 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
 
 
 def _turned(leap: Jump, kind: str) -> float:
-    """How far a joint went; of a continuous one without its turns."""
+    """Distance that a joint moved, for a continuous joint without whole turns."""
     far = leap.after - leap.before
     return math.remainder(far, 2.0 * math.pi) if kind == "continuous" else far
 

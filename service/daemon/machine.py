@@ -1,4 +1,4 @@
-"""Whether this machine is too busy for its real-time work: missed deadlines, a late loop, and
+"""Detection of a machine that is too busy for real-time work: missed deadlines, a late loop, and
 processes that wait for a processor.
 """
 

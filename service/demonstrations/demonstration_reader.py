@@ -132,9 +132,9 @@ def read_demonstration(
 
 
 class Seen(NamedTuple):
-    """What hands and tool have in common: their trusted samples, the stamps of the tool at which
-    all of them are seen, the indices at which it begins anew behind a stretch that is left out, and
-    what is to be said of it.
+    """The part that hands and tool have in common: their trusted samples; the stamps of the tool at
+    which all are seen; the indices at which a new part begins behind a stretch that is left out;
+    and the remarks on it.
     """
 
     tracks: list[Track]

@@ -180,7 +180,7 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
 
 
 def _is_before(stamps: NDArray[np.int64], times: NDArray[np.int64], most_ns: int) -> Mask:
-    """Whether one of these times follows a stamp (N,) within `most_ns`."""
+    """True for each stamp (N,) that one of these times follows within `most_ns`."""
     if not len(times):
         return np.zeros(len(stamps), bool)
     following = np.searchsorted(times, stamps)
@@ -210,7 +210,7 @@ def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[str]:
 
 
 def _is_lost(poses: Vector, seconds: Vector, begin: int, end: int) -> bool:
-    """Whether a pose that is repeated from `begin` to `end` is one at which no hand can rest: it
+    """True for a pose, repeated from `begin` to `end`, at which no hand can rest: it
     comes to it from full speed within one sample, or goes on from elsewhere.
     """
     if begin > 0:
@@ -259,7 +259,7 @@ def _kept(track: Track, why: Sequence[str], restarts: Mask, hands: HandSettings)
 
 
 def _leaps(at: Vector, pauses: Vector, hands: HandSettings) -> Mask:
-    """Whether no hand can move from a position to the next (N, 3) [m], so long after it [s].
+    """True where no hand can move from one position (N, 3) [m] to the next in the time given [s].
 
     In sight it is judged by the acceleration needed at both, out of sight by the speed.
     """

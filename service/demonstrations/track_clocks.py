@@ -60,7 +60,7 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
 
 
 def _is_steady(track: Track) -> bool:
-    """Whether the least delay from stamp to recording stays the same from second to second. A hold
+    """True if the least delay from stamp to recording agrees from second to second. A hold
     up delays samples; it does not make any of them faster.
     """
     if not np.ptp(track.logged_ns):
@@ -73,5 +73,5 @@ def _is_steady(track: Track) -> bool:
 
 
 def _are_usable(tracks: Sequence[Track]) -> bool:
-    """Whether the times of recording tell when the samples were made."""
+    """True if the times of recording follow the times at which the samples were made."""
     return all(np.ptp(track.logged_ns) > 0 and len(clock_parts(track.logged_ns)) == 1 for track in tracks)

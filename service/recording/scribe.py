@@ -88,7 +88,7 @@ class Scribe:
             self._spawn(skill, state)
 
     def ready(self, timeout_s: float) -> bool:
-        """Whether the process has begun to work; waits for it for `timeout_s` at most."""
+        """True once the process has begun to work; waits for it for at most `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while not self._listens and self._child is not None and time.monotonic() < deadline:
             self._listen()

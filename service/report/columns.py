@@ -50,7 +50,7 @@ class InForce(NamedTuple):
 
 
 class Said(msgspec.Struct, frozen=True):
-    """What a status said at its tick of mode and reason, and of what came in."""
+    """Mode, reason and inputs that a status reported at its tick."""
 
     tick: int
     mode: str

@@ -87,7 +87,7 @@ class Limit(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """How near a joint came to its limits: position [rad, m], and shares of speed and
+    """Margin of a joint to its limits: position [rad, m], and shares of speed and
     acceleration.
     """
 

@@ -123,7 +123,7 @@ NO_LIMIT_RAD = 1000.0  # a continuous joint farther from its limits has none tha
 
 
 def _margin(joint: Joint) -> str:
-    """How far a joint stayed from its limits [rad]; in metres where it slides."""
+    """Least distance of a joint from its limits [rad, or m if it slides]."""
     if joint.kind == "continuous" and joint.margin_rad > NO_LIMIT_RAD:
         return "no limit"
     return f"{joint.margin_rad:.2f}" + (" m" if joint.kind == "prismatic" else "")

@@ -41,7 +41,7 @@ def devices() -> int:
 
 
 def is_there() -> bool:
-    """Whether a device is found, by a process of its own: a driver brings libraries of its own."""
+    """True if a device is found. A separate process asks, as drivers load their own libraries."""
     if not sys.platform.startswith("linux"):
         return True  # elsewhere the viewer draws by the system's own interface
     program = Path(__file__).read_text(encoding="utf-8") + "\nprint(devices())"

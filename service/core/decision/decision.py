@@ -236,9 +236,8 @@ def _is_outside(joints: Vector, parameters: Records) -> bool:
 
 @compiled
 def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
-    """How far the joints are from where they are measured, the farthest by `per_rad` [rad]; how
-    fast the tool is measured [m/s], by the tasks at the commanded joints, no farther than that
-    error from there.
+    """Largest difference between measured and commanded joints, by `per_rad` [rad]; and the
+    measured speed of the tool [m/s], from the Jacobian at the commanded joints.
     """
     state, here = states[0], heres[0]
     error = speed = 0.0
