@@ -415,7 +415,7 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"urdf = {json.dumps(urdf, ensure_ascii=False)}{'' if Path(urdf).is_absolute() else '  # beside this file'}\n"
         f"plate = {json.dumps(arm.plate, ensure_ascii=False)}  # the link that carries the tool\n"
         f"{packages}"
-        f"posture = {list(arm.posture)}  # [rad] the tool over the table, pointing down\n"
+        f"posture = {list(arm.posture)}  # [rad] the tool over the table, pointing down and forward\n"
         "\n"
         f"# A guess, from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
         "# The maker's data sheet knows better; begin with a tenth on a real arm.\n"

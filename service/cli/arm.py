@@ -124,8 +124,7 @@ def text(proposal: Proposal, path: Path) -> str:
     if proposal.text:
         x, y, z = proposal.stand
         lines.append(
-            f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base, so that it reaches the demo's "
-            "places; --at 0 0 0 leaves it at the origin"
+            f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 leaves it at the origin"
         )
     if proposal.unmet:
         lines.append(

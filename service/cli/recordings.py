@@ -96,7 +96,8 @@ def learn(args: argparse.Namespace) -> int:
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
-    check_count([path.stem for path in args.demonstrations], args.components)
+    if args.demonstrations[0].exists():  # else its reader says that it does not
+        check_count([path.stem for path in args.demonstrations], args.components)
     settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()

@@ -171,8 +171,8 @@ def _where(now: Status, side: str) -> str:
 
 def _coming(source: Source) -> str:
     """How often something comes of a source and how old it is, or since when nothing does."""
-    why = f" as {source.cause}" if source.cause else ""
-    refused = f"; {source.rate_hz:.0f} messages/s are rejected{why}" if source.rate_hz else ""
+    is_rejected = source.rate_hz > 0 and source.cause
+    refused = f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
     if source.fresh:
         return f"{source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
     return ("not seen yet" if source.age_ms is None else f"not seen for {source.age_ms / 1000:.1f} s") + refused

@@ -37,6 +37,7 @@ def draw(evidence: Evidence, path: Path) -> None:
 def drawn(evidence: Evidence) -> Figure:
     """The picture; of a skill between via-points with the stages of one demonstration."""
     from matplotlib.figure import Figure  # heavy, and most learn without
+    from matplotlib.ticker import LogFormatter
 
     mosaic = "ae;rg;ss" if evidence.beliefs else "ae;rg"
     figure = Figure(figsize=(11, 3.75 * len(mosaic.split(";"))), layout="constrained", dpi=110)
@@ -81,6 +82,8 @@ def drawn(evidence: Evidence) -> Figure:
     gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
     gate.set(title="what is held lies to the right of the gate", ylabel="of the samples [%]")
     gate.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
+    gate.xaxis.set_major_formatter("{x:g}")  # numbers as text: formulas are switched off
+    gate.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     gate.legend(frameon=False, fontsize=8)
 
     overall, count = evidence.figures.all, len(held_out)

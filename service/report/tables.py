@@ -150,6 +150,8 @@ def verdict(report: Report) -> str:
     holds = [span for span in report.spans if span.mode is Mode.HOLD]
     waited = [span for span in holds if span.start_s < first_s]
     ended = [span for span in holds if span.start_s >= last_s]
+    if report.spans[-1].mode is Mode.FAULT:
+        ended = []  # a fault is no end of a session
     stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)]
     faults = len(report.faults)
     counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
@@ -161,7 +163,7 @@ def verdict(report: Report) -> str:
     lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
     since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
-    end = f" It ended with {ended[0].doing}, {report.lasts_s - last_s:.1f} s before the end." if ended else ""
+    end = f" It ended with {ended[0].doing}, {report.lasts_s - ended[0].start_s:.1f} s before the end." if ended else ""
     followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
     return f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was {most}.{end}"
 

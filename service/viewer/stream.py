@@ -82,6 +82,7 @@ class _Destination:
         if skill is not None:
             self._dynamic.set_gate(skill[0].threshold)
         self._objects: tuple[SceneObject, ...] = ()
+        self._moved: list[tuple[int, tuple[SceneObject, ...]]] = []  # times [ns], objects: to be sent with the frames
         self._repeated_ns = 0
         self._open = False
         self.redirect(name, sink, path)
@@ -143,7 +144,12 @@ class _Destination:
     def show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
         """Shows the objects on the bench."""
         before, self._objects = self._objects, objects
-        if self._repeated_ns and objects != before:
+        if not self._repeated_ns or objects == before:
+            return
+        if self._thinning is not None and scene_objects.are_the_same(before, objects):
+            self._moved.append((time_ns, objects))
+        else:
+            self._send_moved()
             self._put_objects(time_ns, before)
 
     def _put_objects(self, time_ns: int, before: Iterable[SceneObject] = ()) -> None:
@@ -168,6 +174,16 @@ class _Destination:
             if self._thinning is not None:
                 self._thinning.sent(len(batch), self._size())
             self.put(list(self._dynamic.chunks(batch)))
+        self._send_moved()
+
+    def _send_moved(self) -> None:
+        """Sends where the objects have been since the last batch, in few chunks: a chunk of one row
+        takes 50 times as much of a file as a row.
+        """
+        if self._moved:
+            moved, self._moved = self._moved, []
+            index = self._dynamic.index(np.array([time_ns for time_ns, _ in moved], np.int64))
+            self.put(list(scene_objects.moved_chunks([objects for _, objects in moved], index)))
 
     def _finish(self) -> None:
         """Sends what is pending; to a file also its blueprint, with the curves' ranges."""

@@ -11,6 +11,7 @@ from service.viewer.dynamic import DrawnFrame
 
 SHARE, LEAST_SHARE = 0.8, 0.2  # of the budget; what is left of it for frames at least
 FRAME_BYTES = 1800.0  # of a drawn frame, before the file shows how many it takes
+MOST_FRAME_BYTES = 2.0 * FRAME_BYTES  # of the estimate: what else grows in the file does not thin the frames for ever
 PEAKS = ("lateness_us", "work_us", "latency_us", "stages_us")
 
 
@@ -61,6 +62,6 @@ class Thinning:
     def sent(self, count: int, size: int) -> None:
         """So many more frames are on their way to the file, which has `size` bytes without them."""
         if self._sent and size > self._static:
-            self._frame_bytes = (size - self._static) / self._sent
+            self._frame_bytes = min((size - self._static) / self._sent, MOST_FRAME_BYTES)
             self._every = self.every
         self._sent += count

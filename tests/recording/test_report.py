@@ -273,6 +273,7 @@ def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: P
         "a bench": (waits, moves, *ends),
         "a stop": (waits, moves, stops, moves, *ends),
         "a fault at the end": (moves, (1.0, fault, Reason.SERVICE)),
+        "a hold before it": (moves, (0.1, hold, Reason.STALE_HAND), (1.0, fault, Reason.ARM_SILENT)),
         "never": (waits,),
         "on": (waits, moves),
     }
@@ -284,6 +285,8 @@ def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: P
     assert found["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
     assert found["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
     assert "with no holds and 1 fault; the worst was fault: service" in found["a fault at the end"]
+    assert "with 1 hold and 1 fault; the worst was fault: arm_silent" in found["a hold before it"]
+    assert "It ended with" not in found["a hold before it"]
     assert "It followed 0 % of 6.0 s, with 1 hold and no faults; the worst was hold: no_hands" in found["never"]
     assert "It followed 40 % of 10.0 s, from 6.0 s on, with no holds and no faults" in found["on"]
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,6 +29,7 @@ from service.core.skill.pose import CLOSED
 from service.core.skill.skill import Skill
 from service.learning.skill_file import with_file
 from service.recording.mcap_file import RecordingError
+from service.recording.recording import OBJECTS
 from service.viewer.banner import banner
 from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
@@ -60,7 +62,9 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
 def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
     tmp_path: Path, rate_hz: int, mb_per_hour: float
 ) -> None:
-    """One of 30 s with hands that tremble; every tick of it would take more than 1.7 GB an hour."""
+    """One of 30 s with hands that tremble and objects that move; every tick of it would take more
+    than 1.7 GB an hour.
+    """
     settings, random = Settings(rate_hz=rate_hz), np.random.default_rng(1)
     one = Viewer(urdf=WAM, settings=settings, mb_per_hour=mb_per_hour, rrd=tmp_path / "a.rrd")
     period_ns = 1_000_000_000 // rate_hz
@@ -75,6 +79,10 @@ def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
             shown["mode"], shown["reason"] = Mode.HOLD, Reason.OPERATOR
             changes.append(i)
         measured["lateness_us"] = latest = 5000.0 if i == 8003 else 40.0
+        if i % (rate_hz // 25) == 0:
+            where, look = (0.5, 0.1, 1e-5 * i), ((0.0, 0.0, 0.0, 1.0), (0.08, 0.05, 0.002), (0.0, 0.5, 0.0, 1.0))
+            things = [SceneObject(name, "box", "base", where, *look) for name in ("board", "glass", "iron")]
+            one.note(OBJECTS, msgspec.json.encode(things).decode(), i * period_ns)
         one.add(shown, i * period_ns, measured)
         if i % (10 * rate_hz) == 10 * rate_hz - 1:
             one.flush()
@@ -88,6 +96,7 @@ def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
     rows = drawn(tmp_path / "a.rrd")
     at = [row["tick"] for row in rows["/joints/position"] if "tick" in row]
     assert {*changes, *(i + 1 for i in changes)} <= set(at)
+    assert sum(tick >= 20 * rate_hz for tick in at) > 10 * 5 * mb_per_hour / 100  # in the last 10 s
     late = {row["tick"]: row["Scalars:scalars"][0] for row in rows["/timing/lateness"] if "tick" in row}
     (peak,) = [tick for tick, value in late.items() if value > 4000]
     assert 8003 <= peak < 8003 + rate_hz
