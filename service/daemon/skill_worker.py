@@ -93,7 +93,7 @@ class SkillWorker:
             progress = child.Progress(working)
             try:
                 while not working.has_begun(POLL_S):
-                    if working.returncode is not None or progress.is_hung(timeout_s):
+                    if working.returncode is not None or progress.is_hung(TIMEOUT_S):
                         working.kill()
                         raise EOFError
                     if time.monotonic() > end_s:  # what it has imported stays: it is waited for again
