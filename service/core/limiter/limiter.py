@@ -297,7 +297,6 @@ def _frozen(moved: Vector, *, limited: bool) -> Limited:
     return Limited(moved[0], moved[1], moved[2], limited)
 
 
-NEAR_SPEED = 0.8  # share of the tool's speed limit; what the joints turn in a stop changes it by less than the rest
 # Joints end their accelerations at different times in a stop, so their motions cancel less of each
 # other: the tool gains at most this share of the sum of what they contribute (0.16 seen).
 CANCELLED_SHARE = 0.3
@@ -378,12 +377,12 @@ class LimiterStage:
     def _comes_to(self, moved: Limited, here: Kinematics) -> float:
         """Greatest speed [m/s] of the tool if the joints stop after a step.
 
-        The stop is sampled only where it may pass the limit: near it, or where the joints move the
-        tool by much more than their sum shows.
+        The stop is sampled only where it may pass the limit. That includes all speeds above 77 % of
+        the limit, since the sum of what the joints contribute is at least the speed.
         """
         _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
         most = self._max_speed
-        if speed <= STOP_SHARE * most and (speed > NEAR_SPEED * most or speed + CANCELLED_SHARE * total > most):
+        if speed <= STOP_SHARE * most and speed + CANCELLED_SHARE * total > most:
             return max(float(speed), self._limiter.speed_in_stop(moved, here))
         return float(speed)
 
