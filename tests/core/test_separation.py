@@ -22,9 +22,19 @@ from service.core.frame import Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from service.core.limiter.limiter import LimiterStage
 from service.core.separation.body import Body, body_of
-from service.core.separation.separation import SLIP, TABLE_DEPTH, Separation, allowed_speed
+from service.core.separation.clearance import NEAR_ITSELF, NOBODY
+from service.core.separation.separation import (
+    CLEARANCE_GAIN,
+    RETREAT_MIN_AUTHORITY,
+    RETREAT_SPEED,
+    SLIP,
+    TABLE_DEPTH,
+    Separation,
+    allowed_speed,
+)
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
+from service.shipped import shipped_skill
 from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
@@ -270,6 +280,27 @@ def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(
     assert (seen["mode"] == Mode.FOLLOW).all()
     assert np.linalg.norm(seen["tool"][-1] - free["tool"][-1]) < 0.05
     assert np.linalg.norm(free["tool"] - free["tool"][0], axis=1).max() > 0.2
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_parts_that_are_too_near_each_other_go_apart_and_hardly_slip(arm: str) -> None:
+    """Small errors of many stops add up otherwise."""
+    cell = cell_of(arm)
+    urdf = robot_description(cell)
+    separation, kinematics, random = Separation(cell, urdf), Arm(cell, urdf), np.random.default_rng(3)
+    depths = []
+    for q in random.uniform(cell.joints.lower, cell.joints.upper, (4000, len(cell.joints.names))):
+        clear, _, thing = separation.clearance(q, NOBODY)
+        if thing != NEAR_ITSELF or not -0.009 < clear < -0.001:
+            continue
+        separation.step(start_state(cell, shipped_skill()), blank(frame_layout(len(q))), kinematics.at(q).record)
+        least = separation.constraints[: separation.count]
+        worst = least[np.argmin(least["planned"])]
+        can_return = np.abs(worst["row"]) @ np.array(cell.joints.velocity) > RETREAT_MIN_AUTHORITY
+        assert worst["planned"] == pytest.approx(can_return * max(CLEARANCE_GAIN * clear, -RETREAT_SPEED), rel=1e-6)
+        assert worst["allowed"] == pytest.approx(0.1 * SLIP)
+        depths.append(clear)
+    assert depths, "no posture with parts so near each other"
 
 
 def test_motion_that_leaves_a_hand_is_not_slowed() -> None:

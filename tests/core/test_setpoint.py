@@ -12,7 +12,8 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.config import Settings, ToolSettings
-from service.core.frame import Vector, blank, copied
+from service.core.arm.arm import Arm
+from service.core.frame import Vector, blank, copied, frame_layout
 from service.core.setpoint.bounds import (
     HULL_MARGIN,
     HULL_TIME_S,
@@ -21,12 +22,12 @@ from service.core.setpoint.bounds import (
     speed_to_come,
     stop_distance,
 )
-from service.core.setpoint.setpoint import SetpointGenerator, slow_down
+from service.core.setpoint.setpoint import SetpointGenerator, SetpointStage, slow_down
 from service.core.setpoint.tracker import waiting
-from service.core.skill.model import Target
+from service.core.skill.model import Target, Wanted
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
-from support.wam import STATE
+from support.wam import STATE, URDF
 
 WAY_TICKS = round(2.0 / PERIOD_S)  # to come from anywhere to where the targets have gone
 properties = example_settings(max_examples=60, deadline=None, derandomize=True)
@@ -159,6 +160,22 @@ def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:
         generator.step(state, waiting(target, state["setpoint"], MIDDLE), BOX, FREE, slow)
     assert not state["setpoint"][1].round(4).any()
     assert 0.15 < state["setpoint"][0, 0] - MIDDLE[0] <= 0.201
+
+
+def test_a_setpoint_outside_the_workspace_waits_for_a_tool_that_cannot_come() -> None:
+    arm = Arm(Settings(), URDF)
+    stage, state, here = SetpointStage(Settings(), arm), blank(STATE), arm.at(np.array(Settings().arm.posture))
+    state["orientation"][3] = 1.0
+    frame = blank(frame_layout(7))
+    frame["orientation"][3] = 1.0
+    target = Target(*at_rest(here.position + np.array([0.5, 0.0, 0.0])), clamped=False)
+    start = here.position + np.array([0.21, 0.0, 0.0])
+    box = np.array([start + np.array([0.05, -1.0, -1.0]), start + 1.0])
+    SetpointGenerator(Settings()).begin(state, at_rest(start))
+    wanted = Wanted(target, state["orientation"], np.zeros(3), 0.0, torn=False, needs=False)
+    for _ in range(1000):
+        stage.step(state, frame, wanted, here, box, 1.0)
+    np.testing.assert_allclose(state["setpoint"][0], start, atol=1e-3)
 
 
 def test_a_setpoint_from_outside_the_workspace_only_comes_nearer() -> None:

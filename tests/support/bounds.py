@@ -24,7 +24,8 @@ AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
 SPEED_ROUNDING_MPS = 1e-6
 STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop, beyond its speed limit
 OTHERS_RISE_MPS = 0.025  # beyond its speed at the start of the stop, for other arms and rates than a WAM at 500 Hz
-BEHIND_M = 0.25  # the tool may be so far from its setpoint
+BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
+WAITING_M = 0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
 SLIP_MPS = 0.01  # joints that start one after the other approach so fast
 RESTING_S = 0.6  # a hand that has been still for this time is at rest, also as it is estimated
@@ -40,6 +41,7 @@ SETTLED_S = 6.0  # with the hands at rest, in which an arm comes to rest
 LOOK_S, STUCK_S = 0.5, 2.5  # at the end: of accelerations; in which a stuck tool is reported
 AT_REST_RADPS2, AT_REST_NOISY_RADPS2, KEPT_BACK_RADPS2 = 0.05, 0.3, 0.5  # root mean square of all joints
 THERE_M, NET_MOTION_M = 0.01, 0.004
+STUCK_M = 0.02  # a tool that is farther from its target is reported as stuck; a nearer one as kept away
 
 
 @dataclass(frozen=True)
@@ -269,8 +271,11 @@ def tool_leaves_the_workspace_by_little(session: Session) -> Vector:
 
 
 def tool_is_near_its_setpoint(session: Session) -> Vector:
-    gap = _norms(session.frames["tool"] - session.frames["setpoint"])
-    return _excess(len(gap), gap, BEHIND_M, _following(session))
+    """Within BEHIND_M, or within WAITING_M and the way of a stop from the greatest speed."""
+    gap, tool = _norms(session.frames["tool"] - session.frames["setpoint"]), session.settings.tool
+    v, a, j = tool.max_speed, 0.4 * tool.acceleration, tool.jerk / np.sqrt(3.0)
+    stop_m = 0.5 * v * (v / a + a / j) if v > a**2 / j else v * np.sqrt(v / j)
+    return _excess(len(gap), gap, max(BEHIND_M, WAITING_M + stop_m), _following(session))
 
 
 # --- speed of the tool ---
@@ -497,13 +502,14 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
 
 
 def tool_is_never_stuck_in_silence(session: Session) -> Vector:
-    """At the end the tool is at its target, on its way, or reported to be stuck."""
+    """At the end the tool is at its target, on its way, or reported to be stuck or kept away."""
     if session.quiet_s < SETTLED_S or not _following(session)[-1] or _net_motion_m(session) >= NET_MOTION_M:
         return _at_the_end(session, 0.0)
     lately = _last(session, STUCK_S)
     if (lately["flags"] & Flag.STUCK).any() or (lately["reason"] == Reason.BLOCKED).any():
         return _at_the_end(session, 0.0)
-    return _at_the_end(session, _off_target_m(session) - THERE_M)
+    is_kept_away = bool((lately["flags"] & Flag.SEPARATION).all())
+    return _at_the_end(session, _off_target_m(session) - (STUCK_M if is_kept_away else THERE_M))
 
 
 def hands_at_rest_and_resets_end_every_fault(session: Session) -> Vector:

@@ -35,11 +35,13 @@ PLAN_BRAKE = np.array(
     [1.0, 0.5, 0.5]
 )  # of the tool's acceleration in a stop, for people and things: no more is planned with ...
 PLAN_REACTION_S = 0.02  # ... nor with less reaction time: joints that are let nearer more quickly swing there
-CLEARANCE_GAIN = 5.0  # [1/s] of the way to a thing's clearance, and back to it where small errors have added up
-RETREAT_SPEED = 0.02  # [m/s] at most, back to a thing's clearance: twice as fast as joints may slip
+CLEARANCE_GAIN = (
+    5.0  # [1/s] of the way to the clearance of a thing or part, and back to it where small errors have added up
+)
+RETREAT_SPEED = 0.02  # [m/s] at most, back to a clearance: twice as fast as joints may slip
 RETREAT_MIN_AUTHORITY = 0.1  # [m/s] only what the joints can move so fast is moved back
 SLIP = 0.01  # [m/s] that joints which start one after the other may approach at all ...
-SLIP_DEPTH = 0.0005  # [m] ... less the farther a thing is inside its clearance, a tenth from here on
+SLIP_DEPTH = 0.0005  # [m] ... less the deeper inside a clearance, a tenth from here on
 NEAR_VIA_POINT = 0.02  # [m] beside a via-point's radius, each axis
 AHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # moments the rule is asked about
 CHANGE_S = 0.07  # over which a hand's acceleration fades
@@ -259,15 +261,8 @@ def _step(
                 planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
                 twice = where > 0 and share == inner
                 if not twice and planned < part.max_speed:
-                    constraint = constraints[count]
-                    left = distance - given.clearance[THINGS]
-                    slip = min(max(1.0 + left / SLIP_DEPTH, 0.1), 1.0) * SLIP
-                    constraint.allowed = _allowed(parameters, THINGS, distance, 0.0) + slip
-                    planned = min(planned, max(CLEARANCE_GAIN * left, -RETREAT_SPEED))
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-                    if planned < 0.0 and not _may_pass(constraints, count, RETREAT_MIN_AUTHORITY, given.max_velocity):
-                        planned = 0.0
-                    constraint.planned = planned
+                    planned = _limit(constraints, count, parameters, THINGS, distance, planned)
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
                     count += _may_pass(constraints, count, planned, given.max_velocity)
@@ -276,10 +271,9 @@ def _step(
         distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
         planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
         if planned < one.max_speed + other.max_speed:
-            constraint = constraints[count]
-            constraint.planned, constraint.allowed = planned, _allowed(parameters, ITSELF, distance, 0.0) + SLIP
             _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
             _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
+            planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
             count += _may_pass(constraints, count, planned, given.max_velocity)
     return count, nearest_m, speed_limit, setpoint_share
 
@@ -300,6 +294,25 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
     brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
     planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.room[rule])
     return max(PLAN_SHARE * least, planned) + PLAN_SHARE * braked
+
+
+@compiled
+def _limit(constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float) -> float:
+    """Set the limits of a constraint to a thing or to another part; the planned speed [m/s].
+
+    With the distance `left` to the clearance, parts slow down to CLEARANCE_GAIN * left. Inside of
+    the clearance they return, if the joints can move them, and may slip the less the deeper they
+    are.
+    """
+    given, constraint = parameters[0], constraints[k]
+    left = distance - given.clearance[rule]
+    slip = min(max(1.0 + left / SLIP_DEPTH, 0.1), 1.0) * SLIP
+    constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
+    planned = min(planned, max(CLEARANCE_GAIN * left, -RETREAT_SPEED))
+    if planned < 0.0 and not _may_pass(constraints, k, RETREAT_MIN_AUTHORITY, given.max_velocity):
+        planned = 0.0
+    constraint.planned = planned
+    return planned
 
 
 @compiled

@@ -29,7 +29,7 @@ from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.bounds import BOUNDS, HULL_TIME_S, between, bounds_around, stopping, take_safe, what_is_wrong
-from service.core.setpoint.tracker import GAP_WIDE, gains_for, waiting
+from service.core.setpoint.tracker import GAP_MOST, GAP_WIDE, gains_for, waiting
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import decided
@@ -216,15 +216,16 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
         jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = gains[0]^(1/3).
 
     A setpoint whose target lies on a side then comes to rest there. Without this, the tracker
-    passes its target by a little, each time into the fastest stop, and swings for ever.
+    passes its target by a little, each time into the fastest stop, and swings for ever. Beyond a
+    side h is 0: the setpoint goes no farther, and its targets bring it back.
     """
     given = parameters[0]
     p = given.gains[0] ** (1.0 / 3.0)
     for i in range(3):
         x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
         damping = -3.0 * p * (p * v + a)
-        highest = max(p**3 * (box[1, i] - x) + damping, -given.stop_jerk)
-        lowest = min(p**3 * (max(box[0, i], given.lowest[i]) - x) + damping, given.stop_jerk)
+        highest = max(p**3 * max(box[1, i] - x, 0.0) + damping, -given.stop_jerk)
+        lowest = min(p**3 * min(max(box[0, i], given.lowest[i]) - x, 0.0) + damping, given.stop_jerk)
         jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
 
 
@@ -358,8 +359,11 @@ class SetpointStage:
         states, frames = as_array(state), as_array(frame)
         slow = _ready(states, here.record, self._arm.parameters, self._max_speed, share, self._costs)
         target, tool = wanted.target, here.record["position"][0]
-        if math.dist(state["setpoint"][0].tolist(), tool.tolist()) > GAP_WIDE:
+        gap_m = math.dist(state["setpoint"][0].tolist(), tool.tolist())
+        if gap_m > GAP_WIDE:
             target = waiting(target, state["setpoint"], tool)
+        if gap_m > GAP_MOST:  # it waits, also outside of the workspace
+            box = np.array([np.minimum(box[0], state["setpoint"][0]), np.maximum(box[1], state["setpoint"][0])])
         met = self._position.step(state, target, box, self._costs, slow)
         if state["closure"] != NO_GRIPPER:
             self._grip(state, wanted, here)
