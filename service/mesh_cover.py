@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from service.contract.explain import in_words
 from service.urdf import COVER, UrdfError
 
 Points = NDArray[np.float64]
@@ -74,7 +75,8 @@ def _capsule(
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
-        raise UrdfError(f"{what} cannot be read: {' '.join(str(error).split())}") from None
+        words = in_words(error, named=False).rpartition("message:")[2]  # before it a library names its own files
+        raise UrdfError(f"{what} cannot be read: {' '.join(words.split())}") from None
     return known
 
 
@@ -99,7 +101,7 @@ def _found(name: str, urdf: Path, packages: tuple[str, ...], what: str) -> Path:
     file = next((one for one in tried if one.is_file()), None)
     if file is None:
         where = (
-            f"package {package!r} is in no folder above the URDF, and in none of $.arm.packages: name its folder's "
+            f"package {package!r} is in no folder above the URDF, and in none of [arm] packages: name its folder's "
             f"there, or give the link a box, cylinder or sphere instead. Looked for: {', '.join(map(str, tried))}"
             if len(tried) > 1
             else f"there is no {tried[0]}: put it there, or give the link a box, cylinder or sphere instead"

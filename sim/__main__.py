@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
+from service.contract.explain import in_words
 
 # isort: split
 import argparse
@@ -155,7 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
             engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
     except (SceneError, LaunchError, UnreadableError) as error:
-        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     except SettingsError as error:
         p.error(str(error))
@@ -221,7 +222,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
     except (BenchError, OSError) as error:
-        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 

@@ -15,13 +15,13 @@ import math
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
 from service.config import Reach
 from service.contract import requests
-from service.contract.explain import explained
+from service.contract.explain import InvalidError, in_words, validated
 from service.described_arm import SettingsError
 from service.shipped import ARMS, cell_of
 
@@ -179,16 +179,12 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
         Raises SceneError.
         """
-        given: Any = None
         try:
-            given = tomllib.loads(path.read_text(encoding="utf-8"))
-            return msgspec.convert(given, Scene)
+            return validated(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
         except (OSError, UnicodeDecodeError) as error:
-            raise SceneError(f"cannot read scene {path}: {error}") from None
-        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"cannot read scene {path}: {in_words(error, named=False)}") from None
+        except (tomllib.TOMLDecodeError, InvalidError) as error:
             raise SceneError(f"{path}: {error}") from None
-        except msgspec.ValidationError as error:
-            raise SceneError(f"{path}: {explained(error, given, Scene)}") from None
 
 
 def main(arguments: list[str] | None = None) -> int:

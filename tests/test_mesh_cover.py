@@ -133,7 +133,7 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
     [
         (
             "package://no_arm/link.stl",
-            "'no_arm' is in no folder above the URDF, and in none of $.arm.packages: name its folder's there",
+            "'no_arm' is in no folder above the URDF, and in none of [arm] packages: name its folder's there",
         ),
         ("meshes/link.stl", "there is no {folder}/meshes/link.stl: put it there, or give the link a box, cylinder"),
         ("broken.stl", "cannot be read"),
@@ -147,7 +147,7 @@ def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Pa
         covered(urdf.read_text(), urdf)
     assert f"{urdf}: the collision mesh {name} of link 'forearm'" in str(error.value)
     assert told.format(folder=tmp_path) in str(error.value)
-    with pytest.raises(SettingsError, match=r"\$\.arm\.urdf: .*the collision mesh"):
+    with pytest.raises(SettingsError, match=r"\[arm\] urdf: .*the collision mesh"):
         robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
 
 

@@ -28,7 +28,7 @@ from service.cli.live_page import Address, Latest, LivePage, web_viewer
 from service.cli.progress import progress, say
 from service.cli.usage import UsageError, check_writable, reached
 from service.client import Client
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.launch import free_port
@@ -240,7 +240,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     except ViewerError:
         raise
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
-        raise ViewerError(f"no picture of {source}: {error} ({NO_VULKAN})") from error
+        raise ViewerError(f"no picture of {source}: {in_words(error)} ({NO_VULKAN})") from error
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:

@@ -74,7 +74,7 @@ def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text('[network]\nlisten = ["127.0.0.1:1"]\n')
     done = told("serve", "--config", str(tmp_path / "cell.toml"))
     assert done.returncode == 2
-    assert "$.network.listen[0]" in done.stderr
+    assert "[network] listen, entry 1" in done.stderr
     assert "tcp/127.0.0.1:1 ?" in done.stderr
 
 
@@ -108,10 +108,10 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
         (1, "at least 2 needed", ("learn", str(RECORDINGS / "demonstration-1.mcap"), "--output", "nowhere.npz")),
         (1, "no such user's folder", ("status", "--certificate", "~nobody-of-this-name/x")),
-        (2, "--cell: $.cell", ("status", "--cell", "*")),
-        (2, "$.cell: ", ("serve", "--cell", "*")),
-        (2, "--cell: $.cell", ("hold", "--cell", "")),
-        (2, "--cell: $.cell", ("play", "nowhere.mcap", "--cell", "**")),
+        (2, "--cell: '", ("status", "--cell", "*")),
+        (2, "command line: cell: '*' given", ("serve", "--cell", "*")),
+        (2, "--cell: '", ("hold", "--cell", "")),
+        (2, "--cell: '", ("play", "nowhere.mcap", "--cell", "**")),
         (2, "", ("record",)),
         (2, "accepted as a take's name", ("record", "a/b", *NOBODY)),
         (2, "a port from 0 to 65535 needed", ("status", "--connect", "tcp/127.0.0.1:99999")),

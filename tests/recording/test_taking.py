@@ -321,7 +321,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         (["there"], 1, "is there already: another name needed, or --delete it first"),
         (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
         (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
-        (["a", "--places", "PLACES"], 1, "$.points[1].name: 'glass' given twice, names once each needed"),
+        (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
         (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),
     ],
