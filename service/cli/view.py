@@ -170,6 +170,8 @@ def convert(
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
+        if viewer.arm_remark:
+            say(viewer.arm_remark)
         notes = recording.notes("requests", "log", OBJECTS)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
