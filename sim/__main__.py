@@ -206,9 +206,11 @@ def main(arguments: list[str] | None = None) -> int:
         wait_s=args.wait,
         dropout=dropout,
     )
-    target = args.output or ("-" if args.once else None)
+    target, runs = args.output or ("-" if args.once else None), 0
 
     def report(result: RunReport) -> None:
+        nonlocal runs
+        runs += 1
         line = msgspec.json.encode(result).decode() + "\n"
         if target == "-":
             sys.stdout.write(line)
@@ -243,6 +245,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (BenchError, OSError) as error:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
+    if not args.once:
+        kept = f"their reports are in {target}" if target else "no report was kept (--output)"
+        print(f"ended: the bench of cell {reach.cell}, after {runs} whole runs; {kept}", file=sys.stderr)
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

@@ -10,17 +10,16 @@ import argparse
 import contextlib
 import importlib
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from service import interrupt
 from service.cli import record_options
+from service.cli.progress import say
 from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
-from service.contract.printable import printable_lines
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
@@ -378,13 +377,13 @@ def main(arguments: list[str] | None = None) -> int:
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
     except (UsageError, SettingsError) as error:
-        print(f"thirdhand {args.command}: {printable_lines(in_file(str(error)))}", file=sys.stderr)
+        say(f"thirdhand {args.command}: {in_file(str(error))}")
         return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:
-        print(f"thirdhand {args.command}: {printable_lines(in_file(in_words(error)))}", file=sys.stderr)
+        say(f"thirdhand {args.command}: {in_file(in_words(error))}")
         return 1
     except KeyboardInterrupt:
         interrupt.end_at_once()

@@ -196,6 +196,8 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
                 assert time.monotonic() < end
             process.send_signal(number)
             assert process.wait(30) == code
+            ended = "ended: the bench of cell thirdhand, after 0 whole runs; no report was kept (--output)"
+            assert process.stderr.read().splitlines()[-1] == ended
 
 
 # --- help -----------------------------------------------------------------------------------------
