@@ -322,7 +322,7 @@ def parser() -> argparse.ArgumentParser:
     option(picture, "--screenshot", "PNG", "write this picture instead of opening a window; of several files the last")
     option(picture, "--time", "S", "show this time after the start (default: the last moment in mode follow)")
     tabs = ("task", "timing", "learning")
-    option(picture, "--tab", None, "show this tab of the viewer", "task", choices=tabs)
+    option(picture, "--tab", None, "show this tab of the viewer (default: task)", choices=tabs)
     browser = c.add_argument_group("a browser")
     web = "serve a page for browsers, with hold, resume and reset, of `live` (default: any port of this machine)"
     option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")

@@ -22,6 +22,7 @@ from support.paths import RECORDINGS, ROOT
 
 COMMANDS = [name for names in GROUPS.values() for name in names]
 RENAMED = ("--out", "--duration", "--json FILE", "--soak MIN")
+WEB = (("--web",), ("--web", "8080"), ("--web", ""))
 NOBODY = ("--connect", "tcp/127.0.0.1:1")
 
 
@@ -123,6 +124,9 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "needed", ("via-points", "add")),
         (2, "", ("via-points", "add", "here", *NOBODY)),
         (2, "", ("view", "live", "--time", "-1", *NOBODY)),
+        *((2, "--web and --screenshot given", ("view", "live", *web, "--screenshot", "a.png")) for web in WEB),
+        (2, "--web shows a running daemon, not files", ("view", "a.rrd", "--web")),
+        (2, "--tab chooses the tab of a picture", ("view", "live", "--web", "--tab", "timing")),
         *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
         (1, "50 Hz is too slow: commands would come every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
