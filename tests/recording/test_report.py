@@ -30,7 +30,7 @@ from service.recording.recording import Recorder, Recording
 from service.report.columns import read, runs
 from service.report.report import Report, Span, differing_settings, reported, why_missed
 from service.report.stages import LEAST_S
-from service.report.tables import _times, verdict
+from service.report.tables import tables, verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
@@ -130,14 +130,15 @@ def test_the_initial_approach_of_the_tool_is_no_error_of_following(
     found = Report(columns)
     stops = [span for span in found.spans if span.mode is not Mode.FOLLOW]
     found.spans = tuple(span for span in found.spans if span not in stops)  # else a stop is the worst
-    names = {name: values for name, values, _, _ in _times(found)}
+    prompt = next(one for one in tables(found) if one.title == "Promptness")
     if far_ticks == 0:
         assert found.initial_mm is None
         assert found.lag_mm == before.lag_mm
         assert "initial approach" not in verdict(found)
         return
     assert found.initial_mm is not None
-    assert names["tool from its target, initial approach"] == found.initial_mm
+    (row,) = (row for row in prompt.rows if row[0] == "tool from its target, initial approach")
+    assert row[3] == f"{found.initial_mm.largest:.1f}"
     assert found.initial_mm.largest > 400.0
     if arrives:
         assert found.initial_mm.samples == far_ticks
