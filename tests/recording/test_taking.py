@@ -241,7 +241,7 @@ def test_what_rest_is_is_told_as_it_is() -> None:
     add_options(parser)
     options = " ".join(parser.format_help().split())
     assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
-    assert f"left out but for {KEPT_S:g} s" in options
+    assert f"{KEPT_S:g} s are then retained" in options
     tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
     assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
     assert MOVED == 5, "the tutorial says five times"
