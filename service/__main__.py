@@ -1,14 +1,12 @@
 """`thirdhand ...`, also `python -m service ...`."""
 
-from __future__ import annotations
-
-from service import one_blas_thread  # noqa: F401
-
-# isort: split
-import signal
+import signal  # before all else: until the next statement, Ctrl-C shows a traceback
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback, until it is watched for
+
+# isort: split
+from service import one_blas_thread  # noqa: F401
 
 # isort: split
 import sys

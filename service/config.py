@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract import ros2
-from service.contract.explain import InvalidError, validated
+from service.contract.explain import InvalidError, in_words, validated
 from service.described_arm import SettingsError, UnreadableError, check, completed, description
 from service.network_settings import Network, Ros2
 from service.urdf import Urdf, UrdfError
@@ -382,10 +382,10 @@ def _make_paths_absolute(given: Any, folder: Path | None) -> None:
         value = table.get(name) if isinstance(table, dict) else None
         base = folder if folder is not None and (section, name) in BESIDE else Path()
         if isinstance(table, dict) and isinstance(value, str):
-            table[name] = _absolute(value, base, f"$.{section}.{name}")
+            table[name] = _absolute(value, base, f"[{section}] {name}")
         elif isinstance(table, dict) and isinstance(value, list | tuple):
             table[name] = [
-                _absolute(one, base, f"$.{section}.{name}[{i}]") if isinstance(one, str) else one
+                _absolute(one, base, f"[{section}] {name}, entry {i + 1}") if isinstance(one, str) else one
                 for i, one in enumerate(value)
             ]
 
@@ -455,7 +455,7 @@ def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
     needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
     if share < needed:
         raise SettingsError(
-            f"$.reach: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
+            f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
             f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
             f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
         )
@@ -478,5 +478,5 @@ def load(path: Path) -> Settings:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableError(f"cannot read configuration {path}: {error}") from None
+        raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
     return parse(text, origin=str(path), folder=path.parent)

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any, Protocol
 
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.robot_xml import readable
 from service.urdf import Shape, Urdf, UrdfError
 
@@ -34,9 +34,9 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
 
         return covered(text, path, packages)
     except OSError as error:
-        raise SettingsError(f"$.arm.urdf: cannot read {path}: {error}") from None
+        raise SettingsError(f"[arm] urdf: cannot read {path}: {in_words(error, named=False)}") from None
     except UrdfError as error:
-        raise SettingsError(f"$.arm.urdf: {error}") from None
+        raise SettingsError(f"[arm] urdf: {error}") from None
 
 
 def _text(path: Path) -> str:
@@ -89,7 +89,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     )
     if "plate" not in arm:
         raise SettingsError(
-            f"$.arm.plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
+            f"[arm] plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
         )
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
@@ -103,7 +103,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         ("joints", joints, "jerk"),
         ("arm", arm, "posture"),
     )
-    if missing := [f"$.{path}.{name}" for path, section, name in wanted if name not in section]:
+    if missing := [f"[{path}] {name}" for path, section, name in wanted if name not in section]:
         needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
@@ -119,18 +119,18 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
     for shape in urdf.shapes:
         if (size := extent(shape)) > reach:
             raise SettingsError(
-                f"$.arm.urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and the arm {reach:.3g} m; "
+                f"[arm] urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and the arm {reach:.3g} m; "
                 'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 0.001 0.001"; '
                 "tables and walls belong into [table] and [obstacles]"
             )
     names = tuple(joint.name for joint in moving)
     if joints.names != names:
         raise SettingsError(
-            f"$.joints.names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
+            f"[joints] names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
         )
     kinds = tuple(joint.kind for joint in moving)
     if joints.every_kind != kinds:
-        raise SettingsError(f"$.joints.kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
+        raise SettingsError(f"[joints] kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
     wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (
@@ -141,6 +141,7 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
             given = getattr(joints, name)[i]
             if not low <= given <= high:
                 accepted = f"{low} or more" if name == "lower" else f"up to {high}"
-                wide.append(f"$.joints.{name}[{i}]: {given} given; {accepted} accepted by the URDF of {joint.name}")
+                where = f"[joints] {name}, entry {i + 1}"
+                wide.append(f"{where}: {given} given; {accepted} accepted by the URDF of {joint.name}")
     if wide:
         raise SettingsError("\n".join(wide))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from service.contract.explain import in_words
 from service.urdf import COVER, UrdfError
 
 Points = NDArray[np.float64]
@@ -42,6 +43,8 @@ def covered(text: str, path: Path, packages: tuple[str, ...] = ()) -> str:
     Raises UrdfError for a mesh that is not found, is none, or has numbers that are not finite.
     """
     robot = ElementTree.fromstring(text)
+    if lost := unfound(robot, path, packages, "collision"):
+        raise UrdfError(f"{path}: {lost}. Links with a box, cylinder or sphere instead need no mesh")
     for link in robot.iter("link"):
         for mesh in (found for one in link.iter("collision") for found in one.iter("mesh")):
             if COVER not in mesh.attrib:
@@ -61,7 +64,7 @@ def _capsule(
         factors = np.array([float(number) for number in scale.split()])
         if factors.shape != (3,) or not np.isfinite(factors).all() or not factors.all():
             raise UrdfError(f"{what}: scale {scale!r} given; three finite numbers, none of them 0, needed")
-        file = _found(name, urdf, packages, what)
+        file = next(one for one in _candidates(name, urdf, packages) if one.is_file())
         data = file.read_bytes()
         made_by = hashlib.sha256(Path(__file__).read_bytes())
         made_by.update(repr((file.suffix.lower(), factors.tolist())).encode() + data)
@@ -74,38 +77,61 @@ def _capsule(
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
-        raise UrdfError(f"{what} cannot be read: {' '.join(str(error).split())}") from None
+        words = in_words(error, named=False).rpartition("message:")[2]  # before it a library names its own files
+        raise UrdfError(f"{what} cannot be read: {' '.join(words.split())}") from None
     return known
 
 
 def found_meshes(
     robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...]
 ) -> Iterator[tuple[ElementTree.Element, Path]]:
-    """The meshes of a robot whose files are there."""
+    """The meshes of a robot whose files exist, with these files."""
     for mesh in robot.iter("mesh"):
-        with contextlib.suppress(UrdfError):
-            yield mesh, _found(mesh.get("filename", ""), urdf, packages, "")
+        candidates = _candidates(mesh.get("filename", ""), urdf, packages)
+        if file := next((one for one in candidates if one.is_file()), None):
+            yield mesh, file
 
 
-def _found(name: str, urdf: Path, packages: tuple[str, ...], what: str) -> Path:
-    """The file of a mesh. Raises UrdfError."""
+def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], kind: str) -> str:
+    """A sentence, without its end, on the meshes of a kind (collision or visual) that are not
+    found: which they are, where they were looked for, and how to name their folder. Empty where
+    all are found or covered.
+    """
+    lost: dict[str, str] = {}  # the link of each file's name
+    for link in robot.iter("link"):
+        for mesh in (found for one in link.iter(kind) for found in one.iter("mesh")):
+            name = mesh.get("filename", "")
+            if COVER not in mesh.attrib and not any(one.is_file() for one in _candidates(name, urdf, packages)):
+                lost.setdefault(name, link.get("name", ""))
+    if not lost:
+        return ""
+    name, link_name = next(iter(lost.items()))
+    what = f"the {kind} mesh {name} of link {link_name!r} is not found"
+    if len(lost) > 1:
+        links = ", ".join(dict.fromkeys(lost.values()))
+        what = f"{len(lost)} {kind} meshes of links {links} are not found, the first is {name}"
+    tried = _candidates(name, urdf, packages)
+    if len(tried) == 1:
+        return f"{what}: there is no {tried[0]}; put it there"
+    rest = name.rpartition("://")[2]
+    folders = ", ".join(str(one).removesuffix(rest) for one in tried if str(one).endswith(rest))
+    return (
+        f"{what}; package {rest.partition('/')[0]!r} with this file is in none of {folders}. Name the folder that "
+        "holds the package in [arm] packages (`thirdhand arm`: by --packages)"
+    )
+
+
+def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
+    """Where the file of a mesh may be."""
     scheme, _, rest = name.rpartition("://")
+    if scheme not in ("package", "model"):
+        return [urdf.parent / rest]
     package, _, inside = rest.partition("/")
-    tried = [urdf.parent / rest]
-    if scheme in ("package", "model"):
-        above = urdf.absolute().parents
-        tried = [folder / inside for folder in above if folder.name == package]
-        tried += [folder / package / inside for folder in (*above, *(Path(one).expanduser() for one in packages))]
-    file = next((one for one in tried if one.is_file()), None)
-    if file is None:
-        where = (
-            f"package {package!r} is in no folder above the URDF, and in none of $.arm.packages: name its folder's "
-            f"there, or give the link a box, cylinder or sphere instead. Looked for: {', '.join(map(str, tried))}"
-            if len(tried) > 1
-            else f"there is no {tried[0]}: put it there, or give the link a box, cylinder or sphere instead"
-        )
-        raise UrdfError(f"{what} is not found: {where}")
-    return file
+    above, named = urdf.absolute().parents, [Path(one).expanduser() for one in packages]
+    return [
+        *(folder / inside for folder in (*above, *named) if folder.name == package),
+        *(folder / package / inside for folder in (*above, *named)),
+    ]
 
 
 def _vertices(file: Path, data: bytes) -> Points:

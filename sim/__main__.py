@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
+from service.contract.explain import in_words
 
 # isort: split
 import argparse
@@ -70,21 +71,35 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="publish hands and things only, and score an arm that is elsewhere by its joint states",
     )
-    p.add_argument("--seed", type=int, help="of the hands' scatter, tremor and noise (default: the scene's)")
+    p.add_argument(
+        "--seed", type=int, help="the seed for scatter, tremor and noise of the hands (default: the scene's)"
+    )
     p.add_argument(
         "--once",
         action="store_true",
         help="end after one run; its report goes to standard output unless --output says otherwise",
     )
-    p.add_argument("--output", metavar="FILE", help="where reports go, one JSON object a line; - is standard output")
-    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
-    p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after so long")
-    p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    p.add_argument("--wait", metavar="S", type=float, default=60.0, help="for the first command (default: %(default)s)")
     p.add_argument(
-        "--hands-rate", metavar="HZ", type=int, default=100, help="of the hand poses, 30 to 500 (default: %(default)s)"
+        "--output", metavar="FILE", help="write reports to this file, one JSON object per line; - is standard output"
     )
-    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="of the hands, 1 is as demonstrated")
+    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
+    p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
+    p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    p.add_argument(
+        "--wait",
+        metavar="S",
+        type=float,
+        default=60.0,
+        help="wait this long for the first command (default: %(default)s)",
+    )
+    p.add_argument(
+        "--hands-rate",
+        metavar="HZ",
+        type=int,
+        default=100,
+        help="the rate of the hand poses, 30 to 500 (default: %(default)s)",
+    )
+    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="the speed of the hands; 1 is as demonstrated")
     p.add_argument(
         "--pause",
         metavar=("AT", "LASTS"),
@@ -92,7 +107,7 @@ def parser() -> argparse.ArgumentParser:
         nargs=2,
         action="append",
         default=[],
-        help="seconds after the begin while the hands stop, 0.6 at least; may be repeated",
+        help="stop the hands AT seconds after the beginning for LASTS seconds, at least 0.6; may be repeated",
     )
     p.add_argument(
         "--turn",
@@ -101,37 +116,42 @@ def parser() -> argparse.ArgumentParser:
         nargs=2,
         action="append",
         default=[],
-        help="the same for hands that go back and come again",
+        help="likewise, but the hands move back and return; may be repeated",
     )
     p.add_argument(
         "--offset-mm",
         metavar="MM",
         type=float,
         default=8.0,
-        help="scatter of the places, std per axis (default: %(default)s)",
+        help="the scatter of the places, standard deviation per axis (default: %(default)s)",
     )
     p.add_argument(
         "--tremor-mm",
         metavar="MM",
         type=float,
         default=0.5,
-        help="tremor of the hands, rms per axis (default: %(default)s)",
+        help="the tremor of the hands, rms per axis (default: %(default)s)",
     )
     p.add_argument(
         "--noise-mm",
         metavar="MM",
         type=float,
         default=0.5,
-        help="noise of the tracker, std per axis (default: %(default)s)",
+        help="the noise of the tracker, standard deviation per axis (default: %(default)s)",
     )
     p.add_argument(
         "--dropout",
         metavar=("START", "DURATION"),
         type=float,
         nargs=2,
-        help="seconds of the script while one hand is not seen",
+        help="hide one hand from START of the script for DURATION seconds",
     )
-    p.add_argument("--dropout-hand", choices=("left", "right"), default="left", help="which one (default: %(default)s)")
+    p.add_argument(
+        "--dropout-hand",
+        choices=("left", "right"),
+        default="left",
+        help="the hand that --dropout hides (default: %(default)s)",
+    )
     return p
 
 
@@ -155,7 +175,7 @@ def main(arguments: list[str] | None = None) -> int:
             engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
     except (SceneError, LaunchError, UnreadableError) as error:
-        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     except SettingsError as error:
         p.error(str(error))
@@ -186,9 +206,11 @@ def main(arguments: list[str] | None = None) -> int:
         wait_s=args.wait,
         dropout=dropout,
     )
-    target = args.output or ("-" if args.once else None)
+    target, runs = args.output or ("-" if args.once else None), 0
 
     def report(result: RunReport) -> None:
+        nonlocal runs
+        runs += 1
         line = msgspec.json.encode(result).decode() + "\n"
         if target == "-":
             sys.stdout.write(line)
@@ -221,8 +243,11 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
             run(bench, session, live, stop=stop, report=report)
     except (BenchError, OSError) as error:
-        print(f"thirdhand sim: {printable_lines(str(error))}", file=sys.stderr)
+        print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
+    if not args.once:
+        kept = f"their reports are in {target}" if target else "no report was kept (--output)"
+        print(f"ended: the bench of cell {reach.cell}, after {runs} whole runs; {kept}", file=sys.stderr)
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

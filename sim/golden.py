@@ -8,6 +8,7 @@ again, for a change of behaviour that is meant.
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
+from service.contract.explain import in_words
 
 # isort: split
 import argparse
@@ -228,7 +229,7 @@ def main(arguments: list[str] | None = None) -> int:
             make(args.output, decoded(args.skill.read_bytes(), origin=str(args.skill)))
             print(args.output)
     except (OSError, RecordingError, SkillError) as error:
-        print(f"python -m sim.golden: {error}", file=sys.stderr)
+        print(f"python -m sim.golden: {in_words(error)}", file=sys.stderr)
         return 1
     return 0
 

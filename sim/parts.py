@@ -14,6 +14,7 @@ Each says where it listens, if it does, or else that it began; port 0 takes a fr
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
+from service.contract.explain import in_words
 
 # isort: split
 import argparse
@@ -222,7 +223,7 @@ def _ip(*arguments: str) -> None:
     try:
         done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=10, check=False)
     except OSError as error:
-        raise PartError(f"ip cannot be run: {error}") from None
+        raise PartError(f"ip cannot be run: {in_words(error)}") from None
     if done.returncode != 0:
         raise PartError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 

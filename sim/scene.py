@@ -15,13 +15,13 @@ import math
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
 from service.config import Reach
 from service.contract import requests
-from service.contract.explain import explained
+from service.contract.explain import InvalidError, in_words, validated
 from service.described_arm import SettingsError
 from service.shipped import ARMS, cell_of
 
@@ -81,7 +81,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def __post_init__(self) -> None:
         for name, lowest in LOWEST.items():
             given: Point = getattr(self, name)
-            nominal: Point = Scene.__struct_defaults__[Scene.__struct_fields__.index(name)]
+            nominal = _nominal(name)
             moved = math.dist(given, nominal)
             if not moved <= MOST_MOVED + 1e-9:
                 raise ValueError(
@@ -151,27 +151,33 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """The scene with what an arm does not reach moved over the table until it does, and what
         was moved, in words. Raises SceneError where that is too far.
         """
-        places, said, centre = msgspec.structs.asdict(self), [], reach.centre
+        places, centre = msgspec.structs.asdict(self), reach.centre
+        said, lost = list[str](), list[str]()
         for name, tool in (("handover", self.offer), ("glass", self.glass), ("soldering", self.carry)):
             up, out = tool[2] - centre[2], math.dist(tool[:2], centre[:2])
             low, high = (max(r * r - up * up, 0.0) ** 0.5 for r in (reach.inner + IN_REACH, reach.outer - IN_REACH))
             wanted = min(max(out, low), high)
-            if wanted != out and out > 0:
-                moved = [(wanted - out) / out * (tool[i] - centre[i]) for i in range(2)]
-                places[name] = _add(getattr(self, name), (moved[0], moved[1], 0.0))
-                said.append(f"{name} moved by {100 * abs(wanted - out):.0f} cm into the arm's reach")
-        try:
-            scene = Scene(**places)
-        except ValueError as error:
-            raise SceneError(f"out of the arm's reach: {error}") from None
-        for name, tool in (("handover", scene.offer), ("glass", scene.glass), ("soldering", scene.carry)):
-            away = math.dist(tool, centre)
-            if not (reach.inner <= away <= reach.outer and tool[0] >= reach.min_x and tool[2] >= reach.min_z):
-                raise SceneError(
-                    f"out of the arm's reach: {name}: the tool at {list(tool)} m; {reach.inner:g} to {reach.outer:g} m "
-                    f"from {list(centre)}, x from {reach.min_x:g} and z from {reach.min_z:g} m accepted"
-                )
-        return scene, tuple(said)
+            share, by = (wanted - out) / out if out else 0.0, abs(wanted - out)
+            shift = (share * (tool[0] - centre[0]), share * (tool[1] - centre[1]), 0.0)
+            place, at = _add(getattr(self, name), shift), _add(tool, shift)
+            is_in = reach.inner <= math.dist(at, centre) <= reach.outer
+            if math.dist(place, _nominal(name)) > MOST_MOVED or not is_in:
+                lost.append(f"{name} needs the tool {math.dist(tool, centre):.2f} m from the shoulder")
+            elif at[0] < reach.min_x or at[2] < reach.min_z:
+                lost.append(f"{name} needs the tool at x = {at[0]:.2f}, z = {at[2]:.2f} m")
+            elif by:
+                places[name] = place
+                said.append(f"{name} moved by {100 * by:.0f} cm into the arm's reach")
+        if lost:
+            reaches = f"from {reach.inner:.2f} to {reach.outer:.2f} m around its shoulder at {list(centre)}"
+            raise SceneError(
+                f"the arm does not reach this scene, not even with each place moved by {MOST_MOVED:g} m: "
+                f"{'; '.join(lost)}. Its tool reaches {reaches}, where x is at least {reach.min_x:g} and z at least "
+                f"{reach.min_z:g} m. What to do: take a larger arm, put this one nearer (`thirdhand arm URDF --at X Y "
+                "Z`), or teach it a task of its own size (docs/tutorial.md). A scene of your own (--scene FILE) moves "
+                f"places by {MOST_MOVED:g} m at most"
+            )
+        return Scene(**places), tuple(said)
 
     @staticmethod
     def load(path: Path) -> Scene:
@@ -179,16 +185,12 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
         Raises SceneError.
         """
-        given: Any = None
         try:
-            given = tomllib.loads(path.read_text(encoding="utf-8"))
-            return msgspec.convert(given, Scene)
+            return validated(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
         except (OSError, UnicodeDecodeError) as error:
-            raise SceneError(f"cannot read scene {path}: {error}") from None
-        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"cannot read scene {path}: {in_words(error, named=False)}") from None
+        except (tomllib.TOMLDecodeError, InvalidError) as error:
             raise SceneError(f"{path}: {error}") from None
-        except msgspec.ValidationError as error:
-            raise SceneError(f"{path}: {explained(error, given, Scene)}") from None
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -223,6 +225,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(line, file=sys.stderr)
     print(requests.encode_json(requests.Add(scene.via_points(gripper=args.gripper))).decode())
     return 0
+
+
+def _nominal(name: str) -> Point:
+    """A place of the nominal scene."""
+    place: Point = Scene.__struct_defaults__[Scene.__struct_fields__.index(name)]
+    return place
 
 
 def _add(a: Point, b: Point) -> Point:

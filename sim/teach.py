@@ -5,6 +5,7 @@ the same seed), or published live for `thirdhand record`.
 from __future__ import annotations
 
 from service import one_blas_thread  # noqa: F401
+from service.contract.explain import in_words
 
 # isort: split
 import argparse
@@ -280,7 +281,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SettingsError as error:
         p.error(str(error))
     except (SceneError, OSError) as error:
-        print(f"python -m sim.teach: {error}", file=sys.stderr)
+        print(f"python -m sim.teach: {in_words(error)}", file=sys.stderr)
         return 1
     return 0
 

@@ -26,7 +26,7 @@ import psutil
 import zenoh
 
 from service.client import Client, open_session
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.launch import launched
 from sim.parts import Part, PartError
 from sim.sockets import CountingRelay
@@ -142,7 +142,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         print(text(measured(args.seconds), args.cells))
     except (ExplainedError, PartError, OSError) as error:
-        print(f"python -m sim.traffic: {error}", file=sys.stderr)
+        print(f"python -m sim.traffic: {in_words(error)}", file=sys.stderr)
         return 1
     return 0
 

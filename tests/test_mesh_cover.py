@@ -9,6 +9,7 @@ import struct
 import time
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from service.config import Settings, SettingsError, converted, parse, robot_desc
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
 from service.described_arm import description
-from service.mesh_cover import capsule_around, covered
+from service.mesh_cover import capsule_around, covered, unfound
 from service.urdf import Shape, Urdf, UrdfError
 from support import arms
 from support.paths import ROOT
@@ -133,9 +134,12 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
     [
         (
             "package://no_arm/link.stl",
-            "'no_arm' is in no folder above the URDF, and in none of $.arm.packages: name its folder's there",
+            "package 'no_arm' with this file is in none of {folder}/, ",
         ),
-        ("meshes/link.stl", "there is no {folder}/meshes/link.stl: put it there, or give the link a box, cylinder"),
+        (
+            "meshes/link.stl",
+            "there is no {folder}/meshes/link.stl; put it there. Links with a box, cylinder or sphere instead",
+        ),
         ("broken.stl", "cannot be read"),
     ],
 )
@@ -147,8 +151,24 @@ def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Pa
         covered(urdf.read_text(), urdf)
     assert f"{urdf}: the collision mesh {name} of link 'forearm'" in str(error.value)
     assert told.format(folder=tmp_path) in str(error.value)
-    with pytest.raises(SettingsError, match=r"\$\.arm\.urdf: .*the collision mesh"):
+    with pytest.raises(SettingsError, match=r"\[arm\] urdf: .*the collision mesh"):
         robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
+
+
+def test_all_meshes_that_are_not_found_are_named_once(tmp_path: Path) -> None:
+    urdf = tmp_path / "arm.urdf"
+    lost = '<collision><geometry><mesh filename="package://no_arm/plate.stl"/></geometry></collision>'
+    text = described("package://no_arm/link.stl")
+    shapes = lost + lost.replace("collision", "visual")
+    urdf.write_text(text.replace("</robot>", f'<link name="plate">{shapes}</link></robot>'))
+    robot = ElementTree.fromstring(urdf.read_text())
+    for kind, words in (("collision", "2 collision meshes of links forearm, plate are"), ("visual", "the visual mesh")):
+        said = unfound(robot, urdf, ("/opt/share",), kind)
+        assert said.startswith(words)
+        assert "/opt/share/" in said
+        assert "--packages" in said
+    with pytest.raises(UrdfError, match="2 collision meshes of links forearm, plate are not found, the first is"):
+        covered(urdf.read_text(), urdf)
 
 
 def collada(points: Points, unit: str, node: str = "", up: str = "Z_UP") -> str:

@@ -136,7 +136,7 @@ def test_the_tool_belongs_to_the_reach(tmp_path: Path) -> None:
 def test_a_reach_that_the_arm_has_not_is_refused_with_what_it_has(
     mount: tuple[str, str], reach: str, share: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(SettingsError, match=rf"\$\.reach: the arm reaches {share} of it; at least .*By its kinematics"):
+    with pytest.raises(SettingsError, match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics"):
         cell_in(tmp_path, mounted(UR5, *mount), f"[reach]\n{reach}\n")
 
 
@@ -145,5 +145,5 @@ def test_what_is_said_of_a_reach_stays(tmp_path: Path) -> None:
     assert (cell.reach.outer, cell.reach.min_z) == (0.7, 0.1)
     assert cell.reach.inner < 0.7
     assert cell.reach.centre == pytest.approx((0.0, 0.0, 0.0892), abs=1e-3)
-    with pytest.raises(SettingsError, match=r"\$\.reach\.inner: 0\.8 given; less than \$\.reach\.outer"):
+    with pytest.raises(SettingsError, match=r"\[reach\] inner: 0\.8 given; less than \[reach\] outer"):
         parse(CELL.replace("arm.urdf", str(tmp_path / "arm.urdf")) + "[reach]\ninner = 0.8\nouter = 0.7\n", origin="c")

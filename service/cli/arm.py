@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from xml.etree import ElementTree
 
 from service.arms.arm_picture import draw
-from service.arms.first_cell import JERK_RATE, RISE_S, TORQUE_SHARE, Proposal, proposed, written
+from service.arms.first_cell import JERK_RATE, PLACES, RISE_S, TORQUE_SHARE, Proposal, proposed, written
 from service.cli.usage import check_writable
 from service.config import load
 from service.contract.explain import ExplainedError
-from service.described_arm import SettingsError
+from service.described_arm import SettingsError, description
+from service.mesh_cover import unfound
 
 DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
 
@@ -101,6 +103,12 @@ def text(proposal: Proposal, path: Path) -> str:
         f"  body      {len(radii)} capsules, {radii.min():.3f} to {radii.max():.3f} m thick at most; "
         f"{len(body.pairs)} pairs are kept apart",
     ]
+    raw = ElementTree.fromstring(description(path, cover=False))
+    if lost := unfound(raw, path, settings.arm.packages, "visual"):
+        lines += [
+            f"  meshes    {lost}.",
+            "            The service does not need them. Drawings show the capsules of the collision shapes instead",
+        ]
     if bare:
         lines.append(
             f"            no collision shape moves with joint {', '.join(map(str, bare))}: [arm] link_radius = "
@@ -127,9 +135,10 @@ def text(proposal: Proposal, path: Path) -> str:
             f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 leaves it at the origin"
         )
     if proposal.unmet:
+        far = ", ".join(f"{name} at {math.dist(PLACES[name], shell.centre):.2f} m" for name in proposal.unmet)
         lines.append(
-            f"  demo      out of reach: {', '.join(proposal.unmet)}. The demo moves places by 15 cm at most; teach "
-            "tasks of this arm's own size (docs/tutorial.md)"
+            f"  demo      its scene is out of reach: the tool is needed for {far}. The demo moves a place by 15 cm at\n"
+            "            most; teach tasks of this arm's own size (docs/tutorial.md)"
         )
     return "\n".join(lines)
 

@@ -18,7 +18,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from service.cli.usage import UsageError
 from service.client import AUTHORITY, CERTIFICATE, KEY
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
 
 DAYS = 3650
@@ -77,7 +77,7 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
         authority = x509.load_pem_x509_certificate(beside.read_bytes())
     except (OSError, ValueError) as error:
         raise ExplainedError(
-            f"no authority in {folder} ({error}): {AUTHORITY_KEY} and {DAEMON}/{AUTHORITY} needed, "
+            f"no authority in {folder} ({in_words(error)}): {AUTHORITY_KEY} and {DAEMON}/{AUTHORITY} needed, "
             f"as `thirdhand certificates {folder}` made them"
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():

@@ -78,8 +78,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     bench = too_busy(report)
     for name, event in report["events"].items():
         if not event["reached"]:
-            why = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
-            event["why"] = f"this machine was too busy, {bench}; {why}" if bench else why
+            event["why"] = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
     return {
         "success": report["success"],
         "events": report["events"],
@@ -124,14 +123,16 @@ def _percentiles(values: Any) -> dict[str, float]:
 
 
 def text(report: dict[str, Any]) -> str:
-    """The report for people to read."""
-    lines = []
+    """The report for people to read: each cause of a failure once."""
+    lines, causes = list[str](), list[str]()
     for name, what in EVENTS.items():
         event = report["events"][name]
         outcome = "reached" if event["reached"] else "MISSED"
         lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
         if why := event.get("why"):
-            lines.append(f"      because {why}")
+            lines.append("      for the same reason" if why in causes else f"      because {why}")
+            causes.append(why)
+    busy = ", ".join(part for part in report["busy"].split(", ") if part not in " ".join(causes))
     latency, late, work = report["latency_ms"], report["lateness_us"], report["work_us"]
     lines += [
         "",
@@ -141,7 +142,7 @@ def text(report: dict[str, Any]) -> str:
         f"p99 {latency['p99']:.2f}, max {latency['max']:.2f} ms",
         f"  late     p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} µs;  "
         f"work p50 {work['p50']:.0f}, p99 {work['p99']:.0f}, max {work['max']:.0f} µs",
-        *([f"  machine  too busy: {report['busy']}"] if report["busy"] else []),
+        *([f"  machine  too busy: {busy}"] if busy else []),
         "",
         f"  thirdhand replay {_shown(report['recording'])}",
         f"  thirdhand view {_shown(report['rrd'])}",

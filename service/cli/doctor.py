@@ -19,7 +19,7 @@ import zenoh
 from service.cli.diagnosis import Finding, findings, wrong
 from service.cli.status import heard
 from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
-from service.client import Overheard, StartingError, UnreachableError
+from service.client import Overheard, RefusedError, StartingError, UnreachableError
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.explain import in_words
@@ -78,8 +78,8 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
                 remedy = f"give --cell: {', '.join(sorted(cells))} can be reached here"
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
-        except msgspec.ValidationError as error:
-            yield wrong("daemon", f"a status of another version: {error}", version("thirdhand"), "update the older one")
+        except RefusedError as error:
+            yield wrong("daemon", str(error), f"one of version {version('thirdhand')}", "update the older one")
             return
     yield from findings(
         *seen,

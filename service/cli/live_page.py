@@ -33,7 +33,7 @@ from yarl import URL
 
 from service.client import Client, RefusedError, decoded
 from service.contract import channels
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import in_brief
 from service.contract.requests import Status
 
@@ -304,7 +304,7 @@ class LivePage:
                         await begun.write(piece)
         except (aiohttp.ClientError, OSError) as error:  # a TimeoutError too
             if not begun.prepared:
-                return _answer(502, f"{to} does not answer: {error}")
+                return _answer(502, f"{to} does not answer: {in_words(error, named=False)}")
             if request.transport is not None:
                 request.transport.abort()  # so that the browser does not take the part for the whole
         return begun
@@ -370,7 +370,9 @@ def web_viewer(program: Path, stream: str, port: int) -> Iterator[Address]:
                         break
                     except OSError as error:
                         if viewer.poll() is not None or time.monotonic() > until:
-                            raise OSError(f"the web viewer did not start on port {port}: {error}") from None
+                            raise OSError(
+                                f"the web viewer did not start on port {port}: {in_words(error, named=False)}"
+                            ) from None
                 time.sleep(0.1)
             yield Address("127.0.0.1", port)
         finally:

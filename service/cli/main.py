@@ -10,17 +10,16 @@ import argparse
 import contextlib
 import importlib
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from service import interrupt
 from service.cli import record_options
+from service.cli.progress import say
 from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
-from service.contract.explain import ExplainedError, in_words
-from service.contract.printable import printable_lines
+from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
@@ -32,7 +31,8 @@ RUN_BY = {  # the modules that are not named as their command
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
-SIM = "The simulated bench: publishes hands and joint states, and follows commands."
+SIM = "Runs the simulated bench: publishes hands and joint states, and follows commands."
+RATE = "the rate of the control loop (default: the rate in the cell's settings)"
 ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "play"),
@@ -73,67 +73,88 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "demo",
-        "The soldering scenario, closed loop and headless: bench, service and scribe.",
+        "Runs the soldering scenario once, without a window: simulated bench, service and recording. Then reports how "
+        "the task went.",
         "thirdhand demo --scene my-scene.toml",
     )
-    option(c, "--output", "DIR", "where recording and viewer file go", Path("thirdhand-demo"))
-    option(c, "--scene", "FILE", "TOML file with handover, glass and soldering as [x, y, z] in metres")
+    option(
+        c,
+        "--output",
+        "DIR",
+        "write the recording, the drawing and the service's log to this folder",
+        Path("thirdhand-demo"),
+    )
+    option(
+        c, "--scene", "FILE", "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
+    )
     option(c, "--arm", "ARM", ARM, "wam")
     c.add_argument(
-        "--engine", choices=("pybullet", "mujoco"), help="the physics (default: the first that is installed)"
+        "--engine",
+        choices=("pybullet", "mujoco"),
+        help="the physics engine of the bench (default: the first that is installed)",
     )
-    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
+    option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
         "follow",
-        "The arm's side: drives an arm by the commands of a running cell, and brakes it where they end.",
+        "Drives an arm by the joint commands of a running cell, and brakes it when they end.",
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
-    c.add_argument("arm", metavar="ARM", help="franka, or simulated: an ideal one, to try a cell without any")
-    option(c, "--config", "CELL", f"the daemon's settings: {ARM}")
-    option(c, "--robot", "ADDRESS", "of a Franka: name or IP address", "172.16.0.2")
-    option(c, "--wait", "S", "for the daemon, and for its first command", 60.0)
+    c.add_argument("arm", metavar="ARM", help="the arm to drive: franka, or simulated, an ideal arm to try a cell with")
+    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM}")
+    option(c, "--robot", "ADDRESS", "the host name or IP address of a Franka's control box", "172.16.0.2")
+    option(c, "--wait", "S", "wait this long for the daemon, and as long again for its first command", 60.0)
     _reach(c)
 
-    c = command("bench", "How the loop keeps its time on this machine.", "thirdhand bench --rate 1000 --seconds 60")
-    option(c, "--seconds", "S", "to measure for (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
-    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
+    c = command(
+        "bench",
+        "Measures how punctual the control loop is on this machine.",
+        "thirdhand bench --rate 1000 --seconds 60",
+    )
+    option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
+    option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
     option(c, "--arm", "ARM", ARM, "wam")
-    option(c, "--output", "DIR", "write bench.json there, a picture, and what the whole recorded")
+    option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
     other = c.add_mutually_exclusive_group()
     other.add_argument(
-        "--loads", action="store_true", help="what happens beside the loop instead, each for these seconds"
+        "--loads", action="store_true", help="measure under each kind of load beside the loop, --seconds for each"
     )
-    other.add_argument("--soak", action="store_true", help="memory and open files instead, a sample each 5 s at most")
+    other.add_argument(
+        "--soak", action="store_true", help="measure memory and open files over time, with a sample every 5 s or less"
+    )
 
     c = command(
-        "serve", "The daemon: hand poses in, joint commands out.", "thirdhand serve --record recordings --joints state"
+        "serve",
+        "Runs the daemon of a cell: it receives hand poses and publishes joint commands.",
+        "thirdhand serve --record recordings --joints state",
     )
-    option(c, "--config", "CELL", f"{ARM}; the options below override it")
-    option(c, "--cell", "NAME", "prefix of all keys (default: thirdhand)")
-    listen = f"Zenoh endpoint to listen on; may be repeated (default: {channels.ENDPOINT})"
+    option(c, "--config", "CELL", f"the cell: {ARM}; the options below override its settings")
+    option(c, "--cell", "NAME", "the prefix of all keys on the network (default: thirdhand)")
+    listen = f"listen on this Zenoh endpoint; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
-    option(c, "--connect", "EP", "Zenoh endpoint to connect to; may be repeated", action="append")
+    option(c, "--connect", "EP", "connect to this Zenoh endpoint; may be repeated", action="append")
     option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
-    option(c, "--rate", "HZ", "of the loop (default: the cell's)")
-    option(c, "--skill", "FILE", "a skill made by `thirdhand learn` (default: the shipped soldering skill)")
-    joints = "wait for the arm's joint states, or assume its posture (default: the settings', else state)"
+    option(c, "--rate", "HZ", RATE)
+    option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
+    joints = (
+        "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, which is state)"
+    )
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
     c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
-    option(c, "--record", "DIR", "write .mcap and .rrd files there")
-    live = "serve Rerun viewers on this loopback port"
+    option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
+    live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
 
     c = command(
         "play",
-        "Publishes the hands of a recording or demonstration, as a tracker would.",
+        "Publishes the hands of a recording or demonstration, as a tracker does.",
         "thirdhand play recordings/demonstration-6.mcap --loop",
     )
-    option(c, "file", "FILE", "an MCAP file with hands/left and hands/right")
-    option(c, "--speed", "X", "times as fast as recorded", 1.0, type=within(float, 0.01, 100))
-    c.add_argument("--loop", action="store_true", help="over and over")
+    option(c, "file", "FILE", "the recording or demonstration: an MCAP file with hands/left and hands/right")
+    option(c, "--speed", "X", "play this many times as fast as recorded", 1.0, type=within(float, 0.01, 100))
+    c.add_argument("--loop", action="store_true", help="start again at the end, until Ctrl-C")
     _reach(c)
 
     c = command(
@@ -155,7 +176,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "report",
-        "A report of recordings: what they lack, modes and reasons, faults and what led to them, promptness, closest "
+        "Reports on recordings: what they lack, modes and reasons, faults and what led to them, promptness, closest "
         "approach, places, limits, rejections. Several are set side by side.",
         "thirdhand report thirdhand-demo/*.mcap --html report.html",
     )
@@ -168,40 +189,46 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "learn",
-        "Learns a skill from demonstrations and judges it by leaving out one at a time. Where it would be unsafe, "
-        "exit 1 and no file.",
+        "Learns a skill from demonstrations and judges it by held-out ones: each is left out once and predicted "
+        "from the others. An unsafe skill is not written, and the exit code is 1.",
         "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
     )
     demonstrations = (
-        "recordings with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's folder, "
-        ".bag, CSV of Motive, C3D"
+        "demonstrations with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's "
+        "folder, .bag, CSV of Motive, C3D"
     )
     option(c, "demonstrations", "DEMO", demonstrations, nargs="+", type=Path)
     for name in ("left", "right", "tool"):
         c.add_argument(
             f"--{name}",
             metavar="TOPIC[:PART]",
-            help=f"where the {name}{' hand' * (name != 'tool')} is in recordings of others: poses, a PoseArray with an "
-            "index, or a TFMessage with a child frame" + "; or joint states" * (name == "tool"),
+            help=f"the topic of the {name}{' hand' * (name != 'tool')} in recordings of other systems: poses, a "
+            "PoseArray with an index, or a TFMessage with a child frame" + "; or joint states" * (name == "tool"),
         )
-    option(c, "--output", "FILE", "the skill, .npz", required=True)
-    option(c, "--plot", "FILE", "a picture of what it is judged by, .png")
-    c.add_argument("--name", help="of the skill (default: the file's)")
-    option(c, "--config", "CELL", f"the tracker's axes and unit, the arm: {ARM}")
+    option(c, "--output", "FILE", "write the skill to this .npz file", required=True)
+    option(c, "--plot", "FILE", "draw the held-out errors to this .png file")
+    c.add_argument("--name", help="the name of the skill (default: the name of the file)")
+    option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM}")
     places = (
-        "where the named places of the task were, as `via-points add --file` takes them, for demonstrations that "
-        "do not hold it: then the skill is learned between them, and holds wherever they are"
+        "the named places of the task, as `via-points add --file` reads them, for demonstrations that do not hold "
+        "them; the skill is then learned between these places and follows them when they move"
     )
     option(c, "--places", "FILE", places)
     count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
-    option(c, "--points", "N", "of the reference", 200, type=count)
-    option(c, "--ell", "L", "of the kernel [1/m²] (default: chosen; mixture: 5)", type=positive)
-    components = "take the reference from a mixture of K, the paper's way (default: from the demonstrations themselves)"
+    option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
+    option(
+        c,
+        "--ell",
+        "L",
+        "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)",
+        type=positive,
+    )
+    components = "take the reference from a mixture of K Gaussians, as in the paper (default: from the demonstrations)"
     option(c, "--components", "K", components, type=count)
-    option(c, "--penalty", "L", "the mixture's lambda (default: 2)", type=positive)
-    option(c, "--seed", None, "of the mixture's start and the sampled inputs", 0, type=int)
+    option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)
+    option(c, "--seed", None, "the seed for the start of the mixture and for the sampled inputs", 0, type=int)
 
-    c = command("via-points", "Via-points taught to a running daemon.", "thirdhand via-points list")
+    c = command("via-points", "Adds, lists and removes via-points of a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")
     example = "thirdhand via-points"
     a = described(
@@ -233,10 +260,12 @@ def parser() -> argparse.ArgumentParser:
     _reach(described(actions, "list", "the via-points in force", f"{example} list"))
     _reach(described(actions, "clear", "forget all via-points", f"{example} clear"))
 
-    c = _reach(command("stage", "Tells that the task has come to a via-point.", "thirdhand stage handover"))
+    c = _reach(
+        command("stage", "Tells a running daemon that the task has reached a via-point.", "thirdhand stage handover")
+    )
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
 
-    c = _reach(command("status", "What a running daemon does.", "thirdhand status --json"))
+    c = _reach(command("status", "Shows what a running daemon does.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")
     c.add_argument("--watch", action="store_true", help="hands, tool, target and distances as they change")
     about = "Looks at a running cell, and says what is wrong and what to do. Then exit 1."
@@ -247,7 +276,9 @@ def parser() -> argparse.ArgumentParser:
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
     _reach(command("reset", "Ends a fault.", "thirdhand reset"))
 
-    c = command("cells", "The daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447")
+    c = command(
+        "cells", "Lists the daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447"
+    )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
     _reach(c, one=False)
 
@@ -291,7 +322,7 @@ def parser() -> argparse.ArgumentParser:
     option(picture, "--screenshot", "PNG", "write this picture instead of opening a window; of several files the last")
     option(picture, "--time", "S", "show this time after the start (default: the last moment in mode follow)")
     tabs = ("task", "timing", "learning")
-    option(picture, "--tab", None, "show this tab of the viewer", "task", choices=tabs)
+    option(picture, "--tab", None, "show this tab of the viewer (default: task)", choices=tabs)
     browser = c.add_argument_group("a browser")
     web = "serve a page for browsers, with hold, resume and reset, of `live` (default: any port of this machine)"
     option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
@@ -346,13 +377,13 @@ def main(arguments: list[str] | None = None) -> int:
         with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
             return int(run(args))
     except (UsageError, SettingsError) as error:
-        print(f"thirdhand {args.command}: {printable_lines(str(error))}", file=sys.stderr)
+        say(f"thirdhand {args.command}: {in_file(str(error))}")
         return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:
-        print(f"thirdhand {args.command}: {printable_lines(in_words(error))}", file=sys.stderr)
+        say(f"thirdhand {args.command}: {in_file(in_words(error))}")
         return 1
     except KeyboardInterrupt:
         interrupt.end_at_once()

@@ -5,19 +5,27 @@ spinner on a terminal, else a line every ten seconds.
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 
-from service.contract.printable import printable_lines
+from service.contract.printable import CLEAR, printable_lines
+from service.contract.requests import STARTING
 
 AFTER_S, EVERY_S = 2.0, 10.0
 
 
 def say(line: str) -> None:
-    """Print a message on standard error at once, without effects of what it quotes."""
-    print(printable_lines(line), file=sys.stderr, flush=True)
+    """Print a message on standard error at once, without effects of what it quotes.
+
+    On a terminal, what a daemon reports of its start is one line, written anew in place.
+    """
+    terminal = sys.stderr.isatty()
+    in_place = terminal and line.lstrip().startswith(STARTING)
+    shown = line[: shutil.get_terminal_size().columns - 1] if in_place else line
+    print(f"{CLEAR * terminal}{printable_lines(shown)}", end="" if in_place else "\n", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -8,9 +8,9 @@ from pathlib import Path
 from service.cli.usage import ARM, option
 
 ABOUT = (
-    "Records a demonstration of hands and tool from a running cell, and shows what it got; lists, shows, trims and "
-    "deletes those that are there. The tool is what is published as tool/pose, else it is found from the arm's "
-    "joints/state by its URDF."
+    "Records a demonstration of hands and tool from a running cell, called a take, and summarizes it. Also lists, "
+    "shows, trims and deletes takes. The pose of the tool is taken from tool/pose or, if nothing publishes that, is "
+    "computed from the arm's joints/state and its URDF."
 )
 EXAMPLE = """thirdhand record take-1
   thirdhand record take-1 --hands left
@@ -21,35 +21,35 @@ EXAMPLE = """thirdhand record take-1
 
 def add_options(c: argparse.ArgumentParser) -> None:
     """Adds the command's own options."""
-    option(c, "name", "NAME", "of the take", nargs="?")
-    option(c, "--folder", "DIR", "where takes are, made if missing", Path("demonstrations"))
-    option(c, "--config", "CELL", f"the daemon's settings: {ARM}")
-    hands = "that conduct the tool: of one, only it is recorded, and what is learned heeds no other"
+    option(c, "name", "NAME", "the name of the take", nargs="?")
+    option(c, "--folder", "DIR", "the folder of the takes; it is made if missing", Path("demonstrations"))
+    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM}")
+    hands = "the hands that lead the tool; if it is one, only that one is recorded and the skill ignores the other"
     option(c, "--hands", None, hands, "both", choices=("both", "left", "right"))
-    person = "who demonstrates; of two or more, `learn` leaves out all takes of one at once"
+    person = "the person who demonstrates; with two or more people, `learn` holds out all takes of a person together"
     option(c, "--person", "WHO", person)
     until = (
-        "it ends with Enter or Ctrl-C, or also once hands and tool rest after they moved: all stay within 15 mm, "
-        "joints within 0.02 rad (rest before and after is then left out but for 0.3 s)"
+        "end the take by a key (Enter or Ctrl-C), or also once hands and tool rest after they moved: all stay "
+        "within 15 mm, joints within 0.02 rad (of the rest before and after, 0.3 s are then retained)"
     )
     option(c, "--until", None, until, "key", choices=("key", "rest"))
-    rest = "for so long; slow motion, of less than 15 mm in that time, is rest too"
+    rest = "with --until rest, they must rest this long; slower motion than 15 mm in this time counts as rest"
     option(c, "--rest", "S", rest, 1.0)
-    option(c, "--seconds", "S", "it lasts at most", 600.0)
-    option(c, "--wait", "S", "for hands and tool to be heard", 30.0)
-    listen = "Zenoh endpoint to listen on instead, for tracker and arm to connect to while no daemon runs"
+    option(c, "--seconds", "S", "end the take after this time at the latest", 600.0)
+    option(c, "--wait", "S", "wait this long for hands and tool to be published", 30.0)
+    listen = "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
     option(c, "--listen", "EP", listen)
-    places = "where the things of the task lie in this take, by name: JSON as `via-points add --file` takes it"
+    places = "the named places of the task in this take, as JSON that `via-points add --file` reads"
     option(c, "--places", "FILE", places)
-    option(c, "--plot", "FILE", "a picture of the take, .png")
+    option(c, "--plot", "FILE", "draw the take to this .png file")
     instead = c.add_mutually_exclusive_group()
-    instead.add_argument("--list", action="store_true", help="the takes that are there, instead")
-    instead.add_argument("--show", action="store_true", help="a take that is there, instead")
+    instead.add_argument("--list", action="store_true", help="list the takes, and record none")
+    instead.add_argument("--show", action="store_true", help="show the take of this name, and record none")
     instead.add_argument(
         "--trim",
         metavar=("FROM", "TO"),
         nargs=2,
         type=float,
-        help="cut a take to these seconds, instead; as it was it stays beside it as NAME.mcap.uncut",
+        help="cut the take of this name to these seconds; the uncut take is kept beside it as NAME.mcap.uncut",
     )
-    instead.add_argument("--delete", action="store_true", help="a take that is there, and its .uncut, instead")
+    instead.add_argument("--delete", action="store_true", help="delete the take of this name and its .uncut file")

@@ -16,7 +16,7 @@ import msgspec
 from service import child
 from service.cli.usage import UsageError
 from service.config import Settings, converted
-from service.contract.printable import printable_lines
+from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
 from service.described_arm import SettingsError
 from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
@@ -62,7 +62,7 @@ class PrintableFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record's line or lines."""
-        return printable_lines(super().format(record))
+        return CLEAR * sys.stderr.isatty() + printable_lines(super().format(record))
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:

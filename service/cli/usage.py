@@ -17,6 +17,7 @@ import zenoh
 from service.client import ClientSettings, client_settings
 from service.config import RATES_HZ
 from service.contract.channels import lacking
+from service.contract.explain import in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
 
 CONNECT_TIMEOUT_S = 3.0
@@ -141,9 +142,9 @@ def added_in(path: Path) -> Add:
     try:
         request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
     except OSError as error:
-        raise RequestError(f"{path} cannot be read: {error.strerror}") from None
+        raise RequestError(f"{path} cannot be read: {in_words(error, named=False)}") from None
     except RequestError as error:
-        raise RequestError(f"{path}: {error}") from None
+        raise RequestError(f"{path}: {in_file(str(error))}") from None
     return request
 
 

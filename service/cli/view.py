@@ -28,7 +28,7 @@ from service.cli.live_page import Address, Latest, LivePage, web_viewer
 from service.cli.progress import progress, say
 from service.cli.usage import UsageError, check_writable, reached
 from service.client import Client
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.launch import free_port
@@ -56,7 +56,7 @@ def view(args: argparse.Namespace) -> int:
         say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
         if not (url := now["scribe"].get("live")):
             raise UsageError("this daemon serves no live view; start it with --live PORT")
-        return _serve(args, url) if args.web else _show([url], args)
+        return _serve(args, url) if args.web is not None else _show([url], args)
     paths = [Path(name) for name in args.files]
     kinds = [_kind(path) for path in paths]
     if args.screenshot and len(paths) > 1:
@@ -96,8 +96,12 @@ def check_usage(args: argparse.Namespace) -> None:
         raise UsageError(f"--time {args.time:g}: seconds from 0 on, of a --screenshot, needed")
     if "live" in args.files and len(args.files) > 1:
         raise UsageError(f"live beside {len(args.files) - 1} files; either live alone or files needed")
-    if args.web and (args.files != ["live"] or args.screenshot):
-        raise UsageError("--web shows the running daemon in a browser: `thirdhand view live --web`")
+    if args.tab is not None and not args.screenshot:
+        raise UsageError("--tab chooses the tab of a picture; --screenshot PNG needed with it")
+    if args.web is not None and args.screenshot:
+        raise UsageError("--web and --screenshot given; one of them accepted: a page for browsers, or a picture")
+    if args.web is not None and args.files != ["live"]:
+        raise UsageError("--web shows a running daemon, not files: `thirdhand view live --web`")
 
 
 def _serve(args: argparse.Namespace, url: str) -> int:
@@ -138,7 +142,7 @@ def _show(sources: list[str], args: argparse.Namespace) -> int:
     """
     _check_drawing(args)
     if args.screenshot:
-        age_s = screenshot(sources[0], args.screenshot, time=args.time, tab=args.tab)
+        age_s = screenshot(sources[0], args.screenshot, time=args.time, tab=args.tab or TABS[0])
         print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
         return 0
     return subprocess.run([rerun_program(), "--bind", "127.0.0.1", *sources], check=False).returncode
@@ -170,6 +174,8 @@ def convert(
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
+        if viewer.arm_remark:
+            say(viewer.arm_remark)
         notes = recording.notes("requests", "log", OBJECTS)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
@@ -240,7 +246,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     except ViewerError:
         raise
     except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
-        raise ViewerError(f"no picture of {source}: {error} ({NO_VULKAN})") from error
+        raise ViewerError(f"no picture of {source}: {in_words(error)} ({NO_VULKAN})") from error
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:

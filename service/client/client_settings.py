@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import zenoh
 from service.client.session import open_session
 from service.config import Cell
 from service.contract.channels import ENDPOINT, lacking
-from service.contract.explain import InvalidError, validated
+from service.contract.explain import InvalidError, in_words, validated
 from service.described_arm import SettingsError, UnreadableError
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
@@ -79,7 +80,10 @@ def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
     try:
         validated(given, ClientSettings)
     except InvalidError as error:
-        raise SettingsError(f"{origin}: {error}") from None
+        told = str(error)
+        if origin.startswith(("$", "-")):  # a variable or an option, which names the value itself
+            told = re.sub(rf"(?m)^{next(iter(given))}(, entry \d+)?: ", "", told)
+        raise SettingsError(f"{origin}: {told}") from None
     return given
 
 
@@ -98,7 +102,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableError(f"cannot read client settings {path}: {error}") from None
+        raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SettingsError(f"{path}: {error}") from None
     if isinstance(given.get("connect"), str):

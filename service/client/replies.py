@@ -7,6 +7,7 @@ from typing import TypeVar
 import msgspec
 
 from service.client.session import RefusedError
+from service.contract.explain import InvalidError, in_words, validated
 from service.contract.printable import printable_values
 
 T = TypeVar("T")
@@ -15,6 +16,7 @@ T = TypeVar("T")
 def decoded(data: bytes, kind: type[T]) -> T:
     """The value of this type in JSON bytes, each of its texts printable. Raises RefusedError."""
     try:
-        return msgspec.convert(printable_values(msgspec.json.decode(data)), kind)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-        raise RefusedError(f"not a {kind.__name__}: {error}. Is the daemon of this version?") from None
+        return validated(printable_values(msgspec.json.decode(data)), kind)
+    except (msgspec.DecodeError, InvalidError, RecursionError, UnicodeDecodeError) as error:
+        what = f"not a {kind.__name__}: {in_words(error, named=False)}"
+        raise RefusedError(f"{what}. Is the daemon of this version?") from None

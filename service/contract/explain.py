@@ -32,12 +32,40 @@ class ExplainedError(Exception):
     """Tells people what failed, was given and is accepted: commands print it and exit 1."""
 
 
-def in_words(error: BaseException) -> str:
-    """An error without the numbers of the operating system: what failed, and what it would take."""
+def in_words(error: BaseException, *, named: bool = True) -> str:
+    """An error in words, without numbers of the operating system and names of codecs: which file
+    (if `named`), what failed, and what is needed.
+    """
+    if isinstance(error, UnicodeDecodeError):
+        return f"the byte 0x{error.object[error.start]:02x} is not valid; a text in UTF-8 needed"
     if not isinstance(error, OSError) or isinstance(error, ExplainedError) or error.strerror is None:
         return str(error) or type(error).__name__
     wanted = WANTED.get(error.errno or 0, "")
-    return f"{error.filename}: " * (error.filename is not None) + error.strerror + f"; {wanted}" * bool(wanted)
+    file = f"{error.filename}: " * (named and error.filename is not None)
+    return file + error.strerror + f"; {wanted}" * bool(wanted)
+
+
+_PATH = re.compile(
+    r"""(?mx) (?<!\w)(?: '(?:[^'\\\n]|\\.)*' | "(?:[^"\\\n]|\\.)*" )  # a quotation stays as it is
+    | ^\$:[ ] | \$((?:\.\w+ | \[(?:\d+|\.\.\.)\])+)"""
+)
+
+
+def in_file(text: str) -> str:
+    """The text with each JSON path as an author of a file names the value: `$.arm.urdf` becomes
+    `[arm] urdf`, `$.points[0].left` becomes `points, entry 1, left`; the root needs no name.
+    """
+    return _PATH.sub(lambda found: _named(found[1]) if found[1] else found[0].replace("$: ", ""), text)
+
+
+def _named(path: str) -> str:
+    parts = [
+        name or (f"entry {int(index) + 1}" if index.isdigit() else "an entry")
+        for name, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", path)
+    ]
+    if re.match(r"\.\w+\.", path):
+        parts[:2] = [f"[{parts[0]}] {parts[1]}"]
+    return ", ".join(parts)
 
 
 class InvalidError(ExplainedError, ValueError):
@@ -45,7 +73,8 @@ class InvalidError(ExplainedError, ValueError):
 
 
 def validated(given: Any, kind: type[T]) -> T:
-    """A struct of structs from what a file holds. Raises InvalidError with all that is wrong.
+    """A struct of structs from what a file holds. Raises InvalidError with all that is wrong, in
+    the words of `in_file`.
 
     What is wrong is left out and the rest looked at again. The checks of several values come last;
     what they say of a section in which something was left out is not told.
@@ -68,7 +97,7 @@ def validated(given: Any, kind: type[T]) -> T:
             if not problems:
                 return value
             break
-    raise InvalidError("\n".join(problems))
+    raise InvalidError(in_file("\n".join(problems)))
 
 
 def _leave_out(given: Any, said: str) -> str:

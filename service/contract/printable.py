@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+CLEAR = "\r\x1b[K"  # clears the line of a terminal, which was written without an end
 _MARKDOWN = re.compile(r"[\\`*_\[\]<>|#&!~$]")
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 
-from service.contract.explain import ExplainedError, explained
+from service.contract.explain import ExplainedError, explained, in_words
 from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES
 
@@ -139,7 +139,7 @@ def decode_request(data: bytes, kind: Any) -> Any:
     try:
         given = msgspec.json.decode(data or b"{}")
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RequestError(f"not JSON: {error}") from None
+        raise RequestError(f"not JSON: {in_words(error, named=False)}") from None
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:

@@ -105,6 +105,7 @@ class Daemon:
         self._saved_stage = SavedStage(settings)
         if came_to := self._saved_stage.read(stored):
             self._own.append(order("stage", came_to))
+            log.info("the task continues at via-point %s, which an earlier run had reached", came_to)
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
         self._notes = (0, 0)  # a second, and the number of notes in it
         self._failed_at: int | None = None
@@ -173,7 +174,11 @@ class Daemon:
             self._queryables.close()
             self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
-            if missing := self._scribe.close():
+            missing = self._scribe.close()
+            recording = self._scribe.status()["recording"]
+            kept = f"its newest recording is {recording}" if recording else "it recorded nothing"
+            log.info("ended: the daemon of cell %s; %s", self._settings.cell, kept)
+            if missing:
                 log.warning("%s", missing)
         return missing
 
@@ -285,6 +290,7 @@ class Daemon:
             if self._frame["tick"] >= 0:
                 self._is_open = True
                 self._start.over()
+                log.info("started in %.0f s", self._start.age_s)
                 self._queryables.open(self._session)
                 announce(self)
 
@@ -327,7 +333,7 @@ class Daemon:
                     log.warning("%s", error_text)
             for line in self._sources.news(status.sources, time.monotonic()):
                 log.warning("%s", line)
-            if status.tick >= 0 and (status.mode, status.reason) != logged_mode:
+            if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
 
@@ -367,14 +373,23 @@ class Daemon:
 
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
     """The skill in a file, with the via-points taught to it before. Raises SkillError."""
-    skill = skill_of(path)
+    skill, saved = skill_of(path), SavedViaPoints(settings)
 
     def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
         if points == skill.via_points:
             return skill
-        return skill_of(skill.file, points, tolerance, settings.tool.max_gain)
+        adapted = skill_of(skill.file, points, tolerance, settings.tool.max_gain)
+        names = ", ".join(point.name for point in points) or "the skill's own were removed"
+        log.info(
+            "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand via-points remove "
+            "NAME` removes one, `thirdhand via-points clear` all",
+            len(points),
+            names,
+            saved.path(skill),
+        )
+        return adapted
 
-    return SavedViaPoints(settings).restored(skill, taught, skill)
+    return saved.restored(skill, taught, skill)
 
 
 def serve(

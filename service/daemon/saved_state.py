@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from service.contract.explain import in_file, in_words
+
 log = logging.getLogger("thirdhand")
 LARGEST_BYTES = 32_000_000
 T = TypeVar("T")
@@ -26,7 +28,7 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
         return otherwise
     except Exception as error:
         aside = path.with_suffix(".damaged")
-        reason = error.strerror if isinstance(error, OSError) else str(error) or type(error).__name__
+        reason = in_file(in_words(error, named=False))
         try:
             path.replace(aside)
         except OSError as failure:

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
+import shutil
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,29 +20,38 @@ import zenoh
 from service.client import open_session
 from service.config import Settings
 from service.contract import channels, ros2
+from service.contract.printable import CLEAR
 from service.contract.requests import STARTING
 from service.contract.roles import access_control
 from service.daemon.single_instance import BOUNDS, Lock, allow_descriptors, occupy, state_folder
 
 log = logging.getLogger("thirdhand")
-TELL_EVERY_S = 1.0
+TELL_EVERY_S, LOG_EVERY_S = 1.0, 20.0
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # modules of what the loop runs
 
 
 class Start:
-    """Until it is `over` each request to a cell is refused with what is done and how far it is; the
-    log tells it as it changes.
+    """Until it is `over`, each request to a cell is refused with what is done and how far it is.
+
+    On a terminal one line shows it, written anew in place; elsewhere the log reports the beginning,
+    each quarter of the functions, and every LOG_EVERY_S that something changes.
     """
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
         self.lock, self.session = lock, session
         self._compiled: list[str] = []  # what is being compiled, callers first; no names of what libraries have
         self._functions: list[Any] = []  # all that the loop may call, once they are imported
-        self._is_over = threading.Event()
+        self._is_over, self._begun_s = threading.Event(), time.monotonic()
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
         self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
-        threading.Thread(target=self._tell, name="start", daemon=True).start()
+        self._teller = threading.Thread(target=self._tell, name="start", daemon=True)
+        self._teller.start()
+
+    @property
+    def age_s(self) -> float:
+        """The time since it began [s]."""
+        return time.monotonic() - self._begun_s
 
     @property
     def told(self) -> str:
@@ -48,8 +60,11 @@ class Start:
             return f"{STARTING}importing, {len(sys.modules)} modules so far"
         named = [name for name in self._compiled.copy() if name]
         doing = f"compiling {named[-1]}" if named else "loading what is compiled"
-        there = sum(bool(function.signatures) for function in self._functions)
-        return f"{STARTING}{doing}, {there} of {len(self._functions)} functions are there"
+        return f"{STARTING}{doing}, {self._ready} of {len(self._functions)} functions are there"
+
+    @property
+    def _ready(self) -> int:
+        return sum(bool(function.signatures) for function in self._functions)
 
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
@@ -76,6 +91,7 @@ class Start:
     def over(self) -> None:
         """Ends the refusals, so that others can answer; may be repeated."""
         self._is_over.set()
+        self._teller.join()
         while self._queryables:
             self._queryables.pop().undeclare()  # type: ignore[no-untyped-call]
 
@@ -84,11 +100,19 @@ class Start:
             query.reply_err(self.told.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
 
     def _tell(self) -> None:
-        said = ""
+        said, said_s, quarter, terminal = "", -math.inf, -1, sys.stderr.isatty()
         while not self._is_over.is_set():
-            if (told := self.told) != said:
-                log.info("%s", said := told)
+            told, now_s = self.told, time.monotonic()
+            now_in = 4 * self._ready // len(self._functions) if self._functions else -1
+            if terminal:
+                width = shutil.get_terminal_size().columns - 1
+                print(f"{CLEAR}{told[:width]}", end="", file=sys.stderr, flush=True)
+            elif told != said and (now_in > quarter or now_s - said_s >= LOG_EVERY_S):
+                log.info("%s", told)
+                said, said_s, quarter = told, now_s, now_in
             self._is_over.wait(TELL_EVERY_S)
+        if terminal:
+            print(CLEAR, end="", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

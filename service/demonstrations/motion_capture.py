@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.contract.explain import in_words
 from service.core.frame import Vector
 from service.recording.mcap_file import RecordingError
 
@@ -31,7 +32,7 @@ def read_motive(path: Path) -> Captured:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = [row for row in csv.reader(stream) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path} is not a CSV file that can be read: {error}") from None
+        raise RecordingError(f"{path} is not a CSV file that can be read: {in_words(error, named=False)}") from None
     about = dict(zip(rows[0][::2], rows[0][1::2], strict=False)) if rows else {}
     axes_at = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
     if "Format Version" not in about or axes_at < 4:
@@ -79,7 +80,7 @@ def read_c3d(path: Path) -> Captured:
         labels, units = about["LABELS"]["value"], about["UNITS"]["value"]
         rate_hz, points = float(about["RATE"]["value"][0]), np.asarray(found["data"]["points"], np.float64)
     except Exception as error:  # the library raises exceptions of many kinds
-        raise RecordingError(f"{path} is not a C3D file that can be read: {error}") from None
+        raise RecordingError(f"{path} is not a C3D file that can be read: {in_words(error, named=False)}") from None
     unit = str(units[0]).strip().lower() if units else ""
     if unit not in UNITS_M or rate_hz <= 0:
         raise RecordingError(f"{path}: unit {unit!r}, {rate_hz:g} Hz; m, cm or mm needed, and a rate above 0")

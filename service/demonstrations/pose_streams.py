@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
+from service.contract.explain import InvalidError, in_words, validated
 from service.contract.joint_states import JointStates, measured
 from service.contract.messages import BASE, JointState, PoseStamped, WireError
 from service.contract.printable import printable
@@ -139,9 +140,9 @@ class Recorded:
         if "settings.json" in messages.attachments:
             self.is_ours = True
             try:
-                self.settings = msgspec.json.decode(messages.attachments["settings.json"], type=Settings)
-            except msgspec.DecodeError as error:
-                self.unused.append(f"the settings in {self.path} are not understood: {error}")
+                self.settings = validated(msgspec.json.decode(messages.attachments["settings.json"]), Settings)
+            except (msgspec.DecodeError, InvalidError) as error:
+                self.unused.append(f"the settings in {self.path} are not understood: {in_words(error, named=False)}")
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
 
     def _whole(self, data: bytes) -> bytes:

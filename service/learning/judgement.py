@@ -296,7 +296,7 @@ def table(found: Figures) -> str:
     rows = (*found.demonstrations, found.all)
     is_other = any(abs(row.moment_mm - row.error_mm) >= OTHER_MM for row in rows)
     moment = "  at the moment" if is_other else ""
-    lines = [f"{which:<{width}}   error   worst{moment}  predicted   in 50 %  in 95 %   held{ways}"]
+    lines = [f"{which:<{width}}   error   worst{moment}   expected   in 50 %  in 95 %   held{ways}"]
     for row in rows:
         moment = f"        {row.moment_mm:4.0f} mm" if is_other else ""
         lines.append(
@@ -306,11 +306,23 @@ def table(found: Figures) -> str:
         )
     helds = [row.held for row in found.demonstrations]
     lines += [
-        f"the gate would hold {found.all.held:.1f} % of the time: {min(helds):.1f} to {max(helds):.1f} % of a "
-        f"demonstration, standard deviation {found.held_std:.1f} %",
-        f"gate {found.gate_mm:.0f} mm: holds {_caught(found)}",
-        f"{found.ambiguous:.1f} % of the samples contradict others; {found.beyond_reach:.1f} % of the tool's way is "
-        "out of reach",
+        "",
+        "Each row is a demonstration that was left out and predicted from the others. The columns:"
+        if len(found.demonstrations) > 1
+        else "The row is the demonstration that was learned from, as none could be left out. The columns:",
+        "  error, worst   distance of the predicted tool from the demonstrated one: root mean square, and largest",
+        *["  at the moment  that error without any allowance for a tool that is early or late"] * is_other,
+        "  expected       root mean square error that the skill expects, by its covariance as calibrated",
+        "  in 50 %, 95 %  share of the samples in the regions that should hold 50 % and 95 % of them",
+        "  held           share of the time in which the arm would hold, as the hands are beyond the gate",
+        *[f"  {', '.join(found.all.other_mm)}: errors of simpler predictions"] * bool(found.all.other_mm),
+        "docs/learning.md, section Judged, explains each of them.",
+        "",
+        f"the gate would hold the arm for {found.all.held:.1f} % of the time, {min(helds):.1f} to {max(helds):.1f} % "
+        f"of a demonstration, standard deviation {found.held_std:.1f} %",
+        f"the gate, at {found.gate_mm:.0f} mm, would hold it in wrong samples: {_caught(found)}",
+        f"{found.ambiguous:.1f} % of the samples contradict others: the same hands, another tool; "
+        f"{found.beyond_reach:.1f} % of the tool's path is out of the arm's reach",
     ]
     if found.orientation_error_deg is not None:
         lines.append(f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms")
@@ -324,7 +336,7 @@ def table(found: Figures) -> str:
         )
     if found.tried_mm:
         wide = max(map(len, found.tried_mm))
-        lines.append(f"what the tool can be a function of, missed when left out; {found.taken} taken:")
+        lines.append(f"what the tool may be a function of, and its error when left out; {found.taken} is taken:")
         lines += (f"  {name:<{wide}}  {mm:4.0f} mm" for name, mm in found.tried_mm.items())
     lines += (f"warning: {text}" for text in found.warnings)
     return "\n".join([*lines, *(f"unsafe: {text}" for text in found.unsafe)])

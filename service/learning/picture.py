@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
-NONSENSE = {"hands swapped": "0.7", "both 30 cm beside": "0.5", "one 30 cm beside": "0.3"}  # shades of grey
+NONSENSE = {
+    "wrong: swapped": "0.7",
+    "wrong: both beside": "0.5",
+    "wrong: one beside": "0.3",
+}  # shades of grey
 BANDS = [palette.written(one) for one in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]  # of stages
 MOST_NAMED, LEAST_BAND = 12, 0.02  # stages in the legend; share of the time of a band that has its number
 
@@ -52,7 +56,7 @@ def drawn(evidence: Evidence) -> Figure:
         predicted = tool - one.errors
         above.plot(tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None)
         above.plot(
-            predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label="predicted by the others" if i == 0 else None
+            predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label="predicted from the others" if i == 0 else None
         )
     above.set_aspect("equal", adjustable="datalim")
     above.legend(frameon=False)
@@ -62,37 +66,53 @@ def drawn(evidence: Evidence) -> Figure:
     expected = np.array([_along(_deviation(one), grid) for one in held_out])
     errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
     errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
-    errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square")
-    errors.plot(grid, 1000 * np.sqrt((expected**2).mean(axis=0)), color=TARGET, ls="--", lw=2, label="predicted")
-    errors.set(title="error", xlabel="share of the demonstration's time", ylabel="[mm]", ylim=(0, None), xlim=(0, 1))
+    errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square of all")
+    errors.plot(
+        grid,
+        1000 * np.sqrt((expected**2).mean(axis=0)),
+        color=TARGET,
+        ls="--",
+        lw=2,
+        label="expected before calibration",
+    )
+    errors.set(
+        title="error of the predicted tool",
+        xlabel="share of the demonstration's time",
+        ylabel="[mm]",
+        ylim=(0, None),
+        xlim=(0, 1),
+    )
     errors.legend(frameon=False)
 
-    regions.plot((0, 100), (0, 100), color="0.6", lw=1, label="as it should be")
-    regions.plot(100 * np.array(LEVELS), 100 * evidence.inside, "o-", color=TARGET, ms=4, label="held out")
-    regions.set(title="regions of so many per cent hold", xlabel="[%]", ylabel="of the samples [%]")
+    regions.plot((0, 100), (0, 100), color="0.6", lw=1, label="exact")
+    regions.plot(
+        100 * np.array(LEVELS), 100 * evidence.inside, "o-", color=TARGET, ms=4, label="held-out demonstrations"
+    )
+    regions.set(title="share of the samples inside each predicted region")
+    regions.set(xlabel="the region should hold [%]", ylabel="it holds [%]")
     regions.set(xlim=(0, 100), ylim=(0, 100))
     regions.legend(frameon=False)
 
     hands = np.concatenate([hands[:: max(1, len(hands) // 50)] for hands, _ in evidence.paths])
-    shown = {"held-out demonstrations": (np.concatenate([one.gate_m for one in held_out]), OFF)}
+    shown = {"held-out hands": (np.concatenate([one.gate_m for one in held_out]), OFF)}
     for (name, colour), wrong in zip(NONSENSE.items(), nonsense(hands[:, :6]), strict=True):
         shown[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in shown.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
     gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
-    gate.set(title="what is held lies to the right of the gate", ylabel="of the samples [%]")
+    gate.set(title="the arm holds right of the gate", ylabel="samples up to this distance [%]")
     gate.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
     gate.xaxis.set_major_formatter("{x:g}")  # numbers as text: formulas are switched off
     gate.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
-    gate.legend(frameon=False, fontsize=8)
+    gate.legend(frameon=False, fontsize=8, loc="upper left")
 
     overall, count = evidence.figures.all, len(held_out)
     told = (
-        f"{count} demonstrations, each predicted by the others to {overall.error_mm:.0f} mm rms"
+        f"{count} demonstrations, each predicted from the others with an error of {overall.error_mm:.0f} mm rms"
         if count > 1
-        else f"one demonstration, none held out: {overall.error_mm:.0f} mm rms in what was learned"
+        else f"one demonstration, none held out: error of {overall.error_mm:.0f} mm rms in what was learned"
     )
-    figure.suptitle(f"{skill.name}: {told}, {overall.predicted_mm:.0f} mm predicted")
+    figure.suptitle(f"{skill.name}: {told}, {overall.predicted_mm:.0f} mm expected as calibrated")
     return figure
 
 
@@ -116,10 +136,10 @@ def _draw_stages(evidence: Evidence, axes: Axes) -> None:
             axes.text(middle, 0.97, str(k + 1), transform=axes.get_xaxis_transform(), ha="center", va="top")
         told.add(k)
     off_mm, predicted_mm = 1000 * np.linalg.norm(one.errors, axis=1), 1000 * _deviation(one)
-    axes.plot(times, off_mm, color=TOOL, lw=2, label="tool's distance from target")
-    axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="predicted")
+    axes.plot(times, off_mm, color=TOOL, lw=2, label="error of the predicted tool")
+    axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration")
     highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))  # not while nothing is known yet
-    axes.set(title=f"{rows[h].name}, held out: which stage it is, most probably", xlabel="[s]", ylabel="[mm]")
+    axes.set(title=f"{rows[h].name}, held out: its most probable stage, and the error", xlabel="[s]", ylabel="[mm]")
     axes.set(xlim=(0, times[-1]), ylim=(0, 1.15 * highest_mm))
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=4)
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.named_arrays import from_arrays, to_arrays
 from kmp.storage import checksum
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, validated
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
@@ -159,7 +159,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             raise SkillError(f"{origin}: skill of format {kind}, of {accepted} needed: learn it anew with this version")
         for fault in _spoilt(arrays, recorded=recorded):
             raise SkillError(f"{origin}: {fault}")
-        model, via_points = _model(arrays), msgspec.json.decode(str(arrays["places"]), type=tuple[ViaPoint, ...])
+        model, via_points = _model(arrays), validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
         turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
         skill = StoredSkill(
             name=printable(str(arrays["name"])),

@@ -22,6 +22,7 @@ from mcap.reader import make_reader
 
 from service.config import Settings, robot_description
 from service.contract import cdr, channels
+from service.contract.explain import InvalidError, in_words, validated
 from service.contract.messages import SceneObject
 from service.core.frame import Outputs, Record, Tick, encode
 from service.core.transforms import Frames
@@ -208,9 +209,9 @@ class Recording:
                 f"{path} has format {about.get('format')}, {FORMAT} is understood: was it made by another version?"
             )
         try:
-            settings = msgspec.json.decode(parts["settings.json"], type=Settings)
-        except msgspec.DecodeError as error:
-            raise RecordingError(f"the settings in {path} are not understood: {error}") from None
+            settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
+        except (msgspec.DecodeError, InvalidError) as error:
+            raise RecordingError(f"the settings in {path} are not understood: {in_words(error, named=False)}") from None
         return cls(path, settings, parts, about)
 
     def ticks(self) -> int | None:

@@ -22,6 +22,7 @@ from service.report.stages import stages
 from service.report.visits import places
 
 SHARES = (50, 99, 100)
+REACHED_MM = 20.0  # the tool has reached its first target once it is this near
 
 
 class Span(NamedTuple):
@@ -137,7 +138,10 @@ class Report:
         self.work_us = Percentiles.of(timing["work_us"])
         self.latency_ms = Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0)
         lag_mm = 1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)
-        self.lag_mm = Percentiles.of(lag_mm)  # from the tool to its target, while it follows
+        reached = int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
+        self.initial_mm = Percentiles.of(lag_mm[:reached])  # to its target, before it reached the first
+        self.initial_s = reached * columns.period_s
+        self.lag_mm = Percentiles.of(lag_mm[reached:])  # ... and from then on, while it follows
         self.approach = _approach(columns, self.spans)
         self.places = tuple(places(columns))
         self.stages = tuple(stages(columns))
@@ -177,6 +181,7 @@ class Report:
             ("latency", self.latency_ms, "ms", 2),
             ("lateness", self.lateness_us, "µs", 0),
             ("work of a tick", self.work_us, "µs", 0),
+            ("tool to target, initial approach", self.initial_mm, "mm", 1),
             ("tool to target", self.lag_mm, "mm", 1),
         ):
             for share, value in zip(("median", "99 %", "largest"), found or (None,) * 3, strict=False):

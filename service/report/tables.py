@@ -138,6 +138,7 @@ def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]
     yield "hand stamped to command published", report.latency_ms, "ms", 2
     yield "tick later than its deadline", report.lateness_us, "µs", 0
     yield "work of a tick", report.work_us, "µs", 0
+    yield "tool from its target, initial approach", report.initial_mm, "mm", 1
     yield "tool from its target, following", report.lag_mm, "mm", 1
 
 
@@ -160,6 +161,9 @@ def verdict(report: Report) -> str:
         most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
     else:
         most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+        if initial := report.initial_mm:
+            way = f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
+            most = f"{most}, after an {way}" if report.lag_mm else f"an {way} and did not reach the target"
     lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
     since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since

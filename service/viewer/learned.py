@@ -18,6 +18,7 @@ import numpy as np
 import rerun as rr
 
 from service import palette
+from service.contract.explain import in_words
 from service.contract.printable import as_markdown, printable, printable_values
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
@@ -78,7 +79,7 @@ def skill_contents(skill: bytes) -> SkillContents:
             printable_values(msgspec.json.decode(str(arrays["figures"]))) if "figures" in arrays else {},
         )
     except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"a skill of which nothing can be drawn: {error}") from None
+        raise ValueError(f"a skill of which nothing can be drawn: {in_words(error)}") from None
 
 
 def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:

@@ -6,6 +6,8 @@ from typing import Any
 
 import msgspec
 
+from service.contract.explain import in_file
+
 _ORDERS = {
     "hold": "An operator stopped the arm; it stays until resumed.",
     "resume": "An operator let the arm go on.",
@@ -21,7 +23,7 @@ def sentence(note: str) -> str:
         return note
     outcome, _, why = rest.partition(": ")
     if outcome in ("refused", "failed"):
-        return f"{_ASKED[asked]} {'was refused' if outcome == 'refused' else outcome}: {why}"
+        return f"{_ASKED[asked]} {'was refused' if outcome == 'refused' else outcome}: {in_file(why)}"
     try:
         request = msgspec.json.decode(rest, type=dict[str, Any])
     except msgspec.DecodeError:

@@ -7,6 +7,7 @@ Millimetres, microseconds and degrees of transparency are chosen here, in `dynam
 from __future__ import annotations
 
 import itertools
+import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from service.config import Reach, Settings, robot_description, urdf_path
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
+from service.mesh_cover import found_meshes, unfound
 from service.robot_xml import element_of
 from service.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
@@ -41,8 +43,9 @@ _DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 class ArmModels:
     """The arm as commanded and as measured: one URDF, loaded twice under different names.
 
-    `body` are its capsules, which are drawn where meshes are not found, shapes `unfound`, and
-    around meshes that they cover. Those found take `mesh_mb` at most [MB], for both.
+    `body` are its capsules, which are drawn where meshes are not found or not drawn, shapes
+    `undrawn`, and around meshes that they cover. `remark` says so; it is empty where all are drawn.
+    Meshes take `mesh_mb` at most [MB], for both.
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
@@ -50,13 +53,10 @@ class ArmModels:
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
         self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
         with tempfile.TemporaryDirectory() as folder:
-            try:
-                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
-            except RuntimeError:
-                urdf = _plain(urdf, Path(folder))
-                self.commanded = rr.urdf.UrdfTree.from_file_path(urdf, entity_path_prefix="arm")
+            self.remark = _write_drawn(urdf.read_bytes(), settings, drawn_urdf := Path(folder) / "arm.urdf")
+            self.commanded = rr.urdf.UrdfTree.from_file_path(drawn_urdf, entity_path_prefix="arm")
             self.measured = rr.urdf.UrdfTree.from_file_path(
-                urdf,
+                drawn_urdf,
                 entity_path_prefix="measured",
                 frame_prefix=GHOST,
                 static_transform_entity_path="/measured/tf_static",
@@ -70,27 +70,35 @@ class ArmModels:
                 size, names = size + rows.nbytes, rows.schema.names
                 drawn[path] = drawn.get(path, False) or any(name.startswith(_DRAWN) for name in names)
         self.mesh_mb = 2 * size // 1_000_000
-        self.unfound = tuple(path for path, is_drawn in drawn.items() if not is_drawn)
-
-    @property
-    def remark(self) -> str:
-        """What to say of meshes that are not found; empty where all are."""
-        links = ", ".join(dict.fromkeys(path.partition("/")[0] for path in self.unfound))
-        said = "the arm is drawn by its capsules: ROS_PACKAGE_PATH leads to no meshes of"
-        return f"{said} {links}" if links else ""
+        self.undrawn = tuple(path for path, is_drawn in drawn.items() if not is_drawn)
+        if self.undrawn and not self.remark:
+            links = ", ".join(dict.fromkeys(path.partition("/")[0] for path in self.undrawn))
+            self.remark = f"the viewer cannot draw the meshes of links {links}; the arm is drawn by its capsules"
 
 
-def _plain(urdf: Path, folder: Path) -> Path:
-    """A copy of a URDF in a folder, without what Rerun does not accept: masses, prefixes, other
-    encodings than UTF-8. Meshes are not found from there: their capsules are drawn.
+def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
+    """Writes the URDF that Rerun reads: without masses, prefixes and collision shapes, of which it
+    draws none, in UTF-8, and with the files of meshes named in full. Visual shapes whose mesh is
+    not found are left out; returns what to say of them, or an empty text.
     """
-    robot = element_of(urdf.read_bytes())
+    robot, origin = element_of(urdf), urdf_path(settings)
     for link in robot.findall("link"):
-        for inertial in link.findall("inertial"):
-            link.remove(inertial)
-    copy = folder / urdf.name
-    ElementTree.ElementTree(robot).write(copy, encoding="utf-8")
-    return copy
+        for part in (*link.findall("inertial"), *link.findall("collision")):
+            link.remove(part)
+    packages = (*settings.arm.packages, *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)))
+    packages += tuple(f"{one}/share" for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one)
+    lost = unfound(robot, origin, packages, "visual")
+    files = dict(found_meshes(robot, origin, packages))
+    for link in robot.findall("link"):
+        for visual in link.findall("visual"):
+            for mesh in visual.iter("mesh"):
+                if mesh in files:
+                    mesh.set("filename", f"file://{files[mesh].absolute()}")
+                else:
+                    link.remove(visual)
+                    break
+    ElementTree.ElementTree(robot).write(path, encoding="utf-8")
+    return f"the arm is drawn by its capsules: {lost}; ROS_PACKAGE_PATH names more" if lost else ""
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
@@ -100,8 +108,8 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
         stream.log(path, *archetypes, static=True)
 
     for tree, path, ghost in ((models.commanded, "/arm", False), (models.measured, "/measured", True)):
-        _log_arm(stream, tree, path, models.unfound, ghost=ghost)
-        if models.unfound or (models.covered and not ghost):
+        _log_arm(stream, tree, path, models.undrawn, ghost=ghost)
+        if models.remark or (models.covered and not ghost):
             _log_capsules(fix, tree, path, models, settings, ghost=ghost)
     fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name))
@@ -128,13 +136,13 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
 
 
 def _log_arm(
-    stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, unfound: tuple[str, ...], *, ghost: bool
+    stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, undrawn: tuple[str, ...], *, ghost: bool
 ) -> None:
     """Logs the shapes of the arm: solid, or transparent as a ghost."""
     fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
     colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
-        if "/collision_geometries/" in chunk.entity_path or chunk.entity_path.partition(VISUAL)[2] in unfound:
+        if "/collision_geometries/" in chunk.entity_path or chunk.entity_path.partition(VISUAL)[2] in undrawn:
             continue
         stream.send_chunks(chunk)
         names = chunk.to_record_batch().schema.names
@@ -155,7 +163,7 @@ def _log_capsules(
 ) -> None:
     """Logs the capsules of the arm, those of each joint in the frame of the link that it moves."""
     moved = [joint.child_link for name in settings.joints.names if (joint := tree.get_joint_by_name(name)) is not None]
-    root, body, faint = tree.root_link().name, models.body, ghost or not models.unfound
+    root, body, faint = tree.root_link().name, models.body, ghost or not models.remark
     for link in np.unique(body.capsules["link"]):
         capsules = body.capsules[body.capsules["link"] == link]
         along = capsules["ends"][:, 1] - capsules["ends"][:, 0]

@@ -75,8 +75,8 @@ class _Destination:
         self._thinning = thinning
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
-        self._models = ArmModels(urdf, settings)
-        self._dynamic = DynamicScene(self._models, settings, live=live)
+        self.models = ArmModels(urdf, settings)
+        self._dynamic = DynamicScene(self.models, settings, live=live)
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._skill = skill
         if skill is not None:
@@ -100,7 +100,7 @@ class _Destination:
         self._stream.send_recording_name(self._settings.cell)
         # no more often than this: Rerun keeps 1.5 MB of each for good
         self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
-        log_static(self._stream, self._models, self._settings)
+        log_static(self._stream, self.models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
         if self._thinning is not None:
             self._thinning.restart(self._size())
@@ -115,8 +115,8 @@ class _Destination:
         """Adds one frame."""
         if not self._repeated_ns:
             self._repeat(shown.time_ns)
-            if self._models.remark:
-                self.log(self._models.remark, "WARN", shown.time_ns)
+            if self.models.remark:
+                self.log(self.models.remark, "WARN", shown.time_ns)
         kept = shown if self._thinning is None else self._thinning.kept(shown)
         if kept is not None:
             self._pending.append(kept)
@@ -312,6 +312,11 @@ class Viewer:
                 live = _Live(live_port, **self._common)
                 self._destinations.append(live)
                 self.url = live.url
+
+    @property
+    def arm_remark(self) -> str:
+        """A sentence on meshes of the arm that are not drawn; empty where all are."""
+        return next((one.models.remark for one in self._destinations), "")
 
     def draw_into(self, rrd: Path) -> None:
         """Ends the file drawn into, if there is one, and continues in another.

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from types import ModuleType
 
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
 from sim.faulty_cell import FaultError
 from sim.parts import PartError
@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
             numbers = experiment.run(results, options)
             print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
     except (ExplainedError, ExperimentError, FaultError, PartError, OSError) as error:
-        print(f"python -m sim.experiments: {error}", file=sys.stderr)
+        print(f"python -m sim.experiments: {in_words(error)}", file=sys.stderr)
         return 1
     return 0
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import Reach, Settings
+from service.contract.explain import in_words
 from service.contract.records import SIDES
 from service.contract.requests import Hands, ViaPoint
 from service.core.controller import start_state
@@ -182,7 +183,7 @@ def read(path: Path, *, named: bool = False) -> Demonstration:
         with np.load(path, allow_pickle=False) as data:
             times, left, right, tool = (np.asarray(data[name], np.float64) for name in ("t", "left", "right", "tool"))
     except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands and tool: {error}") from None
+        raise ExperimentError(f"{path}: not a recording of hands and tool: {in_words(error, named=False)}") from None
     conducts: Hands = "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
     left, right = (right, right) if conducts == "right" else (left, left) if conducts == "left" else (left, right)
     if not all(np.isfinite(part).all() for part in (times, left, right, tool)):

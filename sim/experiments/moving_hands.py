@@ -17,6 +17,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
+from service.contract.explain import in_words
 from sim.experiments.results import Array, ExperimentError
 from sim.scene import Scene
 from sim.script import HandScript
@@ -66,7 +67,7 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
             t = np.asarray(data["t" if "t" in data else "time_s"], np.float64)
             left, right = (_seen(t, np.asarray(data[name], np.float64)) for name in ("left", "right"))
     except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands: {error}") from None
+        raise ExperimentError(f"{path}: not a recording of hands: {in_words(error, named=False)}") from None
     t = t - t[0]
     rate = 1 / float(np.mean(np.diff(t)))
     noisy = rate < NOISY_HZ

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from service.contract.explain import in_words
 from sim.experiments.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
 from sim.experiments.results import Array, ExperimentError
 from sim.people import Person, Tracker, person
@@ -35,7 +36,7 @@ def _of_file(path: Path, number: int) -> Person | None:
         with np.load(path, allow_pickle=False) as data:
             t, left, right = (np.asarray(data[name], np.float64) for name in ("time_s", "left", "right"))
     except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands: {error}") from None
+        raise ExperimentError(f"{path}: not a recording of hands: {in_words(error, named=False)}") from None
     rate = 1 / float(np.mean(np.diff(t)))
     noisy = rate < NOISY_HZ
     axes = CAMERA_AXES if noisy else np.eye(3)

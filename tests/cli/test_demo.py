@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import text
+from service.cli.demo import EVENTS, text
 from service.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
@@ -94,3 +94,21 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     assert all(event["reached"] for event in report["events"].values())
     assert re.fullmatch(r"[1-9]\d* of \d+ ticks are not recorded", report["missing"])
     assert f"The recording is not complete: {report['missing']}." in text(report)
+
+
+def test_each_cause_of_a_failed_demo_is_printed_once() -> None:
+    bench, loop = "the bench missed 400 of its 9000 periods", "the loop was up to 45 ms late"
+    held = f"the arm held (stale_hand) from 1.0 s on, for 9.0 s: this machine was too busy, {loop}; no hand was seen"
+    whys = (None, held, held)
+    events = {
+        name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0} | ({"why": why} if why else {})
+        for name, why in zip(EVENTS, whys, strict=True)
+    }
+    few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
+    figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}
+    report = {"success": False, "events": events, **figures, "realtime": True, "missing": ""}
+    shown = text(report | {"busy": f"{bench}, {loop}", "recording": "a.mcap", "rrd": "a.rrd"})
+    for cause in (held, bench, loop):
+        assert shown.count(cause) == 1
+    assert shown.count("for the same reason") == 1
+    assert f"  machine  too busy: {bench}\n" in shown

@@ -87,7 +87,7 @@ def test_the_tutorial_runs_as_it_stands(
     assert "3 takes in demonstrations" in said.err
     assert "6 via-points in force" in said.out
     assert re.search(r"^nearer +tool .*missed by .* mm$", said.out, re.MULTILINE)
-    assert re.search(r"^at done since tick \d+: ", said.out, re.MULTILINE)
+    assert re.search(r"^at start since tick \d+: ", said.out, re.MULTILINE)
     assert re.search(r"^the teacher was .* late", said.out, re.MULTILINE)
     skill = decoded((tmp_path / "skill.npz").read_bytes(), origin="skill")
     assert skill.model.names == ("start", "tray", "work", "tray again", "done")

@@ -278,7 +278,7 @@ def test_a_request_is_read_with_its_defaults() -> None:
         (b"{", requests.ViaPointsRequest, "truncated"),
         (b"[1]", requests.Nothing, "$: [1] given; an object with its fields needed"),
         (b'{"name": "../x"}', requests.SkillRequest, "$.name: '../x' given; 1 to 64 letters"),
-        (b'{"name": "\xff"}', requests.SkillRequest, "utf-8"),
+        (b'{"name": "\xff"}', requests.SkillRequest, "0xff is not valid; a text in UTF-8 needed"),
     ],
 )
 def test_the_error_of_a_request_names_the_place_in_it(data: bytes, kind: Any, error: str) -> None:

@@ -86,11 +86,11 @@ def test_diagnostics_are_read_by_others() -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ('ros2.trajectory = "/a/b"', r"\$\.network\.ros2_domain: none given; for /a/b one from 0 to 232 needed"),
-        ('ros2.trajectory = "a/b"', r"\$\.ros2\.trajectory: 'a/b' given; a topic's full name, /like/this, accepted"),
-        ('ros2.tf = "tf"', r"\$\.ros2\.tf: 'tf' given; a topic's full name, /like/this, accepted"),
-        ('ros2.tf = "/tf"', r"\$\.network\.ros2_domain: none given; for /tf, /tf_static one from 0 to 232 needed"),
-        ('ros2.joints = ["elbow"]', r"\$\.ros2\.joints: \['elbow'\] given; those of \$\.joints\.names needed, in any"),
+        ('ros2.trajectory = "/a/b"', r"\[network\] ros2_domain: none given; for /a/b one from 0 to 232 needed"),
+        ('ros2.trajectory = "a/b"', r"\[ros2\] trajectory: 'a/b' given; a topic's full name, /like/this, accepted"),
+        ('ros2.tf = "tf"', r"\[ros2\] tf: 'tf' given; a topic's full name, /like/this, accepted"),
+        ('ros2.tf = "/tf"', r"\[network\] ros2_domain: none given; for /tf, /tf_static one from 0 to 232 needed"),
+        ('ros2.joints = ["elbow"]', r"\[ros2\] joints: \['elbow'\] given; those of \[joints\] names needed, in any"),
     ],
 )
 def test_controllers_that_cannot_be_told_are_refused(given: str, told: str) -> None:
@@ -119,12 +119,12 @@ def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(cel
     if ok:
         assert parse(domain, origin="cell.toml").network.ros2_domain == 0
     else:
-        with pytest.raises(SettingsError, match=r"cell\.toml: \$\.cell: .* given; with \$\.network\.ros2_domain names"):
+        with pytest.raises(SettingsError, match=r"cell\.toml: cell: .* given; with \[network\] ros2_domain names"):
             parse(domain, origin="cell.toml")
 
 
 def test_a_domain_that_is_none_is_refused() -> None:
     with pytest.raises(
-        SettingsError, match=r"\$\.network\.ros2_domain: 233 given; a whole number from 0 to 232 accepted"
+        SettingsError, match=r"\[network\] ros2_domain: 233 given; a whole number from 0 to 232 accepted"
     ):
         parse("network.ros2_domain = 233", origin="cell.toml")

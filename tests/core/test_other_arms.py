@@ -78,14 +78,17 @@ def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> Non
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"plate": ""}, "$.arm.plate: missing; the link that carries the tool needed, the last ones are"),
+        ({"plate": ""}, "[arm] plate: missing; the link that carries the tool needed, the last ones are"),
         ({"plate": 'plate = "gripper"'}, "no link 'gripper'"),
-        ({"posture": ""}, "$.arm.posture: missing; a URDF does not say it, 6 numbers needed"),
-        ({"jerk": ""}, "$.joints.jerk: missing"),
-        ({"posture": "posture = [0, 0, 0]"}, "$.arm.posture: 3 numbers, 6 needed, one for each of $.joints.names"),
-        ({"jerk": f"jerk = {[500] * 6}\nvelocity = {[9] * 6}"}, "$.joints.velocity[0]: 9.0 given; up to 3.15 accepted"),
-        ({"jerk": f'jerk = {[500] * 6}\nnames = ["a", "b", "c", "d", "e", "f"]'}, "$.joints.names: ['a', 'b'"),
-        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "/nowhere.urdf: [Errno 2]"),
+        ({"posture": ""}, "[arm] posture: missing; a URDF does not say it, 6 numbers needed"),
+        ({"jerk": ""}, "[joints] jerk: missing"),
+        ({"posture": "posture = [0, 0, 0]"}, "[arm] posture: 3 numbers, 6 needed, one for each of [joints] names"),
+        (
+            {"jerk": f"jerk = {[500] * 6}\nvelocity = {[9] * 6}"},
+            "[joints] velocity, entry 1: 9.0 given; up to 3.15",
+        ),
+        ({"jerk": f'jerk = {[500] * 6}\nnames = ["a", "b", "c", "d", "e", "f"]'}, "[joints] names: ['a', 'b'"),
+        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "/nowhere.urdf: No such file or directory"),
     ],
 )
 def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str, str], message: str) -> None:

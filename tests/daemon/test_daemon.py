@@ -138,7 +138,12 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
         assert daemon.end() == 0
+        assert "earlier run" not in daemon.log.read_text()
     with serving(tmp_path, "--arm", "assumed") as daemon:
+        (said,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
+        (file,) = (tmp_path / "state").rglob("places-*.json")
+        assert f"via-points of an earlier run are in force (1): handover. They are saved in {file}; " in said
+        assert "`thirdhand via-points remove NAME` removes one" in said
         assert daemon.client.status().places == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]

@@ -97,6 +97,10 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
     with serving(tmp_path, "--arm", "assumed") as daemon:
         assert "cannot be used" not in daemon.log.read_text()
         assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
+        said = daemon.log.read_text()
+        assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
+        assert daemon.end() == 0
+        assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")
 
 
 def test_a_daemon_is_told_the_stage_and_knows_it_after_a_restart(tmp_path: Path) -> None:
@@ -108,3 +112,7 @@ def test_a_daemon_is_told_the_stage_and_knows_it_after_a_restart(tmp_path: Path)
         assert daemon.until(lambda now: now["stage"] == ["glass", "soldering"])["stage_belief"] == 1.0
     with serving(tmp_path) as daemon:
         assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
+        said = daemon.log.read_text()
+        assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
+        assert daemon.end() == 0
+        assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")

@@ -4,12 +4,15 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
+import logging
 import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,7 +21,7 @@ from service.cli.main import main
 from service.client import Client, StartingError, UnreachableError, cells, endpoints, open_session
 from service.config import Files, Settings
 from service.contract.channels import CHANNELS
-from service.daemon.start import Start, starting
+from service.daemon.start import LOG_EVERY_S, Start, starting
 from service.launch import LaunchError, launched
 from service.network_settings import Network
 from support.cell import serving
@@ -87,30 +90,70 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    endpoint = f"tcp/127.0.0.1:{launch.free_port()}"
     (tmp_path / "cell.toml").write_text(
-        f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path / "state"}"\n'
+        f'[network]\nlisten = ["{endpoint}"]\n[files]\nstate = "{tmp_path / "state"}"\n'
     )
     command = [sys.executable, "-m", "service", "serve", "--config", str(tmp_path / "cell.toml")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as service:
         assert service.stderr is not None
-        lines = [service.stderr.readline()]
-        assert "starting: importing" in lines[0]  # first of all
+        begun_s = time.monotonic()
+        assert "starting: importing" in service.stderr.readline()  # first of all
+        answers: list[str] = []
         compiled: dict[str, int] = {}
-        while len(compiled) < 3 or max(compiled.values()) < 10:
-            lines.append(service.stderr.readline())
-            assert lines[-1], lines
-            found = COUNTED.search(lines[-1])
-            if found and found[1]:
-                compiled[found[1]] = int(found[2])
+        with open_session(connect=[endpoint]) as session:
+            while len(compiled) < 3 or max(compiled.values()) < 10:
+                with pytest.raises(StartingError) as starts:
+                    Client(session).status()
+                answers.append(str(starts.value))
+                found = COUNTED.search(answers[-1])
+                if found and found[1]:
+                    compiled[found[1]] = int(found[2])
+        lasted_s = time.monotonic() - begun_s
         service.kill()
-        service.communicate()
-    counts = [found for line in lines if (found := COUNTED.search(line))]
+        logged = service.communicate()[1].splitlines()
+    counts = [found for line in answers if (found := COUNTED.search(line))]
     there = [int(found[2]) for found in counts]
     assert there == sorted(there)
     own = {path.stem for room in ("service/core", "kmp") for path in (ROOT / room).rglob("*.py")}
     assert {name.partition(".")[0] for name in compiled} <= own  # none of a library's own
     assert len({found[3] for found in counts}) == 1
     assert int(counts[0][3]) > 100  # of all that the loop may call
+    assert sum("starting:" in line for line in logged) <= 4 + lasted_s / LOG_EVERY_S
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
+    started: tuple[Start, str],
+    terminal: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    started[0].over()
+    capsys.readouterr()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setattr("service.daemon.start.TELL_EVERY_S", 0.01)
+    start = Start(started[0].lock, started[0].session, "other")
+    caplog.clear()
+    functions = [SimpleNamespace(signatures=[]) for _ in range(60)]
+    start._functions = functions  # noqa: SLF001
+    for one in functions:
+        time.sleep(0.03)
+        one.signatures = ["compiled"]
+    time.sleep(0.05)
+    start.over()
+    shown, logged = capsys.readouterr().err, [line for line in caplog.messages if "starting:" in line]
+    if terminal:
+        assert logged == []
+        assert "\n" not in shown
+        assert shown.count("\r\x1b[K") > 30
+        assert shown.endswith("60 of 60 functions are there\r\x1b[K")
+    else:
+        assert shown == ""
+        assert [COUNTED.search(line)[2] for line in logged[-4:]] == ["15", "30", "45", "60"]  # type: ignore[index]
+        assert len(logged) <= 6
 
 
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

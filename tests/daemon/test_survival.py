@@ -178,6 +178,9 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
         assert "Traceback" not in said
         assert "has not come to rest" not in said  # the time-out of the stop
     (recording,) = records.glob("*.mcap")
+    last = said.splitlines()[-1]
+    assert last.endswith(f" ended: the daemon of cell thirdhand; its newest recording is {recording}")
+    assert "operator" not in said  # its own stop is nobody's hold, which `resume` would end
     result = replay(recording)
     assert result.exact, result.text()
 

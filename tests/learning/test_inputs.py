@@ -73,7 +73,7 @@ def test_where_both_hands_tell_it_is_a_function_of_both() -> None:
     }
     assert found.tried_mm["positions"] < 0.5 * found.tried_mm["positions of the left hand"]
     lines = table(found).splitlines()
-    assert any(line.endswith("positions taken:") for line in lines)
+    assert any(line.endswith("positions is taken:") for line in lines)
     assert sum(line.split("  ")[1] in found.tried_mm for line in lines if line.startswith("  ")) == len(found.tried_mm)
 
 

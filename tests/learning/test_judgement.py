@@ -15,6 +15,7 @@ from service.learning.learn import Evidence, learn
 from service.learning.picture import draw, drawn
 from service.learning.skill_file import SkillError
 from sim.made_tasks import takes
+from support.paths import ROOT
 from support.taught_scene import demonstrated
 
 
@@ -100,7 +101,7 @@ def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_
     h = [row.name for row in seen[0].figures.demonstrations].index(name)
     labels = [text.get_text() for text in stages.get_legend().get_texts()]
     told = ["1: start → left out", "2: left out → work", "3: work → left out again"]
-    assert labels == [*told, "tool's distance from target", "predicted"]
+    assert labels == [*told, "error of the predicted tool", "expected before calibration"]
     off, predicted = (np.asarray(line.get_ydata()) for line in stages.get_lines())
     row = seen[0].figures.demonstrations[h]
     assert np.sqrt(np.mean(off**2)) == pytest.approx(row.error_mm)
@@ -108,7 +109,7 @@ def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_
     shown = [patch for patch in stages.patches if patch.get_alpha()]
     assert len(shown) == 1 + np.count_nonzero(np.diff(likely))
     # what is predicted is of the tool, not how far hands are off their ways
-    (line,) = (line for line in by_title["error"].get_lines() if line.get_label() == "predicted")
+    (line,) = (line for line in by_title["error of the predicted tool"].get_lines() if "expected" in line.get_label())
     variance = [np.trace(one.covariance, axis1=1, axis2=2).mean() for one in seen[0].held_out]
     usual = 1000 * np.sqrt(np.mean(variance))
     assert np.sqrt(np.mean(np.asarray(line.get_ydata()) ** 2)) == pytest.approx(usual, rel=0.1)
@@ -124,6 +125,17 @@ def test_the_error_at_the_moment_stands_in_the_table_where_it_is_another(good: l
         assert ("at the moment" in head) == bool(more_mm)
         told = (rows[0].error_mm, rows[0].worst_mm, *[rows[0].moment_mm] * bool(more_mm), rows[0].predicted_mm)
         assert first.split()[1 : 2 * len(told) : 2] == [f"{mm:.0f}" for mm in told]
+
+
+def test_each_column_of_the_table_is_explained_below_it_and_on_the_page(good: list[Demonstration]) -> None:
+    found = judged(good)
+    head, _, below = table(found).partition("The columns:")
+    columns = ("error", "worst", "expected", "in 50 %", "95 %", "held", *found.all.other_mm)
+    page = (ROOT / "docs/learning.md").read_text(encoding="utf-8")
+    for column in columns:
+        assert column in head.splitlines()[0]
+        assert column in below.partition("docs/learning.md")[0]
+        assert column in page.partition("## Judged")[2]
 
 
 def test_figures_of_earlier_skills_are_read_and_tell_of_no_delay(good: list[Demonstration]) -> None:

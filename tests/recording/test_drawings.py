@@ -68,7 +68,7 @@ def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followe
 
 
 def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
@@ -91,6 +91,7 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         assert sum(radii) == (len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0)
         said = [text for (text,) in values(rows["/log"], TEXT) if "ROS_PACKAGE_PATH" in text]
         assert len(said) == is_drawn
+        assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
 
 
 def test_capsules_around_collision_meshes_are_drawn_with_the_arm(tmp_path: Path) -> None:

@@ -27,10 +27,10 @@ from service.daemon.status import CellStatus
 from service.learning.skill_file import decoded, with_file
 from service.learning.via_points import adapted
 from service.recording.recording import Recorder, Recording
-from service.report.columns import runs
+from service.report.columns import read, runs
 from service.report.report import Report, Span, differing_settings, reported, why_missed
 from service.report.stages import LEAST_S
-from service.report.tables import verdict
+from service.report.tables import tables, verdict
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
@@ -117,6 +117,40 @@ class Told:
 @pytest.fixture(scope="module")
 def session(golden: Path) -> Report:
     return reported(golden)
+
+
+@pytest.mark.parametrize(("far_ticks", "arrives"), [(0, True), (900, True), (None, False)])
+def test_the_initial_approach_of_the_tool_is_no_error_of_following(
+    golden: Path, far_ticks: int | None, arrives: bool
+) -> None:
+    columns = read(Recording.open(golden))
+    follows = np.flatnonzero(columns.frames["mode"] == Mode.FOLLOW)
+    before = Report(columns)
+    columns.frames["tool"][follows[:far_ticks]] += (0.473, 0.0, 0.0)
+    found = Report(columns)
+    stops = [span for span in found.spans if span.mode is not Mode.FOLLOW]
+    found.spans = tuple(span for span in found.spans if span not in stops)  # else a stop is the worst
+    prompt = next(one for one in tables(found) if one.title == "Promptness")
+    if far_ticks == 0:
+        assert found.initial_mm is None
+        assert found.lag_mm == before.lag_mm
+        assert "initial approach" not in verdict(found)
+        return
+    assert found.initial_mm is not None
+    (row,) = (row for row in prompt.rows if row[0] == "tool from its target, initial approach")
+    assert row[3] == f"{found.initial_mm.largest:.1f}"
+    assert found.initial_mm.largest > 400.0
+    if arrives:
+        assert found.initial_mm.samples == far_ticks
+        assert found.initial_s == pytest.approx(900 * columns.period_s)
+        assert found.lag_mm is not None
+        assert found.lag_mm.largest < 200.0
+        assert re.search(
+            r"the worst was \d+ mm from the tool to its target, after an initial approach of", verdict(found)
+        )
+    else:
+        assert found.lag_mm is None
+        assert "did not reach the target" in verdict(found)
 
 
 def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:

@@ -343,7 +343,7 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     [
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
         ('via_points {"op": "remove", "names": ["a"]}', "Forgotten: a."),
-        ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: $.points[0].left: 2 numbers"),
+        ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
         ('skill {"name": "soldering"}', "Skill soldering is in force."),
         ("hold {}", "An operator stopped the arm; it stays until resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),

@@ -218,11 +218,29 @@ def test_places_out_of_reach_are_moved_into_it_and_said() -> None:
     for tool in (moved.offer, moved.glass, moved.carry):
         assert np.linalg.norm(np.subtract(tool, short.centre)) <= short.outer
     assert moved.robot_start == SCENE.robot_start
-    with pytest.raises(SceneError, match=r"out of the arm's reach: handover: .* lies 0.176 m from the nominal"):
-        SCENE.in_reach(Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.45))
-    for sides in ({"min_x": 0.6}, {"min_z": 0.2}):
-        with pytest.raises(SceneError, match=r"out of the arm's reach: (handover|glass): the tool at .* accepted"):
-            SCENE.in_reach(Reach(**sides))
+
+
+@pytest.mark.parametrize(
+    ("reach", "words"),
+    [
+        (
+            Reach(centre=(0.0, -0.05, 0.12), inner=0.23, outer=0.26),  # an SO-100
+            "moved by 0.15 m: handover needs the tool 0.64 m from the shoulder; glass needs the tool 0.66 m from the "
+            "shoulder; soldering needs the tool 0.64 m from the shoulder. Its tool reaches from 0.23 to 0.26 m around "
+            "its shoulder at [0.0, -0.05, 0.12], where x is at least 0.15 and z at least 0.02 m. What to do: take a",
+        ),
+        (Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.45), "handover needs the tool 0.61 m from the shoulder; "),
+        (Reach(min_x=0.6), "handover needs the tool at x = 0.54, z = 0.38 m; glass needs the tool at x = 0.50, z = "),
+        (Reach(min_z=0.2), "moved by 0.15 m: glass needs the tool at x = 0.50, z = 0.16 m. Its tool reaches"),
+        (Reach(inner=2.0, outer=2.5), "Its tool reaches from 2.00 to 2.50 m around its shoulder"),
+    ],
+)
+def test_a_scene_beyond_the_arm_is_refused_with_each_place_and_what_to_do(reach: Reach, words: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        SCENE.in_reach(reach)
+    assert words in str(refused.value)
+    for way_out in ("--scene", "a larger arm", "thirdhand arm URDF --at", "docs/tutorial.md"):
+        assert way_out in str(refused.value)
 
 
 # --- an arm that is elsewhere ---------------------------------------------------------------------

@@ -50,13 +50,13 @@ def test_the_three_taught_places_are_flat_neighbourhoods_and_only_the_handover_f
     ("text", "words"),
     [
         ("handovr = [0.6, 0, 0.3]", ["handovr", "known are", "handover"]),
-        ("handover = [0.62, -0.28]", ["$.handover"]),
+        ("handover = [0.62, -0.28]", ["handover"]),
         ("handover = [0.62, -0.28, 0.46]", ["handover", "0.16 m", "0.15 m"]),
         ("handover = [nan, -0.28, 0.30]", ["handover", "0.15 m"]),
         ("handover = [620.0, -280.0, 300.0]", ["handover", "Is it in metres?"]),
         ("soldering = [0.75, 0.0, 0.04]", ["soldering", "4.0 cm above the table", "5 cm"]),
-        ("phases_s = [3.0, 0.0, 3.0]", ["$.phases_s[1]"]),
-        ("seed = -1", ["$.seed"]),
+        ("phases_s = [3.0, 0.0, 3.0]", ["phases_s, entry 2"]),
+        ("seed = -1", ["seed"]),
         ("seed = ", ["scene.toml"]),
     ],
 )

@@ -1,0 +1,103 @@
+"""Errors of commands about files: which file and which value, in words, without names of code."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from service.contract.explain import in_file, in_words
+from support.cell import thirdhand, told
+from support.paths import RECORDINGS, ROOT
+
+INTERNAL = re.compile(r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at 0x|\b(?:OS|Type|Value|Key|Validation)Error")
+DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
+TAKES: dict[str, tuple[str, ...]] = {  # commands, and the file that each of them reads last
+    "configuration": ("serve", "--config"),
+    "arm of the bench": ("sim", "--arm"),
+    "URDF": ("arm",),
+    "scene": ("sim", "--scene"),
+    "via-points": ("record", "a", "--connect", "tcp/127.0.0.1:1", "--places"),
+    "places": ("learn", *DEMONSTRATIONS, "--output", "skill.npz", "--places"),
+    "skill": ("serve", "--listen", "tcp/127.0.0.1:0", "--skill"),
+    "recording": ("report",),
+    "played": ("play", "--connect", "tcp/127.0.0.1:1"),
+    "replayed": ("replay",),
+    "drawing": ("view", "--screenshot", "a.png"),
+    "Zenoh's settings": ("status", "--zenoh-config"),
+    "certificate": ("status", "--certificate"),
+    "authority": ("certificates", "--role", "tracker"),
+}
+WRONG: dict[str, Callable[[Path], object]] = {
+    "missing": lambda path: None,
+    "a folder": lambda path: path.mkdir(),
+    "no text": lambda path: path.write_bytes(b"\xff\xfe\x00a = 1\n"),
+    "unknown value": lambda path: path.write_text("a = 1\n"),
+    "wrong kind": lambda path: path.write_text('rate_hz = "x"\nhandover = [1]\nseed = "x"\n'),
+    "wrong JSON": lambda path: path.write_text('{"op": "add", "points": [{"name": 3}]}'),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("takes", TAKES)
+def test_a_file_that_cannot_be_used_is_reported_in_words(
+    takes: str, wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    suffix = {"configuration": ".toml", "arm of the bench": ".toml", "skill": ".npz", "drawing": ".rrd"}
+    path = tmp_path / f"given{suffix.get(takes, '.mcap' if takes in ('recording', 'played', 'replayed') else '')}"
+    WRONG[wrong](path)
+    run = thirdhand if takes in ("skill", "arm of the bench", "scene") else told  # the others leave no process behind
+    done = run(*TAKES[takes], str(path))
+    assert done.returncode in (1, 2), done.stdout
+    assert not INTERNAL.search(done.stderr), done.stderr
+    assert path.name in done.stderr or "tcp/127.0.0.1:1" in done.stderr, done.stderr
+
+
+def caught() -> Iterator[tuple[Path, ast.ExceptHandler]]:
+    """Each handler of errors that have numbers of the operating system or names of codecs."""
+    for path in (*(ROOT / "service").rglob("*.py"), *(ROOT / "sim").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ExceptHandler) and node.name and node.type is not None:
+                names = {getattr(one, "attr", getattr(one, "id", "")) for one in ast.walk(node.type)}
+                if names & {"OSError", "UnicodeDecodeError", "ValidationError", "PermissionError"}:
+                    yield path, node
+
+
+def test_what_the_operating_system_and_codecs_say_is_never_printed_as_it_is() -> None:
+    printed = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path, handler in caught()
+        for node in ast.walk(handler)
+        if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Name) and node.value.id == handler.name
+    ]
+    assert printed == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("$.arm.urdf: missing", "[arm] urdf: missing"),
+        ("$.points[0].left: 2 numbers, 3 needed", "points, entry 1, left: 2 numbers, 3 needed"),
+        ("$: unknown field 'a'", "unknown field 'a'"),
+        ("a\n$.rate_hz: 3 given", "a\nrate_hz: 3 given"),
+        ("$.sources[...].rate: 'x' given", "sources, an entry, rate: 'x' given"),
+        ("$.cell: '$.tool.radius' given", "cell: '$.tool.radius' given"),
+        ('the URDF\'s "$.a" and $.b.c', 'the URDF\'s "$.a" and [b] c'),
+        ("$XDG_CONFIG_HOME/x and ${y} cost 3 $.", "$XDG_CONFIG_HOME/x and ${y} cost 3 $."),
+    ],
+)
+def test_a_path_in_json_is_named_as_in_a_file_except_in_what_was_given(text: str, words: str) -> None:
+    assert in_file(text) == words
+    assert in_file(words) == words
+
+
+def test_an_error_of_the_operating_system_names_its_file_once() -> None:
+    error = FileNotFoundError(2, os.strerror(2), "a.toml")
+    assert in_words(error) == "a.toml: No such file or directory"
+    assert in_words(error, named=False) == "No such file or directory"
