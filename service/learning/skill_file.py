@@ -14,6 +14,7 @@ import pickle
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -97,6 +98,11 @@ class StoredSkill(Skill):
 
     figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
     file: bytes = field(default=b"", repr=False)  # all of it, as it is stored and recorded
+
+    @cached_property
+    def tool_positions(self) -> NDArray[np.float64]:
+        """The tool (M, 3) [m] where the hands are at each of the places that the skill knows."""
+        return self.mean(self.hands, self.model.names)
 
     def for_loop(self) -> Skill:
         """The skill alone."""
