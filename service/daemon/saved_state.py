@@ -9,9 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from service.contract.explain import ExplainedError
+
 log = logging.getLogger("thirdhand")
+NOT_OURS = "it is damaged, or was not written by this service"
 LARGEST_BYTES = 32_000_000
 T = TypeVar("T")
+
+
+class UnusableError(ExplainedError, ValueError):
+    """A file that cannot be used; the message says why."""
 
 
 def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str) -> T:
@@ -26,7 +33,8 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
         return otherwise
     except Exception as error:
         aside = path.with_suffix(".damaged")
-        reason = error.strerror if isinstance(error, OSError) else str(error) or type(error).__name__
+        known = error.strerror if isinstance(error, OSError) else isinstance(error, ExplainedError) and str(error)
+        reason = known or NOT_OURS
         try:
             path.replace(aside)
         except OSError as failure:
@@ -40,11 +48,11 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
 
 
 def _content(path: Path) -> bytes:
-    """The content of a regular file of at most LARGEST_BYTES. Raises OSError, ValueError."""
+    """The content of a regular file of at most LARGEST_BYTES. Raises OSError, UnusableError."""
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:  # never waits for a pipe
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
-            raise ValueError("it is not a file")
+            raise UnusableError("it is not a file")
         if about.st_size > LARGEST_BYTES:
-            raise ValueError(f"it has {about.st_size} bytes, at most {LARGEST_BYTES} accepted")
+            raise UnusableError(f"it has {about.st_size} bytes, at most {LARGEST_BYTES} accepted")
         return file.read(LARGEST_BYTES)

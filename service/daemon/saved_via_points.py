@@ -19,7 +19,7 @@ from service.contract.explain import in_words
 from service.contract.requests import Add, ViaPoint, decode_request, encode_json
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
-from service.daemon.saved_state import restored
+from service.daemon.saved_state import UnusableError, restored
 from service.daemon.single_instance import state_folder
 from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError
@@ -100,8 +100,8 @@ class SavedViaPoints:
     def _decoded(self, content: bytes, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """None where they belong to another skill or arm."""
         saved = json.loads(content)
-        if saved.pop("checksum") != _checksum(saved):
-            raise ValueError("the checksum is wrong: the file was changed since; teach them again")
+        if saved.pop("checksum", None) != _checksum(saved):
+            raise UnusableError("the checksum is wrong: the file was changed since; teach them again")
         request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
         if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
             return None
