@@ -15,6 +15,7 @@ import msgspec
 
 from service.contract import ros2
 from service.contract.explain import InvalidError, validated
+from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content, why_not
 from service.described_arm import SettingsError, UnreadableError, check, completed, description
 from service.network_settings import Network, Ros2
 from service.urdf import Urdf, UrdfError
@@ -479,7 +480,7 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
 def load(path: Path) -> Settings:
     """Settings from a TOML file. Raises SettingsError, UnreadableError."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableError(f"cannot read configuration {path}: {error}") from None
+        text = content(path, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
+    except (OSError, UnusableError, UnicodeDecodeError) as error:
+        raise UnreadableError(f"cannot read configuration {path}: {why_not(error)}") from None
     return parse(text, origin=str(path), folder=path.parent)

@@ -36,7 +36,8 @@ def serve(args: argparse.Namespace) -> int:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
-            raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
+            reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
+            raise OSError(f"nothing can be recorded in {folder}: {reason}") from None
     if folder is not None or args.live is not None:
         child.preload("service.recording.process")  # beside this process, which imports as much
     with starting(settings) as start:

@@ -16,7 +16,8 @@ import zenoh
 
 from service.client import ClientSettings, client_settings
 from service.config import RATES_HZ
-from service.contract.channels import lacking
+from service.contract.channels import LARGEST_REQUEST, lacking
+from service.contract.file_content import UnusableError, content, why_not
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
 
 CONNECT_TIMEOUT_S = 3.0
@@ -139,9 +140,11 @@ def added_in(path: Path) -> Add:
     the file.
     """
     try:
-        request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
-    except OSError as error:
-        raise RequestError(f"{path} cannot be read: {error.strerror}") from None
+        request: Add = decode_request(
+            sys.stdin.buffer.read() if str(path) == "-" else content(path, LARGEST_REQUEST, accepts_pipes=True), Add
+        )
+    except (OSError, UnusableError) as error:
+        raise RequestError(f"{path} cannot be read: {why_not(error)}") from None
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
     return request

@@ -15,6 +15,7 @@ from service.client.session import open_session
 from service.config import Cell
 from service.contract.channels import ENDPOINT, lacking
 from service.contract.explain import InvalidError, validated
+from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content, why_not
 from service.described_arm import SettingsError, UnreadableError
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
@@ -96,9 +97,9 @@ def _file() -> Path | None:
 def _read(path: Path) -> dict[str, Any]:
     """What a client's file holds; paths in it are relative to its folder. Raises SettingsError."""
     try:
-        given = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableError(f"cannot read client settings {path}: {error}") from None
+        given = tomllib.loads(content(path, LARGEST_CONFIGURATION).decode())
+    except (OSError, UnusableError, UnicodeDecodeError) as error:
+        raise UnreadableError(f"cannot read client settings {path}: {why_not(error)}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SettingsError(f"{path}: {error}") from None
     if isinstance(given.get("connect"), str):

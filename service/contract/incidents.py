@@ -313,7 +313,7 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
             accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
             found = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
         case Cause.INCOMPLETE:
-            about = "joints that are not all there"
+            about = "joints that are not all there, or named twice"
             remedy = "publish all joints under the names that `joints/command` has, one position each"
         case "malformed":
             about, remedy = "bytes that are no such message", "publish the type and encoding of the wire's table"

@@ -16,10 +16,11 @@ import numpy as np
 
 from service.config import Settings, robot_description
 from service.contract.explain import in_words
+from service.contract.file_content import UnusableError
 from service.contract.requests import Add, ViaPoint, decode_request, encode_json
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
-from service.daemon.saved_state import UnusableError, restored
+from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError

@@ -21,11 +21,12 @@ from typing import Any
 
 from service import child
 from service.config import Settings, robot_description
+from service.contract.file_content import UnusableError, content, why_not
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.way_out import WayOut
 from service.learning.reach import beyond_m
-from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
 
 MODULE = "service.daemon.skill_worker"
@@ -161,9 +162,9 @@ def skill_of(
         )
     else:
         try:
-            skill = decoded(source.read_bytes(), origin=str(source))
-        except OSError as error:
-            raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
+            skill = decoded(content(source, LARGEST_FILE), origin=str(source))
+        except (OSError, UnusableError) as error:
+            raise SkillError(f"cannot read skill {source}: {why_not(error)}") from None
     hands = skill.hands[0].reshape(2, 3)
     skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
     _ = skill.tool_positions
