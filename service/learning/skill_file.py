@@ -151,7 +151,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
     recording has checksums of its own.
     """
-    if not data.startswith(b"PK"):  # as every .npz
+    if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
         made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
         raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
     try:
@@ -192,7 +192,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     except KeyError as error:
         raise SkillError(f"{origin}: not a skill (the array {error} is missing)") from None
     except (pickle.UnpicklingError, zipfile.BadZipFile):
-        raise SkillError(f"{origin}: not a skill (no .npz archive)") from None
+        raise SkillError(f"{origin}: not a skill (a damaged .npz archive)") from None
     except Exception as error:  # what a damaged archive may raise is not documented by anyone
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill
