@@ -152,6 +152,8 @@ def _mode(mode: Mode) -> tuple[str, str]:
 
 def _reason(reason: Reason, seen: Evidence) -> Incident:
     found = ""
+    arm = seen.sources.get("arm")
+    contradiction = _contradiction(arm, seen.contested) if reason is Reason.ARM_ERROR else ""
     match reason:
         case Reason.NONE:
             about = remedy = ""
@@ -185,7 +187,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
-            if (arm := seen.sources.get("arm")) is not None and arm.fresh:
+            if arm is not None and arm.fresh:
                 remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
             remedy = _of_rate(seen) or remedy
             if seen.inside is not None:
@@ -206,6 +208,9 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
                 found = "a joint was {:.3f} rad off, {:g} accepted".format(*seen.error_rad)
                 found += "; " if seen.worst_joint[2] == "rad" else ", half as many m for one that slides; "
                 found += "now {} is off by {:.3f} {}".format(*seen.worst_joint)
+            if contradiction:
+                found = f"{contradiction}; {found or about}"
+                remedy = "see whether two drivers publish `joints/state`, and stop one, then `thirdhand reset`"
         case Reason.ARM_SILENT:
             about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen)
             remedy = "look at its driver and the network, then `thirdhand reset`"
@@ -226,7 +231,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy, found = "keep log and recording, report it, then `thirdhand reset`", seen.failure
         case _:
             assert_never(reason)
-    if seen.busy and reason in OF_TIME and not _of_rejected(seen, *OF_TIME[reason]):
+    if seen.busy and reason in OF_TIME and not (contradiction or _of_rejected(seen, *OF_TIME[reason])):
         found, remedy = f"this machine was too busy, {seen.busy}; {found or about}", f"{FREE_THE_MACHINE}; {remedy}"
     return Incident(about, remedy, found)
 
@@ -347,6 +352,15 @@ def _contest(seen: Evidence) -> str:
             return ""
         what = f"what came scatters by {source.scatter_mm:.0f} mm an axis, {seen.scatter_mm:.0f} accepted"
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
+
+
+def _contradiction(arm: Source | None, accepted: float) -> str:
+    """How the arm's states of the last second contradict each other; empty where they do not."""
+    if arm is None:
+        return ""
+    if arm.contested > accepted:
+        return f"{arm.contested:.0%} of the arm's states in the last second contradict the rest"
+    return f"states of the arm were rejected as jumped: {arm.refused}" if arm.cause == word(Cause.JUMPED) else ""
 
 
 def _is_seldom(seen: Evidence, name: str, most_ms: float) -> bool:
