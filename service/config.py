@@ -15,12 +15,14 @@ import msgspec
 
 from service.contract import ros2
 from service.contract.explain import InvalidError, in_words, validated
+from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content
 from service.described_arm import SettingsError, UnreadableError, check, completed, description
 from service.network_settings import Network, Ros2
 from service.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).with_name("arms") / "wam.urdf"
 RATES_HZ = (50, 1000)  # slowest and fastest
+LONGEST_CELL = 200  # bytes: a recording's name is the cell's and its time, and of 255 bytes at most
 REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
 SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -281,6 +283,8 @@ class Settings(Section, frozen=True):
         yield from (f"{path}: not finite; a finite number needed" for path in unusable)
         if {".", ".."} & set(self.cell.split("/")):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
+        if (size := len(self.cell.encode())) > LONGEST_CELL:
+            yield f"$.cell: a name of {size} bytes given; at most {LONGEST_CELL} accepted, as files are named by it"
         if unusable:
             return
         if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
@@ -476,7 +480,7 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
 def load(path: Path) -> Settings:
     """Settings from a TOML file. Raises SettingsError, UnreadableError."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = content(path, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
+    except (OSError, UnusableError, UnicodeDecodeError) as error:
         raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
     return parse(text, origin=str(path), folder=path.parent)

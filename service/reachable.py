@@ -26,6 +26,8 @@ POINTS = 8_000  # of space that are tested
 SPACING = 0.03  # of the arm's extent: a point is reached when the tool is that near in one of the postures
 RAIL_STEPS = 9  # positions of a prismatic joint below the first one that turns
 NEIGHBOURS = 12  # postures that are looked at for each point
+MORE_NEIGHBOURS = 64  # postures that are looked at for a point that is near none of those
+CERTAIN = 0.08  # of the arm's extent: the tool is never farther from its position in the nearest posture than 0.072
 REACHED = 0.95  # share of the points at a distance from the shoulder that the arm reaches there
 LAYERS = 40  # distances from the shoulder that are tested
 FOLDED = 0.4  # of the outer radius: nearer to its shoulder an arm is folded onto itself
@@ -67,25 +69,37 @@ class Workspace:
         self._tree, self._starts = cKDTree(flat), angles - self.postures[:, rails]
 
     def reaches(self, points: Vectors) -> NDArray[np.bool_]:
-        """For points (M, 3) whether the tool comes near (M,), with the rails below the first joint
-        that turns at any of their stops.
+        """True for each of the points (M, 3) that is near the tool in one of the postures."""
+        return np.asarray(self._nearest(points, NEIGHBOURS) <= SPACING * self._reach)
+
+    def beyond(self, points: Vectors) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from where the tool can be; 0 where it comes."""
+        out = np.where(self.reaches(points), 0.0, math.inf)
+        out[out > 0.0] = self._nearest(points[out > 0.0], MORE_NEIGHBOURS)
+        return np.where(out > CERTAIN * self.extent, out, 0.0)
+
+    def _nearest(self, points: Vectors, neighbours: int) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from the tool in the nearest of the postures, with
+        the rails below the first joint that turns at any of their stops.
         """
-        return np.asarray(np.any([self._reaches(points - stop) for stop in self._stops], axis=0))
+        return np.asarray(np.min([self._distances(points - stop, neighbours) for stop in self._stops], axis=0))
 
-    def _reaches(self, points: Vectors) -> NDArray[np.bool_]:
-        """For points (M, 3) whether the tool comes near with the rails at 0.
+    def _distances(self, points: Vectors, neighbours: int) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from the tool in the nearest posture with the rails
+        at 0.
 
-        The first joint turns the tool on a circle about its axis: so a point is near where one of
-        the postures is on the point's circle, and the joint's limits include the angle between.
+        The first joint turns the tool on a circle of radius r about its axis. A point that is d
+        from the circle, and turned by an angle a beyond the joint's limits, is at
+        sqrt(d² + (2 r sin(a / 2))²).
         """
         flat, angles = self._flattened(points)
-        distances, found = self._tree.query(flat, k=NEIGHBOURS, distance_upper_bound=SPACING * self._reach)
-        near = np.asarray(distances < math.inf)
+        distances, found = map(np.asarray, self._tree.query(flat, k=neighbours))
         if not self._turns:
-            return np.asarray(near.any(axis=1))
+            return np.asarray(distances.min(axis=1))
         lower, upper = self._first
-        turn = angles[:, None] - self._starts[np.where(near, found, 0)] - lower
-        return np.asarray((near & (turn % (2 * math.pi) <= upper - lower)).any(axis=1))
+        turn = (angles[:, None] - self._starts[found] - lower) % (2 * math.pi)
+        excess = np.where(turn <= upper - lower, 0.0, np.minimum(turn - (upper - lower), 2 * math.pi - turn))
+        return np.asarray(np.hypot(distances, 2.0 * flat[:, :1] * np.sin(excess / 2.0)).min(axis=1))
 
     def _flattened(self, points: Vectors) -> tuple[Vectors, Vectors]:
         """Distances of points (M, 3) from the first axis and heights along it (M, 2), and angles

@@ -71,6 +71,9 @@ def test_a_cell_may_hold_slashes(name: str) -> None:
         r"a\u0000b",
         "..",
         "a/../b",
+        "x" * 201,
+        "ä" * 101,
+        "/".join(["x" * 40] * 5),
     ],
 )
 def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:

@@ -16,6 +16,7 @@ import msgspec
 from service import child
 from service.cli.usage import UsageError
 from service.config import Settings, converted
+from service.contract.explain import in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
 from service.described_arm import SettingsError
@@ -25,6 +26,7 @@ from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
 def serve(args: argparse.Namespace) -> int:
     """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
     os.umask(0o077)  # its files are private to its user
+    _open_standard_streams()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -36,7 +38,8 @@ def serve(args: argparse.Namespace) -> int:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
-            raise OSError(f"nothing can be recorded in {folder}: {error.strerror}") from None
+            reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
+            raise OSError(f"nothing can be recorded in {folder}: {reason}") from None
     if folder is not None or args.live is not None:
         child.preload("service.recording.process")  # beside this process, which imports as much
     with starting(settings) as start:
@@ -48,13 +51,27 @@ def serve(args: argparse.Namespace) -> int:
 
         def announce(running: daemon.Daemon) -> None:
             where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
-            print(f"listening on {where} as cell {settings.cell}", flush=True)
+            line = f"listening on {where} as cell {settings.cell}"
+            try:
+                print(line, flush=True)
+            except OSError as error:  # an arm that works does not depend on a reader
+                logging.getLogger("thirdhand").warning("%s (standard output: %s)", line, in_words(error))
 
         skill, scribe = args.skill or skills / SHIPPED_SKILL, Scribe(settings, folder=folder, live_port=args.live)
         missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
-    sys.stdout.flush()
     logging.shutdown()
     os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries
+
+
+def _open_standard_streams() -> None:
+    """Opens the null device for each of standard input, output and error that is closed, or a
+    socket would take its number, and receive what libraries write there.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
 
 
 class PrintableFormatter(logging.Formatter):

@@ -16,8 +16,9 @@ import zenoh
 
 from service.client import ClientSettings, client_settings
 from service.config import RATES_HZ
-from service.contract.channels import lacking
+from service.contract.channels import LARGEST_REQUEST, lacking
 from service.contract.explain import in_file, in_words
+from service.contract.file_content import UnusableError, content
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
 
 CONNECT_TIMEOUT_S = 3.0
@@ -140,8 +141,10 @@ def added_in(path: Path) -> Add:
     the file.
     """
     try:
-        request: Add = decode_request(sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes(), Add)
-    except OSError as error:
+        request: Add = decode_request(
+            sys.stdin.buffer.read() if str(path) == "-" else content(path, LARGEST_REQUEST, accepts_pipes=True), Add
+        )
+    except (OSError, UnusableError) as error:
         raise RequestError(f"{path} cannot be read: {in_words(error, named=False)}") from None
     except RequestError as error:
         raise RequestError(f"{path}: {in_file(str(error))}") from None

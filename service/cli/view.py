@@ -80,6 +80,8 @@ def _kind(path: Path) -> bytes:
         raise ExplainedError(f"no such file: {path}")
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
+    if not path.is_file():  # a pipe would be waited for
+        raise ExplainedError(f"{path} is not a file; a recording (.mcap) or a drawing of Rerun's (.rrd) needed")
     with path.open("rb") as file:
         begins = file.read(len(MCAP0_MAGIC))
     for magic in (RRD_MAGIC, MCAP0_MAGIC):

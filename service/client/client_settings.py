@@ -16,6 +16,7 @@ from service.client.session import open_session
 from service.config import Cell
 from service.contract.channels import ENDPOINT, lacking
 from service.contract.explain import InvalidError, in_words, validated
+from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content
 from service.described_arm import SettingsError, UnreadableError
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
@@ -100,8 +101,8 @@ def _file() -> Path | None:
 def _read(path: Path) -> dict[str, Any]:
     """What a client's file holds; paths in it are relative to its folder. Raises SettingsError."""
     try:
-        given = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+        given = tomllib.loads(content(path, LARGEST_CONFIGURATION).decode())
+    except (OSError, UnusableError, UnicodeDecodeError) as error:
         raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SettingsError(f"{path}: {error}") from None

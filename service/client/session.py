@@ -17,6 +17,7 @@ import zenoh
 
 from service.contract.channels import lacking
 from service.contract.explain import ExplainedError, in_words
+from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
@@ -163,9 +164,9 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
         return zenoh.Config()
     try:
         file = Path(path).expanduser()
-        file.read_bytes()
+        content(file, LARGEST_CONFIGURATION)
         return zenoh.Config.from_file(file)
-    except (OSError, RuntimeError, zenoh.ZError) as error:
+    except (OSError, RuntimeError, UnusableError, zenoh.ZError) as error:
         reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
         raise UnreachableError(f"cannot read the Zenoh configuration {path}: {reason}") from None
 

@@ -102,6 +102,7 @@ class Evidence(NamedTuple):
     commanded_speed: Excess | None = None
     failure: str = ""  # of the service
     silent_ms: float = 0.0  # accepted between states of the arm
+    stale_ms: float = 0.0  # accepted between samples of a hand
     busy: str = ""  # how this machine was too busy when it began
     # of a sample that was rejected:
     sample: PoseStamped | JointState | None = None
@@ -151,6 +152,8 @@ def _mode(mode: Mode) -> tuple[str, str]:
 
 def _reason(reason: Reason, seen: Evidence) -> Incident:
     found = ""
+    arm = seen.sources.get("arm")
+    contradiction = _contradiction(arm, seen.contested) if reason is Reason.ARM_ERROR else ""
     match reason:
         case Reason.NONE:
             about = remedy = ""
@@ -163,6 +166,8 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             found = _unseen(seen)
             remedy = "look at the tracker; growing counters under `rejected` mean that samples come and are refused; "
             remedy += f"a hand that the skill does without is waited for {GONE_S:g} s only"
+            if any(_is_seldom(seen, side, seen.stale_ms) for side in SIDES):
+                remedy = "publish hands more often, or raise `[hands] stale_ms`"
             remedy = _of_rejected(seen, *SIDES) or remedy
         case Reason.FAR_FROM_DEMONSTRATIONS:
             about = "the skill is not sure where the tool belongs with the hands as they are"
@@ -182,7 +187,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             about = "the arm does not say where it is, does not rest within its limits yet, or stands in something"
             found = _not_ready(seen)
             remedy = "start the arm's driver; `joints/state` must name the joints as `joints/command` does"
-            if (arm := seen.sources.get("arm")) is not None and arm.fresh:
+            if arm is not None and arm.fresh:
                 remedy = "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
             remedy = _of_rate(seen) or remedy
             if seen.inside is not None:
@@ -203,6 +208,9 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
                 found = "a joint was {:.3f} rad off, {:g} accepted".format(*seen.error_rad)
                 found += "; " if seen.worst_joint[2] == "rad" else ", half as many m for one that slides; "
                 found += "now {} is off by {:.3f} {}".format(*seen.worst_joint)
+            if contradiction:
+                found = f"{contradiction}; {found or about}"
+                remedy = "see whether two drivers publish `joints/state`, and stop one, then `thirdhand reset`"
         case Reason.ARM_SILENT:
             about, found = "the arm told nothing for 100 ms while it was to move", _silence(seen)
             remedy = "look at its driver and the network, then `thirdhand reset`"
@@ -223,7 +231,7 @@ def _reason(reason: Reason, seen: Evidence) -> Incident:
             remedy, found = "keep log and recording, report it, then `thirdhand reset`", seen.failure
         case _:
             assert_never(reason)
-    if seen.busy and reason in OF_TIME and not _of_rejected(seen, *OF_TIME[reason]):
+    if seen.busy and reason in OF_TIME and not (contradiction or _of_rejected(seen, *OF_TIME[reason])):
         found, remedy = f"this machine was too busy, {seen.busy}; {found or about}", f"{FREE_THE_MACHINE}; {remedy}"
     return Incident(about, remedy, found)
 
@@ -310,7 +318,7 @@ def _cause(cause: Cause | Literal["malformed"], seen: Evidence) -> Incident:
             accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
             found = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
         case Cause.INCOMPLETE:
-            about = "joints that are not all there"
+            about = "joints that are not all there, or named twice"
             remedy = "publish all joints under the names that `joints/command` has, one position each"
         case "malformed":
             about, remedy = "bytes that are no such message", "publish the type and encoding of the wire's table"
@@ -325,6 +333,8 @@ def _unseen(seen: Evidence) -> str:
     for side in SIDES:
         if (source := seen.sources.get(side)) is not None and not source.fresh:
             since = "has not been seen yet" if source.age_ms is None else f"was last seen {_time(source.age_ms)} ago"
+            if _is_seldom(seen, side, seen.stale_ms):
+                since = f"comes {_seldom(source, seen.stale_ms)}"
             instead = f", as what comes is rejected as {source.cause}: {source.refused}" if _is_refused(source) else ""
             said.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
     return "; ".join(said)
@@ -344,25 +354,40 @@ def _contest(seen: Evidence) -> str:
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
 
 
-def _is_seldom(seen: Evidence) -> bool:
-    """True if states of the arm still arrive, but too seldom to follow by."""
-    source = seen.sources.get("arm")
+def _contradiction(arm: Source | None, accepted: float) -> str:
+    """How the arm's states of the last second contradict each other; empty where they do not."""
+    if arm is None:
+        return ""
+    if arm.contested > accepted:
+        return f"{arm.contested:.0%} of the arm's states in the last second contradict the rest"
+    return f"states of the arm were rejected as jumped: {arm.refused}" if arm.cause == word(Cause.JUMPED) else ""
+
+
+def _is_seldom(seen: Evidence, name: str, most_ms: float) -> bool:
+    """True if samples of a source still arrive, but at longer intervals than accepted."""
+    source = seen.sources.get(name)
     if source is None or source.age_ms is None or _is_refused(source):
         return False
     goes_on = source.age_ms * source.rate_hz < 2000.0  # the next one is not overdue by a whole interval
-    return goes_on and 0.0 < source.rate_hz * seen.silent_ms < 1000.0
+    return goes_on and 0.0 < source.rate_hz * most_ms < 1000.0
+
+
+def _seldom(source: Source, most_ms: float) -> str:
+    """The rate of a source that is too low, and the lowest one that is accepted."""
+    return f"at {source.rate_hz:.1f} Hz, {1000 / most_ms:g} Hz at least needed"
 
 
 def _of_rate(seen: Evidence) -> str:
     """Remedy for states that arrive too seldom; empty if they do not."""
-    return "publish `joints/state` more often, or raise `[arm] silent_ms`" if _is_seldom(seen) else ""
+    is_seldom = _is_seldom(seen, "arm", seen.silent_ms)
+    return "publish `joints/state` more often, or raise `[arm] silent_ms`" if is_seldom else ""
 
 
 def _silence(seen: Evidence) -> str:
     """For how long the arm says nothing, or that it does so too seldom; empty where it does."""
     source = seen.sources.get("arm")
-    if source is not None and _is_seldom(seen):
-        return f"joint states come at {source.rate_hz:.1f} Hz, {1000 / seen.silent_ms:g} Hz at least needed"
+    if source is not None and _is_seldom(seen, "arm", seen.silent_ms):
+        return f"joint states come {_seldom(source, seen.silent_ms)}"
     if source is None or source.fresh:
         return ""
     return "no joint states came yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"

@@ -101,6 +101,9 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
     missing = [name for name in names if name not in found]
     if missing:
         raise WireError(f"joints {missing} missing among {len(given)}, {', '.join(given[:10])[:200]}")
+    repeated = [name for name in names if given.count(name) > 1]
+    if repeated:
+        raise WireError(f"joints {repeated} named more than once among {len(given)}; one position each needed")
     return tuple(found[name] for name in names)
 
 

@@ -48,7 +48,8 @@ from service.daemon.skill_worker import SkillWorker, skill_of
 from service.daemon.start import Start
 from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.way_finder import WayFinder
-from service.learning.skill_file import StoredSkill
+from service.learning.reach import beyond_m, out_of_reach
+from service.learning.skill_file import SkillError, StoredSkill
 from service.recording.protocol import pack
 from service.recording.scribe import Scribe
 
@@ -372,7 +373,10 @@ class Daemon:
 
 
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
-    """The skill in a file, with the via-points taught to it before. Raises SkillError."""
+    """The skill in a file, with the via-points taught to it before.
+
+    Raises SkillError, also where the arm does not reach most of the places to which it leads.
+    """
     skill, saved = skill_of(path), SavedViaPoints(settings)
 
     def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
@@ -389,7 +393,13 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
         )
         return adapted
 
-    return saved.restored(skill, taught, skill)
+    restored = saved.restored(skill, taught, skill)
+    found = out_of_reach(restored, beyond_m(settings, restored.tool_positions), settings)
+    if found.is_refused:
+        raise SkillError(found.text)
+    if found.text:
+        log.warning("%s", found.text)
+    return restored
 
 
 def serve(

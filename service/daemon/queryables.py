@@ -34,12 +34,12 @@ from service.contract.requests import (
     encode_json,
 )
 from service.core.frame import Event, Frame, order
-from service.core.skill.skill import is_reachable
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import outcome
+from service.learning.reach import accepted, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
 
@@ -163,7 +163,7 @@ class Queryables:
         self._note = note
         self._keep = keep
         self._failed = failed
-        self._saved = SavedViaPoints(settings)
+        self._saved = SavedViaPoints(settings, skill_worker.beyond_m)
         self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*TOGETHER, COMPUTED)}
         self._queryables: list[zenoh.Queryable[None]] = []
 
@@ -289,7 +289,12 @@ class Queryables:
             time.sleep(POLL_S)
         return tick
 
-    def _adopt(self, skill: StoredSkill) -> Reply:
+    def _adopt(self, skill: StoredSkill, *, is_loaded: bool = False) -> Reply:
+        """Raises RequestError for a loaded skill most of whose places the arm does not reach."""
+        distances_m = self._skill_worker.beyond_m(self._settings, skill.tool_positions)
+        found = out_of_reach(skill, distances_m, self._settings)
+        if is_loaded and found.is_refused:
+            raise RequestError(found.text)
         self._keep(skill.file)
         draft = self._saved.draft(skill)  # first: what cannot be saved is not taught
         try:
@@ -298,7 +303,8 @@ class Queryables:
         finally:
             draft.unlink(missing_ok=True)
         before, self._skill, self._in_force = self._skill, skill, in_force(skill)
-        return Reply(tick, self._in_force, warnings_of(before, skill))
+        warnings = warnings_of(before, skill)
+        return Reply(tick, self._in_force, (found.text, *warnings) if found.text else warnings)
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
@@ -312,7 +318,7 @@ class Queryables:
         if saved := self._saved.read(skill):  # its via-points were taught before
             points, tolerance = saved
             skill = self._skill_worker.adapt(skill, points, tolerance=tolerance)
-        return self._adopt(skill)
+        return self._adopt(skill, is_loaded=True)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:
         points = {point.name: point for point in self._skill.via_points}
@@ -342,14 +348,11 @@ class Queryables:
                 f"$.points: {total} via-points beside the task's, 13 each with a radius; at most {MOST_POINTS} accepted"
             )
         low, high = self._skill.workspace
-        reach = self._settings.reach
-        for i, point in enumerate(added):
+        beyond_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
+        for i, (point, distance_m) in enumerate(zip(added, beyond_m, strict=True)):
             at, given = np.array(point.tool), f"$.points[{i}].tool: {list(point.tool)}"
             if not ((low <= at) & (at <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
                 raise RequestError(f"{given} outside the skill's box, {corners} m accepted")
-            if not is_reachable(at, reach):
-                raise RequestError(
-                    f"{given} out of the arm's reach, {reach.inner} to {reach.outer} m from the shoulder, "
-                    f"x ≥ {reach.min_x} m and z ≥ {reach.min_z} m accepted"
-                )
+            if distance_m > 0.0:
+                raise RequestError(f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")

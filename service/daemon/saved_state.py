@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from service.contract.explain import in_file, in_words
+from service.contract.explain import ExplainedError, in_file, in_words
+from service.contract.file_content import content
 
 log = logging.getLogger("thirdhand")
+NOT_OURS = "it is damaged, or was not written by this service"
 LARGEST_BYTES = 32_000_000
 T = TypeVar("T")
 
@@ -23,12 +23,13 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
     under another name, which the log reports, and `otherwise` is returned.
     """
     try:
-        return read(_content(path))
+        return read(content(path, LARGEST_BYTES))
     except (FileNotFoundError, NotADirectoryError):
         return otherwise
     except Exception as error:
         aside = path.with_suffix(".damaged")
-        reason = in_file(in_words(error, named=False))
+        is_ours = isinstance(error, OSError | ExplainedError)
+        reason = in_file(in_words(error, named=False)) if is_ours else NOT_OURS
         try:
             path.replace(aside)
         except OSError as failure:
@@ -39,14 +40,3 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
             "%s in %s cannot be used: %s; the file %s, and the daemon goes on without it", what, path, reason, where
         )
         return otherwise
-
-
-def _content(path: Path) -> bytes:
-    """The content of a regular file of at most LARGEST_BYTES. Raises OSError, ValueError."""
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:  # never waits for a pipe
-        about = os.fstat(file.fileno())
-        if not stat.S_ISREG(about.st_mode):
-            raise ValueError("it is not a file")
-        if about.st_size > LARGEST_BYTES:
-            raise ValueError(f"it has {about.st_size} bytes, at most {LARGEST_BYTES} accepted")
-        return file.read(LARGEST_BYTES)

@@ -15,16 +15,19 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from service import child
 from service.config import Settings, robot_description
+from service.contract.explain import in_words
+from service.contract.file_content import UnusableError, content
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.way_out import WayOut
-from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.reach import beyond_m
+from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
 
 MODULE = "service.daemon.skill_worker"
@@ -54,7 +57,7 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        loaded: StoredSkill = self._ask(timeout_s, path)
+        loaded: StoredSkill = self._ask(timeout_s, skill_of, path)
         return loaded
 
     def adapt(
@@ -64,13 +67,18 @@ class SkillWorker:
 
         Raises SkillError, also after `timeout_s` [s].
         """
-        made: StoredSkill = self._ask(timeout_s, skill.file, tuple(via_points), tolerance, self._max_gain)
+        made: StoredSkill = self._ask(timeout_s, skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
         return made
 
     def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = TIMEOUT_S) -> list[Vector]:
         """As `WayOut.find` of the cell. Raises SkillError, also after `timeout_s` [s]."""
-        found: list[Vector] = self._ask(timeout_s, settings, *arguments)
+        found: list[Vector] = self._ask(timeout_s, way_out_of, settings, *arguments)
         return found
+
+    def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = TIMEOUT_S) -> Vector:
+        """As `learning.reach.beyond_m`. Raises SkillError, also after `timeout_s` [s]."""
+        distances: Vector = self._ask(timeout_s, beyond_m, settings, positions)
+        return distances
 
     def close(self) -> None:
         """Ends the process, also while it works."""
@@ -87,7 +95,8 @@ class SkillWorker:
                 self._child.wait()
             self._child = None
 
-    def _ask(self, timeout_s: float, *request: Any) -> Any:
+    def _ask(self, timeout_s: float, work: Callable[..., Any], *arguments: Any) -> Any:
+        """The value of `work(*arguments)`, a function of a module that the process has imported."""
         with self._busy:
             working, end_s = self.start(), time.monotonic() + timeout_s
             progress = child.Progress(working)
@@ -98,7 +107,7 @@ class SkillWorker:
                         raise EOFError
                     if time.monotonic() > end_s:  # what it has imported stays: it is waited for again
                         raise SkillError(STARTING)
-                _send(working.socket, pickle.dumps(request))
+                _send(working.socket, pickle.dumps((work, *arguments)))
                 poll = select.poll()
                 poll.register(working.socket, select.POLLIN)
                 while not poll.poll(1000 * POLL_S):
@@ -136,12 +145,9 @@ def _receive(channel: socket.socket) -> Any:
     return pickle.loads(value, buffers=buffers)
 
 
-def _work(*request: Any) -> StoredSkill | list[Vector]:
-    """What one request asks for."""
-    if isinstance(request[0], Settings):
-        settings, *arguments = request
-        return WayOut(settings, robot_description(settings)).find(*arguments)
-    return skill_of(*request)
+def way_out_of(settings: Settings, *arguments: Vector) -> list[Vector]:
+    """As `WayOut.find` of the cell."""
+    return WayOut(settings, robot_description(settings)).find(*arguments)
 
 
 def skill_of(
@@ -157,11 +163,12 @@ def skill_of(
         )
     else:
         try:
-            skill = decoded(source.read_bytes(), origin=str(source))
-        except OSError as error:
-            raise SkillError(f"cannot read skill {source}: {error.strerror}") from None
+            skill = decoded(content(source, LARGEST_FILE), origin=str(source))
+        except (OSError, UnusableError) as error:
+            raise SkillError(f"cannot read skill {source}: {in_words(error, named=False)}") from None
     hands = skill.hands[0].reshape(2, 3)
     skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
+    _ = skill.tool_positions
     return skill
 
 
@@ -171,12 +178,12 @@ def run(channel: socket.socket) -> None:
     child.end_with_parent()
     while True:
         try:
-            request = _receive(channel)
+            work, *arguments = _receive(channel)
         except (EOFError, OSError):
             return
         buffers: list[pickle.PickleBuffer] = []
         try:
-            answer: StoredSkill | list[Vector] | str = _work(*request)
+            answer = work(*arguments)
         except Exception as error:  # any failure is an answer to the client
             answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
         skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)

@@ -113,6 +113,7 @@ class CellStatus(NamedTuple):
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
             silent_ms=settings.arm.silent_ms,
+            stale_ms=settings.hands.stale_ms,
             busy=self.busy,
         )
 

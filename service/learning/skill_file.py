@@ -14,6 +14,7 @@ import pickle
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -98,6 +99,11 @@ class StoredSkill(Skill):
     figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
     file: bytes = field(default=b"", repr=False)  # all of it, as it is stored and recorded
 
+    @cached_property
+    def tool_positions(self) -> NDArray[np.float64]:
+        """The tool (M, 3) [m] where the hands are at each of the places that the skill knows."""
+        return self.mean(self.hands, self.model.names)
+
     def for_loop(self) -> Skill:
         """The skill alone."""
         return Skill(**{part.name: getattr(self, part.name) for part in fields(Skill)})
@@ -145,7 +151,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
     recording has checksums of its own.
     """
-    if not data.startswith(b"PK"):  # as every .npz
+    if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
         made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
         raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
     try:
@@ -186,7 +192,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     except KeyError as error:
         raise SkillError(f"{origin}: not a skill (the array {error} is missing)") from None
     except (pickle.UnpicklingError, zipfile.BadZipFile):
-        raise SkillError(f"{origin}: not a skill (no .npz archive)") from None
+        raise SkillError(f"{origin}: not a skill (a damaged .npz archive)") from None
     except Exception as error:  # what a damaged archive may raise is not documented by anyone
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill

@@ -10,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from service.contract.incidents import MALFORMED, Evidence, Member, explained, in_full, remedy, word
 from service.contract.records import Cause, Flag, Mode, Reason
 from service.contract.requests import Source
@@ -84,6 +86,30 @@ def test_two_sources_are_told_by_the_one_that_contradicts_most_or_scatters_most(
     assert explained(Reason.TWO_SOURCES, seen).why == told
     told = "right hand, in the last second: what came scatters by 15 mm an axis, 12 accepted"
     assert explained(Reason.TWO_SOURCES, seen._replace(contested=0.5)).why == told
+
+
+@pytest.mark.parametrize("busy", ["", "the loop was up to 45 ms late"])
+@pytest.mark.parametrize(
+    ("share", "cause", "told"),
+    [
+        (0.0, "", ""),
+        (0.1, "older", ""),
+        (0.3, "", "30% of the arm's states in the last second contradict the rest"),
+        (0.02, "jumped", "states of the arm were rejected as jumped: elbow from 1 to 2 rad"),
+    ],
+)
+def test_an_arm_error_amid_states_that_contradict_each_other_is_explained_by_two_drivers(
+    busy: str, share: float, cause: str, told: str
+) -> None:
+    arm = Source(rate_hz=500.0, fresh=True, contested=share, cause=cause, refused="elbow from 1 to 2 rad")
+    seen = Evidence({"arm": arm}, contested=0.1, busy=busy)
+    seen = seen._replace(error_rad=(0.12, 0.1), worst_joint=("elbow", 0.24, "rad"))
+    found = explained(Reason.ARM_ERROR, seen)
+    assert "a joint was 0.120 rad off" in found.why
+    assert found.what_to_do.endswith("then thirdhand reset")
+    assert found.why.startswith(told)
+    assert ("two drivers publish joints/state" in found.what_to_do) is bool(told)
+    assert ("too busy" in found.why) is (bool(busy) and not told)
 
 
 def test_a_term_is_followed_by_what_there_is_to_say() -> None:

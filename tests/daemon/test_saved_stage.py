@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from service.client import RefusedError
 from service.config import Files, Settings
 from service.core.skill.skill import Skill
 from service.daemon.saved_stage import LONGEST_S, SavedStage
+from service.daemon.saved_state import LARGEST_BYTES, NOT_OURS
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.single_instance import state_folder
 from service.shipped import shipped_skill
@@ -62,6 +64,14 @@ def damage(path: Path, how: str) -> None:
         path.write_bytes({"deep brackets": b"[" * 200_000, "no text": b"\xff\xfe", "another kind": b"[3]"}[how])
 
 
+REASONS = {
+    "a folder": ("Is a directory",),
+    "a pipe": ("it is not a file",),
+    "a huge file": (f"it has {1 << 40} bytes, at most {LARGEST_BYTES} accepted",),
+    "a link to itself": ("Too many levels of symbolic links",),
+}
+
+
 @pytest.mark.parametrize(
     "how", ["deep brackets", "no text", "another kind", "a folder", "a pipe", "a huge file", "a link to itself"]
 )
@@ -75,7 +85,8 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
     assert SavedStage(settings).read(skill) == ""
     assert saved_points.read(skill) is None
     for path in (stage, saved_points.path(skill)):
-        assert f"{path} cannot be used" in caplog.text
+        (reason,) = re.findall(rf"{path} cannot be used: (.*); the file is kept", caplog.text)
+        assert reason in REASONS.get(how, (NOT_OURS,))
         assert not os.path.lexists(path)
         assert os.path.lexists(path.with_suffix(".damaged"))
     SavedStage(settings).keep(skill, ("handover", "glass"), 0.9)

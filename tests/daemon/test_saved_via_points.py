@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import re
+import stat
 from dataclasses import replace
 from pathlib import Path
 from random import Random
 
+import msgspec
+import numpy as np
 import pytest
 
+from service.cli.usage import added_in
 from service.config import WAM, Files, Settings, converted
 from service.core.skill.skill import Skill
 from service.daemon.saved_via_points import SavedViaPoints
@@ -184,3 +191,51 @@ def test_a_file_of_before_arms_were_told_apart_is_the_shipped_arms(
     other = SavedViaPoints(another_arm(tmp_path, ("0.55", "0.65")))
     path.rename(other.path(skill))
     assert other.read(skill) is None
+
+
+def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_taught_again(
+    saved: SavedViaPoints, skill: Skill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever the change leaves in reach is in force; and all once the arm is as it was."""
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    tools, settings = np.array([point.tool for point in POINTS]), Settings(cell="lab/bench2")
+    for min_x in (0.0, *(np.sort(tools[:, 0])[[0, 1, 2]] + 0.01)):
+        reach = msgspec.structs.replace(settings.reach, min_x=float(min_x))
+        changed = msgspec.structs.replace(settings, files=Files(state=str(tmp_path)), reach=reach)
+        read = SavedViaPoints(changed).read(skill)
+        assert read is not None
+        out = {point.name: min_x - point.tool[0] for point in POINTS if point.tool[0] < min_x}
+        assert read == (tuple(point for point in POINTS if point.name not in out), 0.03)
+        assert ("out of the arm's reach" in caplog.text) is bool(out)
+        for name, distance_m in out.items():
+            assert f"{name!r} by {distance_m:.3f} m" in caplog.text
+        if out:
+            aside = Path(re.findall(r"via-points add --file (\S+)", caplog.text)[0])
+            kept = added_in(aside)
+            assert kept.points == tuple(point for point in POINTS if point.name in out)
+            assert kept.tolerance == 0.03
+            assert stat.S_IMODE(aside.stat().st_mode) == 0o600
+        caplog.clear()
+    assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3  # none replaced another
+    assert saved.read(skill) == (POINTS, 0.03)
+
+
+def test_via_points_out_of_reach_that_cannot_be_set_aside_stay_where_they_are(
+    saved: SavedViaPoints,
+    skill: Skill,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    reach = msgspec.structs.replace(Settings().reach, min_x=0.9)
+    changed = Settings(cell="lab/bench2", files=Files(state=str(tmp_path)), reach=reach)
+
+    def full(*_: object, **more: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tempfile.NamedTemporaryFile", full)
+    assert SavedViaPoints(changed).read(skill) == ((), 0.03)
+    assert "cannot be set aside" in caplog.text
+    assert "No space left" in caplog.text
+    assert saved.read(skill) == (POINTS, 0.03)

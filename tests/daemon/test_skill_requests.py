@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 
 from service.cli.main import main
 from service.client import RefusedError, endpoints
+from service.config import Files, Reach, Settings
 from service.contract.records import Mode, Reason
 from service.core.skill.skill import Skill
-from service.learning.skill_file import StoredSkill, with_file
+from service.daemon.daemon import load_skill
+from service.daemon.skill_worker import SkillWorker
+from service.learning.reach import beyond_m
+from service.learning.skill_file import SkillError, StoredSkill, with_file
 from support.request_cell import PLACES, Cell
 
 
@@ -112,3 +118,41 @@ def test_the_stage_of_the_task_is_told_by_client_and_command(
         assert main(command) == 0
         assert re.search(rf"^at soldering since tick \d+: {re.escape(told)}$", capsys.readouterr().out, re.MULTILINE)
     assert cell.kinds()[-3:] == ["stage"] * 3
+
+
+FAR_LEFT = Reach(centre=(0.0, 1.5, 0.346))
+
+
+def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a_warning(
+    sessions: tuple[zenoh.Session, zenoh.Session], skill: StoredSkill, skill_worker: SkillWorker, tmp_path: Path
+) -> None:
+    positions = skill.tool_positions
+    half = Reach(min_x=float(np.quantile(positions[:, 0], 0.4)))  # 40 % are nearer to the base
+    for reach, is_refused in ((FAR_LEFT, True), (half, False)):
+        folder = tmp_path / str(is_refused)
+        folder.mkdir()
+        number = int(np.count_nonzero(beyond_m(Settings(reach=reach), positions)))
+        sentence = (
+            f"{number} of {len(positions)} places of the tool in skill 'soldering' are out of the arm's reach, the"
+        )
+        with contextlib.closing(Cell(*sessions, skill, skill_worker, folder, reach)) as cell:
+            if is_refused:
+                assert sentence in cell.refusal("skill", {"name": "soldering"})
+                assert cell.kept == []
+            else:
+                (warning,) = cell.client.load_skill("soldering").warnings
+                assert warning.startswith(sentence)
+                assert cell.kinds() == ["skill"]
+
+
+@pytest.mark.parametrize("reach", [FAR_LEFT, Reach(min_x=0.95)])
+def test_a_skill_out_of_reach_is_not_served(
+    reach: Reach, skill: StoredSkill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "soldering.npz").write_bytes(skill.file)
+    settings = Settings(files=Files(state=str(tmp_path)), reach=reach)
+    with pytest.raises(SkillError, match=r"places of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: "):
+        load_skill(tmp_path / "soldering.npz", settings)
+    served = load_skill(tmp_path / "soldering.npz", Settings(files=Files(state=str(tmp_path))))
+    assert served.digest == skill.digest
+    assert caplog.text == ""

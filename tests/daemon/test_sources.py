@@ -12,7 +12,8 @@ import pytest
 
 from service.config import HandSettings, Settings
 from service.contract.incidents import explained
-from service.contract.messages import JointState, PoseStamped
+from service.contract.joint_states import JointStates
+from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import Cause
 from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
@@ -139,6 +140,36 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
             assert re.fullmatch(r"joint states come at \d\.\d Hz, 10 Hz at least needed", told.because)
             assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
     assert told.reason == "arm_not_ready"
+
+
+@pytest.mark.parametrize("rate_hz", [3, 5, 8])
+def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: int) -> None:
+    cell, told_of = Cell(skill), set()
+    for k in range(2500):
+        hands = [("left", pose(k + 1, LEFT)), ("right", pose(k + 1, RIGHT))]
+        cell.tell(("arm", joints(k + 1)), *hands * (k % (500 // rate_hz) == 0))
+        told = cell.status(k / 500)
+        if k > 1000 and told.reason == "stale_hand":
+            told_of.add(told.because)
+            for side in ("left", "right"):
+                assert re.search(rf"the {side} hand comes at \d\.\d Hz, 10 Hz at least needed", told.because)
+            assert told.remedy == "publish hands more often, or raise [hands] stale_ms"
+    assert told_of
+
+
+@pytest.mark.parametrize("named_twice", JOINT_NAMES)
+def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(skill: Skill, named_twice: str) -> None:
+    """With two positions it is nowhere: the arm would seem to have left its command."""
+    cell = Cell(skill)
+    for k in range(1, 100):
+        state = joints(k, (*POSTURE, 1.0), (*JOINT_NAMES, named_twice))
+        cell.tell(("arm", state), ("left", pose(k, LEFT)), ("right", pose(k, RIGHT)))
+        told = cell.status(k / 500)
+    assert (told.mode, told.reason) == ("hold", "arm_not_ready")
+    assert f"['{named_twice}'] named more than once among 8; one position each needed" in told.because
+    part = joints(1, POSTURE[:3], (*JOINT_NAMES[:2], JOINT_NAMES[1]))
+    with pytest.raises(WireError, match="named more than once among 3"):
+        JointStates(JOINT_NAMES, 0.1).take(part, 0.0)
 
 
 class Clock:

@@ -17,11 +17,13 @@ from typing import Any
 
 import pytest
 
-from service.client import RefusedError, UnreachableError
+from service.client import Client, RefusedError, UnreachableError, open_session
 from service.daemon.single_instance import Lock
 from service.daemon.supervised_thread import supervised
+from service.launch import free_port
 from service.recording.replay import replay
 from support.cell import Daemon, Tracker, serving, thirdhand
+from support.paths import ROOT
 
 SABOTAGE = """
 import pathlib
@@ -298,3 +300,27 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     points = [{"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)]
     points_in_force: list[dict[str, Any]] = daemon.client.ask("via_points", {"op": "add", "points": points})["points"]
     return points_in_force
+
+
+@pytest.mark.parametrize("streams", ["> /dev/full", "2> /dev/full", "> >(true)", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path: Path, streams: str) -> None:
+    (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = f"exec {sys.executable} -m service serve --arm assumed --config {tmp_path}/cell.toml --listen {endpoint}"
+    running = subprocess.Popen(
+        ["bash", "-c", f"{command} {streams}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        with open_session(connect=[endpoint], timeout_s=60.0) as session:
+            status = Client(session).wait_until_ready()
+            time.sleep(0.5)
+            assert (status.mode, Client(session).status().reason) == ("hold", "no_hands")
+        running.terminate()
+        said, _ = running.communicate(timeout=30)
+        assert running.returncode == 0, said
+        assert "Traceback" not in said
+        if streams == "> /dev/full":
+            assert f"listening on {endpoint} as cell thirdhand (standard output: No space left on device" in said
+    finally:
+        running.kill()
+        running.wait()

@@ -112,9 +112,9 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's box, ("),
         (
             add(point(tool=[0.2, 0.0, 0.3])),
-            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach, 0.35 to 0.88 m from the shoulder",
+            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach by 0.145 m: 0.35 to 0.88 m from the",
         ),
-        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach"),
+        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m"),
         (add(), "$.points: none given, 1 to 100 needed"),
         (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
         (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),

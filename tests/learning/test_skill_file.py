@@ -7,6 +7,7 @@ import pickle
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import msgspec
@@ -238,3 +239,14 @@ def test_a_skill_file_can_be_read_from_disk_as_bytes(tmp_path: Path, aimed: Skil
     file = tmp_path / "aimed.npz"
     file.write_bytes(aimed.file)
     assert decoded(file.read_bytes(), origin=str(file)).digest == aimed.digest
+
+
+def test_a_damaged_archive_is_told_from_what_never_was_one(skill: Skill) -> None:
+    random = Random(5)
+    for _ in range(30):
+        cut = skill.file[: random.randrange(4, len(skill.file))]
+        with pytest.raises(SkillError, match=r"^x: not a skill \(a damaged \.npz archive\)$"):
+            decoded(cut, origin="x")
+        for begin in (b"", b"P", b"PK", b"PK\x03", b"PK\x07\x08"):
+            with pytest.raises(SkillError, match=r"^x: not a skill \(no \.npz archive\)$"):
+                decoded(begin + bytes(random.randrange(256) for _ in range(200)), origin="x")

@@ -10,7 +10,7 @@ from typing import Any
 import zenoh
 
 from service.client import Client
-from service.config import Files, Settings
+from service.config import Files, Reach, Settings
 from service.contract import channels, requests
 from service.contract.records import Mode, Reason
 from service.core.frame import Event
@@ -28,11 +28,17 @@ class Cell:
     """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
 
     def __init__(
-        self, near: zenoh.Session, far: zenoh.Session, skill: Skill, skill_worker: SkillWorker, folder: Path
+        self,
+        near: zenoh.Session,
+        far: zenoh.Session,
+        skill: Skill,
+        skill_worker: SkillWorker,
+        folder: Path,
+        reach: Reach = Reach(),  # noqa: B008  # immutable
     ) -> None:
         (folder / "soldering.npz").write_bytes(skill.file)
         self.folder = folder
-        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")))
+        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")), reach=reach)
         self.taken: list[Event] = []
         self.notes: list[str] = []
         self.kept: list[bytes] = []

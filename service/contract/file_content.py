@@ -1,0 +1,32 @@
+"""The content of a file that a person or an earlier run names: never more than expected, and never
+a wait for what no file holds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.contract.explain import ExplainedError
+
+LARGEST_CONFIGURATION = 1_000_000  # bytes
+
+
+class UnusableError(ExplainedError, ValueError):
+    """A file that cannot be used; the message says why."""
+
+
+def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> bytes:
+    """The bytes of a regular file, or, where these are accepted, of a pipe.
+
+    Raises OSError, UnusableError.
+    """
+    size = path.stat().st_size
+    if not (path.is_file() or path.is_dir() or (accepts_pipes and path.is_fifo())):
+        raise UnusableError("it is not a file")
+    if path.is_file() and size > largest_bytes:
+        raise UnusableError(f"it has {size} bytes, at most {largest_bytes} accepted")
+    with path.open("rb") as file:
+        data = file.read(largest_bytes + 1)
+    if len(data) > largest_bytes:
+        raise UnusableError(f"it has more than {largest_bytes} bytes")
+    return data

@@ -1,0 +1,72 @@
+"""Tool positions out of the arm's reach, to which a skill or its via-points would lead."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from service.config import Settings, urdf_path
+from service.core.frame import Vector
+from service.core.skill.skill import clamp
+from service.described_arm import description
+from service.learning.skill_file import StoredSkill
+from service.reachable import workspace_of
+from service.urdf import Urdf
+
+REFUSED_SHARE = 0.5  # a skill is refused when a larger share of its places cannot be carried out
+RETAUGHT_M = 0.15  # [m] a task's via-point that is out of reach by less can be taught anew beside where it was learned
+NOTED_M = 0.0005  # [m] a target that is held back by less is within reach
+ANYWHERE = np.array([[-math.inf] * 3, [math.inf] * 3])  # [m] a box
+
+
+class OutOfReach(NamedTuple):
+    """The places of a skill that are out of the arm's reach, in words (empty: none), and whether
+    that are too many.
+    """
+
+    text: str
+    is_refused: bool
+
+
+def out_of_reach(skill: StoredSkill, distances_m: Vector, settings: Settings) -> OutOfReach:
+    """The verdict on a skill with the distances of its tool positions that `beyond_m` measures."""
+    number, total = int(np.count_nonzero(distances_m)), len(distances_m)
+    if not number:
+        return OutOfReach("", is_refused=False)
+    lost = np.count_nonzero(distances_m > (RETAUGHT_M if skill.model.names else 0.0))
+    is_refused = bool(lost > REFUSED_SHARE * total)
+    if is_refused:
+        remedy = "Learn a skill from demonstrations within reach; or move the arm, or change [reach] if it is wrong"
+    else:
+        remedy = "The tool stops at the edge of its reach there" + (
+            ": teach these places anew within reach (thirdhand via-points add)" * bool(skill.model.names)
+        )
+    return OutOfReach(
+        f"{number} of {total} places of the tool in skill {skill.name!r} are out of the arm's reach, the farthest by "
+        f"{distances_m.max():.3f} m: {accepted(settings)}. {remedy}",
+        is_refused,
+    )
+
+
+def accepted(settings: Settings) -> str:
+    """The reach in words."""
+    reach = settings.reach
+    centre = ", ".join(f"{value:g}" for value in reach.centre)
+    return (
+        f"{reach.inner:g} to {reach.outer:g} m from the shoulder ({centre}), x ≥ {reach.min_x:g} m and "
+        f"z ≥ {reach.min_z:g} m accepted, where the joints' limits allow it"
+    )
+
+
+def beyond_m(settings: Settings, positions: Vector) -> Vector:
+    """Distances (M,) [m] of positions (M, 3) from `[reach]`, in which targets are held, or, where
+    it is larger, from where the joints let the tool be; 0 within both.
+    """
+    joints, still = settings.joints, np.zeros(3)
+    held = [clamp(at, still, still, box=ANYWHERE, reach=settings.reach).position for at in positions]
+    chain = Urdf(description(urdf_path(settings), cover=False)).chain(settings.arm.plate)
+    workspace = workspace_of(chain, joints.lower, joints.upper, settings.tool.plate_from_tool)
+    distances = np.linalg.norm(positions - np.reshape(held, positions.shape), axis=1)
+    return np.maximum(np.where(distances > NOTED_M, distances, 0.0), workspace.beyond(positions))

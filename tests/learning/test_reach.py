@@ -1,0 +1,105 @@
+"""Tool positions out of reach: measured against `[reach]` and against what the joints allow."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.config import Reach, Settings, robot_description
+from service.core.arm.arm import Arm
+from service.core.skill.skill import is_reachable
+from service.learning.reach import beyond_m, out_of_reach
+from service.learning.skill_file import StoredSkill
+from service.shipped import ARMS, cell_of, shipped_skill
+from support.turning import sliding_cell
+
+WIDE = Reach(centre=(0.0, 0.0, 0.3), inner=0.01, outer=3.0, min_x=-1.0, min_z=-1.0)
+
+
+def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
+    cell = sliding_cell(folder) if arm == "sliding" else cell_of(arm)
+    return msgspec.structs.replace(cell, reach=reach)
+
+
+@pytest.mark.parametrize("arm", [*ARMS, "sliding"])
+def test_no_place_where_the_tool_can_be_is_out_of_reach_also_at_the_joints_limits(arm: str, tmp_path: Path) -> None:
+    cell = cell_with(arm, WIDE, tmp_path)
+    lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
+    random, forward = np.random.default_rng(7), Arm(cell, robot_description(cell))
+    shares = random.uniform(size=(1500, len(lower)))
+    shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)  # half of the joints at a limit
+    places = np.array([forward.at(q).position for q in lower + shares * (upper - lower)])
+    inside = np.array([is_reachable(place, WIDE) for place in places])
+    assert inside.mean() > 0.9
+    assert not beyond_m(cell, places[inside]).any()
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_place_that_no_posture_comes_near_is_out_of_reach_by_its_distance(arm: str, tmp_path: Path) -> None:
+    cell = cell_with(arm, WIDE, tmp_path)
+    shoulder, length = np.array(cell_of(arm).reach.centre), 1.0  # no shipped arm is longer
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        outward = random.normal(size=3)
+        outward /= np.linalg.norm(outward)
+        away_m = random.uniform(0.3, 0.8)
+        (found,) = beyond_m(cell, (shoulder + (length + away_m) * outward)[None])
+        assert away_m - 0.1 < found < away_m + 0.5  # an arm reaches less far in some directions
+
+
+def test_the_distance_from_a_configured_reach_is_exact() -> None:
+    reach = Settings().reach
+    centre = np.array(reach.centre)
+    cases = {
+        0.05: centre + np.array([reach.outer + 0.05, 0.0, 0.0]),
+        0.1: centre + np.array([reach.inner - 0.1, 0.0, 0.0]),
+        0.03: np.array([0.6, 0.0, reach.min_z - 0.03]),
+        0.0: np.array([0.6, 0.1, 0.3]),
+    }
+    assert beyond_m(Settings(), np.array(list(cases.values()))) == pytest.approx(list(cases), abs=1e-9)
+    assert beyond_m(Settings(), np.empty((0, 3))).shape == (0,)
+
+
+def test_the_joints_limits_narrow_a_reach_that_is_only_part_of_the_arms() -> None:
+    """Joints that turn by 0.6 rad only: the other side of the shell is out of reach."""
+    cell = cell_of("ur5")
+    posture = np.array(cell.arm.posture)
+    lower, upper = (tuple((posture + by).tolist()) for by in (-0.3, 0.3))
+    cell = msgspec.structs.replace(cell, joints=msgspec.structs.replace(cell.joints, lower=lower, upper=upper))
+    here = Arm(cell, robot_description(cell)).at(posture).position - cell.reach.centre
+    half_turn = np.array([-here[0], -here[1], here[2]]) + cell.reach.centre
+    reach = msgspec.structs.replace(cell.reach, min_x=-1.0)
+    found = beyond_m(msgspec.structs.replace(cell, reach=reach), np.array([here + cell.reach.centre, half_turn]))
+    assert found[0] == 0.0
+    assert 0.2 < found[1] < 2.0 * math.hypot(here[0], here[1])
+
+
+@pytest.mark.parametrize(
+    ("distances", "is_named", "is_refused"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), True, False),
+        ((0.4, 0.4, 0.0, 0.0), True, False),
+        ((0.4, 0.4, 0.4, 0.0), True, True),
+        ((0.1, 0.1, 0.1, 0.1), True, False),  # each of them can be taught anew where the arm is
+        ((0.1, 0.1, 0.1, 0.0), False, True),
+        ((0.1, 0.1, 0.0, 0.0), False, False),
+    ],
+)
+def test_a_skill_is_refused_when_most_of_its_places_cannot_be_reached(
+    skill: StoredSkill, distances: tuple[float, ...], is_named: bool, is_refused: bool
+) -> None:
+    """The via-points of a task have names, and may be taught anew."""
+    judged = shipped_skill() if is_named else skill
+    assert bool(judged.model.names) is is_named
+    found = out_of_reach(judged, np.array(distances), Settings())
+    assert found.is_refused is is_refused
+    number = sum(distance > 0.0 for distance in distances)
+    assert bool(found.text) is bool(number)
+    if number:
+        assert f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach" in found.text
+        assert f"the farthest by {max(distances):.3f} m" in found.text
+        assert ("Learn a skill" in found.text) is is_refused
