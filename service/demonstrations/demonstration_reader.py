@@ -22,7 +22,7 @@ from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
 from service.demonstrations.track import Track
-from service.demonstrations.track_check import LEAST_PIECE_S, LEAST_SAMPLES, Checked, checked, sound
+from service.demonstrations.track_check import LEAST_PIECE_S, Checked, checked, sound
 from service.demonstrations.track_clocks import by_one_clock
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
@@ -198,7 +198,7 @@ def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArra
     pieces = [
         piece
         for piece in np.split(stamps, cuts)
-        if not cuts or (len(piece) >= LEAST_SAMPLES and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
+        if not cuts or (len(piece) and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
     ]
     begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
     return np.concatenate(pieces) if pieces else stamps[:0], begins

@@ -19,6 +19,7 @@ RESEARCH = (
     "kmp/test_compiled.py::test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units",
     "recording/test_drawings.py::test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed",
     "recording/test_lagging_viewers.py",
+    "recording/test_track_sensitivity.py::test_each_constant_matters_and_none_is_better_halved_or_doubled",
     "sim/test_experiments.py::TestExperiments",
     "sim/test_experiments_run_the_service.py",
     "sim/test_faults.py",
