@@ -17,6 +17,7 @@ RESEARCH = (
     "daemon/test_survival.py::test_the_arm_is_stopped_and_files_are_closed_on[signals1]",
     "daemon/test_survival.py::test_the_arm_is_stopped_and_files_are_closed_on[signals2]",
     "kmp/test_compiled.py::test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units",
+    "learning/test_spoilt_staged_tasks.py",
     "recording/test_drawings.py::test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed",
     "recording/test_lagging_viewers.py",
     "recording/test_track_sensitivity.py::test_each_constant_matters_and_none_is_better_halved_or_doubled",
