@@ -31,6 +31,7 @@ from service.recording.mcap_reader import Messages, full_name, next_whole
 _STREAMS = tuple(ENDINGS.values())
 ENOUGH = 0.5  # a take is refused if less than this share of it can be learned from
 HARDLY_SEEN = 0.1  # a hand that is seen for a smaller share of a take is not one of those that conduct
+MOST_NAMED = 10  # stretches of a take
 UNUSUAL = 5.0  # a tool that is reported rarely is out of sight after as many times its usual interval
 
 
@@ -102,7 +103,7 @@ def read_demonstration(
         say(f"{path}: {fault}; {there} are there")
     one_clock = by_one_clock(found.tracks)
     tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
-    tracks = [_near(path, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
+    tracks = [_near(recorded, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
     remarks = [*found.guessed, *_none_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
@@ -172,7 +173,9 @@ class Seen(NamedTuple):
         stamps, begins = _left_in(tool.track.stamps_ns, rows)
         kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
         origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
-        bad = "; ".join(one.text(origin_ns) for one in sorted(named, key=lambda one: one.begin_ns))
+        named.sort(key=lambda one: one.begin_ns)
+        bad = "; ".join(one.text(origin_ns) for one in named[:MOST_NAMED])
+        bad += f"; and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
         if kept_s < ENOUGH * span_s:
             raise RecordingError(
                 f"{path}: {kept_s:.1f} of {span_s:.1f} s can be learned from, {ENOUGH:.0%} needed"
@@ -204,7 +207,7 @@ def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArra
     return np.concatenate(pieces) if pieces else stamps[:0], begins
 
 
-def _near(path: str | Path, track: Track, before: Track, hands: HandSettings) -> Track:
+def _near(recorded: Recorded, track: Track, before: Track, hands: HandSettings) -> Track:
     """The track with NaN for poses that are too far away. Raises RecordingError where all are;
     `before`: as published.
     """
@@ -212,7 +215,10 @@ def _near(path: str | Path, track: Track, before: Track, hands: HandSettings) ->
         is_far = np.linalg.norm(track.poses[:, :3], axis=1) > FARTHEST_M
     if len(is_far) and is_far.all():
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
-        raise RecordingError(f"{path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
+        if recorded.is_captured:
+            rule = "the unit that the file names counts, whatever [hands] unit says"
+            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that it names"
+        raise RecordingError(f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
     poses = track.poses.copy()
     poses[is_far] = np.nan
     return track._replace(poses=poses)

@@ -125,6 +125,29 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstr
             read_demonstration(motive(tmp_path / "b.csv", take, **wrong), settings=CAPTURE)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda rows: rows[:0], "holds no frame, 2 needed: export"),
+        (lambda rows: [[row[0], "inf", *row[2:]] for row in rows], "frame 1 of 20 is at inf s, up to 1e.09 s needed"),
+        (lambda rows: [[row[0], "nan", *row[2:]] for row in rows], "frame 1 of 20 is at nan s"),
+        (lambda rows: [row[:1] for row in rows], "frame 1 of 20 is at nan s"),
+        (lambda rows: [[row[0], f"{row[1]}e12", *row[2:]] for row in rows], "frame 2 of 20 is at .* s, up to"),
+        (lambda rows: rows[::-1], "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed"),
+        (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit that the file names"),
+    ],
+)
+def test_frames_of_motive_that_are_none_are_refused_with_what_to_do(
+    spoil: Callable[[list[list[str]]], list[list[str]]], words: str, take: Demonstration, tmp_path: Path
+) -> None:
+    path = motive(tmp_path / "a.csv", take)
+    rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    head = next(i for i, row in enumerate(rows) if row[0] == "Frame") + 1
+    path.write_text("\n".join(map(",".join, [*rows[:head], *spoil(rows[head : head + 20])])), encoding="utf-8")
+    with pytest.raises(RecordingError, match=words):
+        read_demonstration(path, settings=CAPTURE)
+
+
 def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path) -> None:
     file: Any = ezc3d.c3d()
     points = np.ones((4, 3, len(take.tool)))
