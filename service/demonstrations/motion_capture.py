@@ -18,6 +18,7 @@ UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "m": 1.0, "
 POSED = ("Rigid Body", "Bone", "Marker")  # of the types of columns; markers of a body are part of it
 COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(("Rotation", axis) for axis in "XYZW")
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
+BIG_ENDIAN = 86  # the processor that a C3D file names
 LATEST_S = 1e9  # a frame may be this long after the start of its take: 30 years
 
 Captured = dict[str, tuple[list[int], Vector]]
@@ -83,11 +84,22 @@ def read_c3d(path: Path) -> Captured:
     unit = str(units[0]).strip().lower() if units else ""
     if unit not in UNITS_M or not rate_hz > 0:
         raise RecordingError(f"{path}: unit {unit!r}, {rate_hz:g} Hz; m, cm or mm needed, and a rate above 0")
+    raw = path.read_bytes()
+    order = ">u2" if raw[512 * (raw[0] - 1) + 3] == BIG_ENDIAN else "<u2"
+    head = np.frombuffer(raw[:10], order)  # words 4 and 5 of a file number its first and last frame
+    announced = int(head[4]) - int(head[3]) + 1
+    if announced > points.shape[2]:
+        raise RecordingError(f"{path}: cut: {points.shape[2]} of {announced} frames are there; copy or export it again")
     stamps = _stamps(path, np.arange(points.shape[2]) / rate_hz)
     turned = np.tile(UNTURNED, (points.shape[2], 1))
+    names = [str(label).strip() for label in labels[: points.shape[1]]]
     return {
-        str(label).strip(): (stamps, np.hstack([UNITS_M[unit] * points[:3, i].T, turned]))
-        for i, label in enumerate(labels[: points.shape[1]])
+        # of two that have one name, none is it
+        f"{name} {names[:i].count(name) + 1}" if names.count(name) > 1 else name: (
+            stamps,
+            np.hstack([UNITS_M[unit] * points[:3, i].T, turned]),
+        )
+        for i, name in enumerate(names)
     }
 
 

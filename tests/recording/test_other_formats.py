@@ -167,6 +167,20 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
     assert one.conducts == "right"
 
 
+def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demonstration, tmp_path: Path) -> None:
+    for labels, words in ((list(NAMES.values()), "cut: .* of .* frames are there"), (["RightHand"] * 3, "RightHand 2")):
+        file: Any = ezc3d.c3d()
+        file["parameters"]["POINT"]["RATE"]["value"] = [50.0]
+        file["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
+        file["parameters"]["POINT"]["LABELS"]["value"] = labels
+        file["data"]["points"] = np.ones((4, 3, len(take.tool)))
+        file.write(str(tmp_path / "a.c3d"))
+        data = (tmp_path / "a.c3d").read_bytes()
+        (tmp_path / "a.c3d").write_bytes(data[: len(data) // 2] if "cut" in words else data)
+        with pytest.raises(RecordingError, match=words):
+            read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
+
+
 def lerobot(path: Path) -> None:
     (path / "meta").mkdir(parents=True)
     (path / "meta" / "info.json").write_text("{}")
