@@ -135,7 +135,7 @@ class Constrained(Immutable):
         for worst in np.flatnonzero(missed > _VIOLATION)[:1]:
             raise ValueError(
                 f"The constraints cannot be met together: {worst} is missed by {missed[worst]:.3g}. They contradict "
-                "each other, or the reference is too sure there: give it more variance, or fewer constraints."
+                "each other, or the reference's variance there is too small: give it more, or fewer constraints."
             )
         return frozen(weights(found))
 

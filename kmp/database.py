@@ -137,7 +137,7 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
         more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""
         warnings.warn(
             f"Via-points missed [unit of the outputs]: {', '.join(missed[:_NAMED])}{more}. Another point near in the "
-            "inputs asks for something else, or lambda is large: give the via-point less variance, "
+            "inputs requires another value, or lambda is large: give the via-point less variance, "
             "replace what is near by a larger tolerance, or take a larger ell.",
             ViaPointMissed,
             stacklevel=3,

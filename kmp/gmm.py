@@ -147,5 +147,8 @@ def mixture_of(
         with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
             found = estimator.fit(data)
         return GaussianMixture(found.weights_, found.means_, symmetric(found.covariances_))
-    except ValueError as error:
-        raise ValueError(f"samples: with regularization {added:g} no mixture was found: {error}") from None
+    except ValueError:  # a covariance that is not positive definite
+        raise ValueError(
+            f"samples: with regularization {added:g} no mixture of {components} components was found, as one of their "
+            "covariances is singular. Give a larger regularization, or fewer components."
+        ) from None

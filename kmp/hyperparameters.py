@@ -44,7 +44,7 @@ class Hyperparameters(Immutable):
             check_shape("prior_mean.matrix", prior_mean.matrix, outputs, inputs)
             matrix, offset = prior_mean.matrix, prior_mean.offset
             if kernel.period is not None and matrix.any():
-                raise ValueError("prior_mean: a slope given; what is the same again after each period has none.")
+                raise ValueError("prior_mean: a slope given, which no periodic motion has. Give an offset (O,) alone.")
         else:
             matrix = None
             offset = numbers("prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs)
@@ -53,7 +53,7 @@ class Hyperparameters(Immutable):
             own, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
             if not np.array_equal(rates := offset[values:], own) or np.any(of_rates):
                 raise ValueError(
-                    f"prior_mean: rates of {brief(rates)} given; the rate of the values' prior mean is {brief(own)}."
+                    f"prior_mean: rates of {brief(rates)} given, {brief(own)} needed: those of the values' prior mean."
                 )
         return cls(kernel, penalty, other, offset, matrix)
 

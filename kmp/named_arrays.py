@@ -77,7 +77,10 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> KMP:
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
-        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}.")
+        raise ValueError(
+            f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}: give all that "
+            "`named_arrays.to_arrays` returned."
+        )
     base = _base(arrays)
     changes = _changes(arrays, base.database)
     solution = base.adapted(changes) if len(changes.inputs) else base
@@ -91,9 +94,13 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> KMP:
 
 def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
     if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
-        raise ValueError(f"The primitive's arrays lack {', '.join(missing)}.")
+        raise ValueError(
+            f"The primitive's arrays lack {', '.join(missing)}: give all of {', '.join(_OF_CONSTRAINTS)}, or none."
+        )
     if not isinstance(solution, Dense):
-        raise ValueError("constraints: given for a low rank solution, a dense one needed.")
+        raise ValueError(
+            "constraints: given for a low rank solution, a dense one needed. Leave out the arrays of either."
+        )
     inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
     given = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
     return Constrained(solution, given)

@@ -18,7 +18,7 @@ _SMALL = 1500  # numbers N O up to which a look for the rank of several inputs c
 LARGE = 6000  # numbers N O above which the dense solution takes seconds and 300 MB
 _LOW_SMALL, _LOW = 0.2, 0.45  # rank over N C up to which the low rank solution is the faster one
 _RANK_AT_0, _RANK_PER_LENGTH = 8.0, 3.5  # rank = 8 + 3.5 range sqrt(ell) of one input, measured
-_ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever was asked for
+_ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever is required
 
 
 def solved(
@@ -44,7 +44,7 @@ def solved(
         off = solution.error_bounds.at_points
         warnings.warn(
             f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} was asked for: the mean at them may be off by up to {off:.2g} "
+            f"{tolerance:.2g} is required: the mean at them may be off by up to {off:.2g} "
             "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
             RankReached,
             stacklevel=3,

@@ -81,11 +81,13 @@ def load(path: str | Path) -> Stored:
     except Exception:  # what a damaged archive may raise is not documented, nor does it help who reads it
         arrays = {}
     if "kmp_format" not in arrays:
-        raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged.")
+        raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again.")
     if (given := arrays["kmp_format"].tolist()) != _FORMAT:
-        raise ValueError(f"{path}: format {brief(given)} given, {_FORMAT} needed.")
+        raise ValueError(f"{path}: format {brief(given)} given, {_FORMAT} needed. Load it with the kmp that wrote it.")
     if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
-        raise ValueError(f"{path}: the numbers are not those that were saved: their checksum is another.")
+        raise ValueError(
+            f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."
+        )
     try:
         value = from_arrays(arrays) if KIND in arrays else named_arrays.from_arrays(arrays)
         return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))

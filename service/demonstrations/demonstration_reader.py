@@ -22,7 +22,7 @@ from service.core.intake.far_away import too_far
 from service.core.intake.intake import FARTHEST_M, UNIT_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
 from service.demonstrations.track import Track
-from service.demonstrations.track_check import LEAST_PIECE_S, LEAST_SAMPLES, Checked, checked, sound
+from service.demonstrations.track_check import LEAST_PIECE_S, Checked, checked, sound
 from service.demonstrations.track_clocks import by_one_clock
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile, RecordingError, ends_early, existing
@@ -31,6 +31,7 @@ from service.recording.mcap_reader import Messages, full_name, next_whole
 _STREAMS = tuple(ENDINGS.values())
 ENOUGH = 0.5  # a take is refused if less than this share of it can be learned from
 HARDLY_SEEN = 0.1  # a hand that is seen for a smaller share of a take is not one of those that conduct
+MOST_NAMED = 10  # stretches of a take
 UNUSUAL = 5.0  # a tool that is reported rarely is out of sight after as many times its usual interval
 
 
@@ -102,7 +103,7 @@ def read_demonstration(
         say(f"{path}: {fault}; {there} are there")
     one_clock = by_one_clock(found.tracks)
     tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
-    tracks = [_near(path, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
+    tracks = [_near(recorded, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
     remarks = [*found.guessed, *_none_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
@@ -172,7 +173,9 @@ class Seen(NamedTuple):
         stamps, begins = _left_in(tool.track.stamps_ns, rows)
         kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
         origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
-        bad = "; ".join(one.text(origin_ns) for one in sorted(named, key=lambda one: one.begin_ns))
+        named.sort(key=lambda one: one.begin_ns)
+        bad = "; ".join(one.text(origin_ns) for one in named[:MOST_NAMED])
+        bad += f"; and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
         if kept_s < ENOUGH * span_s:
             raise RecordingError(
                 f"{path}: {kept_s:.1f} of {span_s:.1f} s can be learned from, {ENOUGH:.0%} needed"
@@ -198,13 +201,13 @@ def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArra
     pieces = [
         piece
         for piece in np.split(stamps, cuts)
-        if not cuts or (len(piece) >= LEAST_SAMPLES and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
+        if not cuts or (len(piece) and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
     ]
     begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
     return np.concatenate(pieces) if pieces else stamps[:0], begins
 
 
-def _near(path: str | Path, track: Track, before: Track, hands: HandSettings) -> Track:
+def _near(recorded: Recorded, track: Track, before: Track, hands: HandSettings) -> Track:
     """The track with NaN for poses that are too far away. Raises RecordingError where all are;
     `before`: as published.
     """
@@ -212,7 +215,10 @@ def _near(path: str | Path, track: Track, before: Track, hands: HandSettings) ->
         is_far = np.linalg.norm(track.poses[:, :3], axis=1) > FARTHEST_M
     if len(is_far) and is_far.all():
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
-        raise RecordingError(f"{path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
+        if recorded.is_captured:
+            rule = "the unit that the file names counts, whatever [hands] unit says"
+            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that it names"
+        raise RecordingError(f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
     poses = track.poses.copy()
     poses[is_far] = np.nan
     return track._replace(poses=poses)

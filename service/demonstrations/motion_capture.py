@@ -19,6 +19,8 @@ UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "m": 1.0, "
 POSED = ("Rigid Body", "Bone", "Marker")  # of the types of columns; markers of a body are part of it
 COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(("Rotation", axis) for axis in "XYZW")
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
+BIG_ENDIAN = 86  # the processor that a C3D file names
+LATEST_S = 1e9  # a frame may be this long after the start of its take: 30 years
 
 Captured = dict[str, tuple[list[int], Vector]]
 """Stamps (N,) [ns] and poses (N, 7) [m] by the name of a body or marker; NaN: it is not seen."""
@@ -52,14 +54,13 @@ def read_motive(path: Path) -> Captured:
     for i, head in enumerate(zip(types, names, rows[axes_at - 1], rows[axes_at], strict=False)):
         if head[0] in POSED and head[2:] in COLUMNS:
             columns.setdefault(head[1], {})[head[2:]] = i
-    stamps, out = [], Captured()
     table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
     for values, row in zip(table, rows[axes_at + 1 :], strict=True):
         try:
             values[: len(row)] = [float(cell) if cell else np.nan for cell in row[: len(values)]]
-            stamps.append(round(1e9 * values[1]))
         except ValueError as error:
             raise RecordingError(f"{path}: frame {row[0]}: {error}; numbers and empty cells needed") from None
+    stamps, out = _stamps(path, table[:, 1]), Captured()
     for name, found in columns.items():
         if all(one in found for one in COLUMNS[:3]):
             poses = np.tile([np.nan] * 3 + list(UNTURNED), (len(table), 1))
@@ -82,11 +83,40 @@ def read_c3d(path: Path) -> Captured:
     except Exception as error:  # the library raises exceptions of many kinds
         raise RecordingError(f"{path} is not a C3D file that can be read: {in_words(error, named=False)}") from None
     unit = str(units[0]).strip().lower() if units else ""
-    if unit not in UNITS_M or rate_hz <= 0:
+    if unit not in UNITS_M or not rate_hz > 0:
         raise RecordingError(f"{path}: unit {unit!r}, {rate_hz:g} Hz; m, cm or mm needed, and a rate above 0")
-    stamps = np.round(np.arange(points.shape[2]) * 1e9 / rate_hz).astype(np.int64).tolist()
+    raw = path.read_bytes()
+    order = ">u2" if raw[512 * (raw[0] - 1) + 3] == BIG_ENDIAN else "<u2"
+    head = np.frombuffer(raw[:10], order)  # words 4 and 5 of a file number its first and last frame
+    announced = int(head[4]) - int(head[3]) + 1
+    if announced > points.shape[2]:
+        raise RecordingError(f"{path}: cut: {points.shape[2]} of {announced} frames are there; copy or export it again")
+    stamps = _stamps(path, np.arange(points.shape[2]) / rate_hz)
     turned = np.tile(UNTURNED, (points.shape[2], 1))
+    names = [str(label).strip() for label in labels[: points.shape[1]]]
     return {
-        str(label).strip(): (stamps, np.hstack([UNITS_M[unit] * points[:3, i].T, turned]))
-        for i, label in enumerate(labels[: points.shape[1]])
+        # of two that have one name, none is it
+        f"{name} {names[:i].count(name) + 1}" if names.count(name) > 1 else name: (
+            stamps,
+            np.hstack([UNITS_M[unit] * points[:3, i].T, turned]),
+        )
+        for i, name in enumerate(names)
     }
+
+
+def _stamps(path: Path, seconds: Vector) -> list[int]:
+    """Stamps [ns] of the times (N,) [s] of a take's frames. Raises RecordingError."""
+    if not len(seconds):
+        raise RecordingError(f"{path} holds no frame, 2 needed: export the take again, over all its frames")
+    for i in np.flatnonzero(~(np.abs(seconds) <= LATEST_S))[:1]:
+        raise RecordingError(
+            f"{path}: frame {i + 1} of {len(seconds)} is at {seconds[i]:g} s, up to {LATEST_S:g} s needed: export the "
+            "take again"
+        )
+    for i in np.flatnonzero(np.diff(seconds) < 0)[:1]:
+        raise RecordingError(
+            f"{path}: frame {i + 2} of {len(seconds)} is at {seconds[i + 1]:g} s, and the one before at "
+            f"{seconds[i]:g} s; times that grow needed: export the take again"
+        )
+    stamps: list[int] = np.round(1e9 * seconds).astype(np.int64).tolist()
+    return stamps

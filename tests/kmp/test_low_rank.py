@@ -309,7 +309,7 @@ def test_what_the_low_rank_would_lose_in_rounding_is_solved_densely():
 def test_a_rank_that_is_reached_is_said_and_the_error_is_within_the_bound_that_is_said(rank):
     inputs, reference = tube(0, 300)
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
-    says = rf"rank: {rank} features leave up to .* 4e-12 was asked .* Raise the rank"
+    says = rf"rank: {rank} features leave up to .* 4e-12 is required: .* Raise the rank"
     with pytest.warns(RankReached, match=says) as said:
         low = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank)
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()

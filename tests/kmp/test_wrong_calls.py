@@ -1,7 +1,7 @@
 """Every public call of the package, given what is wrong in each of its arguments, one at a time.
 
-It ends in a ValueError that names the argument, in words that are not NumPy's. What may be legal,
-such as huge numbers, may work instead.
+It ends in a ValueError that names the argument and what is accepted, in words that are not
+NumPy's. What may be legal, such as huge numbers, may work instead.
 """
 
 import inspect
@@ -194,6 +194,8 @@ NUMPYS = re.compile(
     "core dimension|concatenat|index|iterable|has no attr|unsupported|convert|stack|Object arrays|not callable"
 )
 
+ACCEPTED = re.compile(r"\b(needed|needs?|must|enough|[Gg]ive|[Dd]ivide|[Ff]it|takes?|[Ss]ave)\b")
+
 
 def wrong_arrays(array):
     """What is no array of this shape, and what may be one that works."""
@@ -282,6 +284,8 @@ def fault(function, name, right, value, must_fail):
             return f"{what} does not name it: {said[:150]}"
         if len(said) > LONGEST:
             return f"{what} says {len(said)} characters: {said[:150]}"
+        if not ACCEPTED.search(said):
+            return f"{what} does not say what is accepted: {said[:150]}"
         return f"{what} speaks NumPy: {said[:150]}" if NUMPYS.search(said) else None
     except OSError:
         return None if name == "path" else f"{what} ends in an OSError"

@@ -125,6 +125,29 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstr
             read_demonstration(motive(tmp_path / "b.csv", take, **wrong), settings=CAPTURE)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda rows: rows[:0], "holds no frame, 2 needed: export"),
+        (lambda rows: [[row[0], "inf", *row[2:]] for row in rows], "frame 1 of 20 is at inf s, up to 1e.09 s needed"),
+        (lambda rows: [[row[0], "nan", *row[2:]] for row in rows], "frame 1 of 20 is at nan s"),
+        (lambda rows: [row[:1] for row in rows], "frame 1 of 20 is at nan s"),
+        (lambda rows: [[row[0], f"{row[1]}e12", *row[2:]] for row in rows], "frame 2 of 20 is at .* s, up to"),
+        (lambda rows: rows[::-1], "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed"),
+        (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit that the file names"),
+    ],
+)
+def test_frames_of_motive_that_are_none_are_refused_with_what_to_do(
+    spoil: Callable[[list[list[str]]], list[list[str]]], words: str, take: Demonstration, tmp_path: Path
+) -> None:
+    path = motive(tmp_path / "a.csv", take)
+    rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    head = next(i for i, row in enumerate(rows) if row[0] == "Frame") + 1
+    path.write_text("\n".join(map(",".join, [*rows[:head], *spoil(rows[head : head + 20])])), encoding="utf-8")
+    with pytest.raises(RecordingError, match=words):
+        read_demonstration(path, settings=CAPTURE)
+
+
 def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path) -> None:
     file: Any = ezc3d.c3d()
     points = np.ones((4, 3, len(take.tool)))
@@ -142,6 +165,20 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
     np.testing.assert_allclose(got.tool[:, 3:], np.tile([0.0, 0.0, 0.0, 1.0], (len(take.tool), 1)))
     one = read_demonstration(tmp_path / "a.c3d", settings=CAPTURE, topics={"left": PoseTopic("RightHand")})
     assert one.conducts == "right"
+
+
+def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demonstration, tmp_path: Path) -> None:
+    for labels, words in ((list(NAMES.values()), "cut: .* of .* frames are there"), (["RightHand"] * 3, "RightHand 2")):
+        file: Any = ezc3d.c3d()
+        file["parameters"]["POINT"]["RATE"]["value"] = [50.0]
+        file["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
+        file["parameters"]["POINT"]["LABELS"]["value"] = labels
+        file["data"]["points"] = np.ones((4, 3, len(take.tool)))
+        file.write(str(tmp_path / "a.c3d"))
+        data = (tmp_path / "a.c3d").read_bytes()
+        (tmp_path / "a.c3d").write_bytes(data[: len(data) // 2] if "cut" in words else data)
+        with pytest.raises(RecordingError, match=words):
+            read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
 
 
 def lerobot(path: Path) -> None:

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from service.contract import cdr
-from service.contract.channels import POSE
+from service.contract.channels import POSE, STRING
 from service.contract.messages import BASE, PoseStamped
+from service.contract.requests import ViaPoint, encode_json
+from service.demonstrations.pose_streams import PLACES
 from service.learning.demonstration import Demonstration
 from service.recording.mcap_file import McapFile
 
@@ -38,8 +40,10 @@ def streams_of(take: Demonstration, *, delay_s: float = 0.004) -> Streams:
     return {name: Stream(stamps.copy(), logged.copy(), np.array(getattr(take, name))) for name in KEYS}
 
 
-def write_streams(path: Path, streams: Mapping[str, Stream], cell: str = "cell") -> Path:
-    """A file of these streams, in the order of recording."""
+def write_streams(
+    path: Path, streams: Mapping[str, Stream], cell: str = "cell", *, places: tuple[ViaPoint, ...] = ()
+) -> Path:
+    """A file of these streams, in the order of recording, which names these places."""
     rows = sorted(
         (int(stream.logged_ns[i]), name, i) for name, stream in streams.items() for i in range(len(stream.poses))
     )
@@ -48,6 +52,9 @@ def write_streams(path: Path, streams: Mapping[str, Stream], cell: str = "cell")
             row = streams[name].poses[i].tolist()
             pose = PoseStamped(int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:]))
             file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
+        if places:
+            text = encode_json(places).decode()
+            file.put(f"{cell}/{PLACES}", STRING.type, cdr.encode_string(text), rows[0][0], 0)
     return path
 
 
@@ -59,6 +66,33 @@ def jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Genera
     """The track is elsewhere, and moves there as it did."""
     way = random.normal(size=3)
     _moved(streams, name, mask, random.uniform(0.25, 0.8) * way / np.linalg.norm(way))
+
+
+def small_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The track is elsewhere by what a fast hand moves in a few samples."""
+    way = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.06, 0.25) * way / np.linalg.norm(way))
+
+
+def lasting_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The same, and it stays there to the end."""
+    end = np.arange(len(mask)) >= len(mask) - int(mask.sum())
+    small_jump(streams, name, end, random)
+
+
+def slight_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The track is elsewhere by less than the daemon takes for a jump."""
+    way = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.02, 0.03) * way / np.linalg.norm(way))
+
+
+def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+    """The track is elsewhere behind a few samples that are lacking, and returns likewise."""
+    way, rows, seconds = random.normal(size=3), np.flatnonzero(mask), streams[name].stamps_ns / 1e9
+    _moved(streams, name, mask, random.uniform(0.1, 0.5) * way / np.linalg.norm(way))
+    since = seconds[:, None] - seconds[rows[[0, -1]]]
+    lacking = ((since >= 0.0) & (since < random.uniform(0.03, 0.09))).any(axis=1)
+    streams[name] = Stream(*(part[~lacking] for part in streams[name]))
 
 
 def spikes(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
@@ -111,3 +145,5 @@ def two_sources(streams: Streams, name: str, mask: np.ndarray, random: np.random
 
 
 SPOILS: tuple[Spoil, ...] = (jump, spikes, nans, far, zeros, origin, freeze, gap, swap, two_sources)
+SUBTLE: tuple[Spoil, ...] = (small_jump, lasting_jump, slight_jump, dropout)
+"""Kinds of which some cannot be told from what a hand does."""
