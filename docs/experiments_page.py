@@ -1,0 +1,125 @@
+"""`python docs/experiments_page.py` writes the figures of the experiments into experiments.md,
+faults.md and the README, from recordings/experiments, and marks those that are stale.
+
+The text is in the templates `*.md.jinja` beside this file. A number there is an expression of a
+result, as `{{ phase.tremor_mm | fixed(1) }}`; an expression without a result is an error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from sim.experiments.evidence import EXPERIMENTS, RESULTS, result_of, staleness, tree
+from sim.experiments.moving_hands import MOST_LATE_S, UNSEEN_S
+
+HERE = Path(__file__).parent
+WIDTH = 100
+WORDS = dict(
+    enumerate(["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"], 1)
+)
+BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTALL)  # of the README
+
+
+def pages() -> dict[Path, str]:
+    """The texts of the pages, by their files."""
+    results = {name: result_of(RESULTS, name) or {} for name in EXPERIMENTS}
+    found = templates(results, tree())
+    whole = {
+        HERE / name: wrapped(found.get_template(f"{name}.jinja").render()) for name in ("experiments.md", "faults.md")
+    }
+    readme = HERE.parent / "README.md"
+    block = wrapped(found.get_template("readme-evidence.md.jinja").render())
+    return whole | {readme: BLOCK.sub(lambda _: block, readme.read_text(encoding="utf-8"))}
+
+
+def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) -> jinja2.Environment:
+    """The templates of a tree with these digests, with the results as variables:
+    `motion_of_others` is motion-of-others.json.
+    """
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HERE), undefined=jinja2.StrictUndefined, line_statement_prefix="%%"
+    )
+    stale = {name for name, result in results.items() if staleness(name, result, here)}
+
+    def at_six(method: str) -> dict[str, Any]:
+        """What a method costs with six inputs."""
+        rows = results["promp"]["dimensions"]
+        return next(row for row in rows if (row["method"], row["inputs"]) == (method, 6))
+
+    def table_miss(who: str) -> float:
+        """The largest miss of a point [cm] by a method of Table I."""
+        rows = [results["table"][letters][who] for letters in ("modelled", "recorded")]
+        return max(row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end"))
+
+    def commit(name: str) -> str:
+        return str(results[name].get("commit", "an unknown commit"))
+
+    def version(*names: str) -> str:
+        """The commit of some results, by which each is marked if it is stale."""
+        cells = [f"**stale**: {commit(name)}" if name in stale else f"`{commit(name)}`" for name in names]
+        return "; ".join(dict.fromkeys(cells))
+
+    def stale_line(*names: str) -> str:
+        """Names what was measured with an earlier version; nothing if none was."""
+        at: dict[str, list[str]] = {}
+        for name in sorted(stale.intersection(names)):
+            at.setdefault(commit(name), []).append(f"`{name}`")
+        said = "; ".join(f"{', '.join(old)} at {where}" for where, old in at.items())
+        return f"*Measured with an earlier version: {said}.*" if at else ""
+
+    found.globals |= {name.replace("-", "_"): result for name, result in results.items()}
+    found.globals |= {
+        "at_six": at_six,
+        "table_miss": table_miss,
+        "version": version,
+        "stale": stale_line,
+        "late_ms": round(1000 * MOST_LATE_S),
+    }
+    found.globals["unseen_ms"] = [round(1000 * each) for each in UNSEEN_S]
+    found.filters |= {
+        "fixed": lambda value, digits=0: f"{value:.{digits}f}",
+        "percent": lambda value, digits=0: f"{100 * value:.{digits}f}",
+        "up": lambda value, digits: f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.{digits}f}",
+        "significant": significant,
+        "thousands": lambda value: f"{value:,}".replace(",", " "),
+        "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
+        "cell": lambda value: "-" if value is None else f"{value:.0f}",
+        "word": lambda value: WORDS.get(value, str(value)),
+    }
+    return found
+
+
+def significant(value: float, digits: int) -> str:
+    """A number with so many significant digits."""
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def wrapped(text: str) -> str:
+    """A page with paragraphs and points as wide as a line, a blank line around each, and other
+    lines as they are. A paragraph follows its picture at once.
+    """
+    parts = re.split(r"\n\s*\n|\n(?=[*|] |\|-|!\[|#|<!--)|(?<=\.png\))\n|(?<=\|)\n", text.strip())
+    out, before = [], ""
+    for part in filter(None, (" ".join(part.split()) for part in parts)):
+        kind = next((kind for kind in ("|", "* ", "#", "![", "<!--") if part.startswith(kind)), "")
+        close = (before, kind) in {("|", "|"), ("* ", "* "), ("![", "")}
+        out.append("\n" * bool(out) + "\n" * (bool(out) and not close))
+        out.append(part if kind not in ("", "* ") else _filled(part, "  " * bool(kind)))
+        before = kind
+    return "".join(out) + "\n"
+
+
+def _filled(text: str, indent: str) -> str:
+    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
