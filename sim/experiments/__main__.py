@@ -123,6 +123,10 @@ def redraw(results: Results, experiment: ModuleType) -> None:
 
 def make(results: Results, experiment: ModuleType, options: Options) -> None:
     """Runs an experiment and writes its result. Raises one of FAILURES."""
+    known = (result_of(results.folder, results.name) or {}).get("options", {})
+    for one, value in known.items():
+        if isinstance(value, dict) and getattr(options, one) is None:
+            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{one} DIR again")
     began, results.origin = time.monotonic(), origin(results.name, options)
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)

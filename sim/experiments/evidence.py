@@ -31,7 +31,7 @@ from sim.experiments.seeds import BY_EXPERIMENT
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "recordings" / "experiments"
-CODE = ("kmp", "service", "sim", "recordings", "pyproject.toml", ":!recordings/experiments/*.json", ":!*.png", ":!*.md")
+CODE = ("kmp", "service", "sim", "pyproject.toml", "recordings/*.npz", "recordings/people", "recordings/golden.mcap")
 MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
 DECIMALS = 6  # of kmp's outputs: what CPUs agree on
 

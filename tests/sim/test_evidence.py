@@ -217,6 +217,18 @@ class TestAll:
         assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
         assert [runs[name] for name in ("letters", "promp", "table")] == [2, 1, 1]
 
+    def test_keeps_a_result_of_recordings_that_are_not_given_again(
+        self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        recorded, results = tmp_path / "recorded", tmp_path / "results"
+        recorded.mkdir()
+        assert main(["table", "--output", str(results), "--letters", str(recorded), "--quiet"]) == 0
+        before = (results / "table.json").read_text()
+        assert main(["table", "--output", str(results), "--quiet"]) == 1
+        assert "name them by --letters DIR again" in capsys.readouterr().err
+        assert (results / "table.json").read_text() == before
+        assert runs["table"] == 1
+
     def test_a_file_that_is_no_result_is_named(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "letters.json").write_text("{")
         assert main(["stale", "--output", str(tmp_path)]) == 1
