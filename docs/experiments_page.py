@@ -1,8 +1,9 @@
-"""`python docs/experiments_page.py` writes the figures of the experiments into experiments.md,
-faults.md and the README, from recordings/experiments, and marks those that are stale.
+"""`python docs/experiments_page.py` writes the figures of the experiments from
+recordings/experiments: experiments.md from its template, experiments.md.jinja; in the README and
+faults.md what stands between `<!-- evidence -->` marks, and the last cells of the table of faults.
 
-The text is in the templates `*.md.jinja` beside this file. A number there is an expression of a
-result, as `{{ phase.tremor_mm | fixed(1) }}`; an expression without a result is an error.
+A number of a template is an expression of a result, as `{{ phase.tremor_mm | fixed(1) }}`; without
+that result it is an error. What was measured with another version is marked as stale.
 """
 
 from __future__ import annotations
@@ -24,19 +25,41 @@ WIDTH = 100
 WORDS = dict(
     enumerate(["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"], 1)
 )
-BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTALL)  # of the README
+BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTALL)
+BLOCKS = {  # templates of a paragraph in a page
+    "README.md": """{{ stale("people") }}
+With modelled people who did not demonstrate it, the soldering task succeeds in
+{{ people.methods.ours.success.mean | percent }} % of the scenes, in
+{{ people.methods.ours.success_on_the_way.mean | percent }} on the path that a teacher would have
+taken. A table of taught places alone succeeds in {{ people.methods.look_up.success.mean | percent }},
+but {{ share(people.methods.look_up.success_on_the_way.mean) }} on that path.
+[docs/experiments.md](docs/experiments.md) has all results, and how they were measured.""",
+    "docs/faults.md": """{{ stale("faults") }}
+In that run, {{ faults.unaccounted_ticks }} ticks were lost without a mark, and
+{{ faults.unasked_faults }} faults of the service occurred that nobody had caused.""",
+}
 
 
 def pages() -> dict[Path, str]:
     """The texts of the pages, by their files."""
     results = {name: result_of(RESULTS, name) or {} for name in EXPERIMENTS}
     found = templates(results, tree())
-    whole = {
-        HERE / name: wrapped(found.get_template(f"{name}.jinja").render()) for name in ("experiments.md", "faults.md")
-    }
-    readme = HERE.parent / "README.md"
-    block = wrapped(found.get_template("readme-evidence.md.jinja").render())
-    return whole | {readme: BLOCK.sub(lambda _: block, readme.read_text(encoding="utf-8"))}
+    texts = {HERE / "experiments.md": wrapped(found.get_template("experiments.md.jinja").render())}
+    for name, template in BLOCKS.items():
+        path, paragraph = HERE.parent / name, wrapped(found.from_string(template).render())
+        texts[path] = BLOCK.sub(lambda _, text=paragraph: text, path.read_text(encoding="utf-8"))
+    texts[HERE / "faults.md"] = with_figures(texts[HERE / "faults.md"], results["faults"]["faults"])
+    return texts
+
+
+def with_figures(page: str, faults: Mapping[str, Mapping[str, Any]]) -> str:
+    """A page whose rows of faults end with what was measured of each."""
+    for name, one in faults.items():
+        values = (one.get(key) for key in ("hold_ms", "rest_ms", "travelled_mm", "lost_ticks"))
+        cells = " | ".join("-" if value is None else f"{value:.0f}" for value in values)
+        row = rf"^(\| {re.escape(name)} \| [^|]+ \|)(?: [^|]+ \|){{4}}$"
+        page = re.sub(row, rf"\1 {cells} |", page, flags=re.MULTILINE)
+    return page
 
 
 def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) -> jinja2.Environment:
@@ -58,6 +81,10 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         rows = [results["table"][letters][who] for letters in ("modelled", "recorded")]
         return max(row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end"))
 
+    def share(value: float) -> str:
+        """In which share of the scenes something happens."""
+        return f"in {100 * value:.0f} %" if value else "never"
+
     def commit(name: str) -> str:
         return str(results[name].get("commit", "an unknown commit"))
 
@@ -78,6 +105,7 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     found.globals |= {
         "at_six": at_six,
         "table_miss": table_miss,
+        "share": share,
         "version": version,
         "stale": stale_line,
         "late_ms": round(1000 * MOST_LATE_S),
@@ -90,7 +118,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         "significant": significant,
         "thousands": lambda value: f"{value:,}".replace(",", " "),
         "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
-        "cell": lambda value: "-" if value is None else f"{value:.0f}",
         "word": lambda value: WORDS.get(value, str(value)),
     }
     return found
