@@ -82,7 +82,7 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         return max(row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end"))
 
     def share(value: float) -> str:
-        """In which share of the scenes something happens."""
+        """A share of the scenes, in words."""
         return f"in {100 * value:.0f} %" if value else "never"
 
     def commit(name: str) -> str:

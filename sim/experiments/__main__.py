@@ -156,10 +156,10 @@ def main(arguments: list[str] | None = None) -> int:
         pyplot()  # what is missing is said now, not after an hour
         here = tree() if args.name == "all" and not args.anew and not args.redraw else None
         for name, one in wanted.items():
-            if here is not None and not staleness(name, result_of(args.output, name), here, one):
-                print(f"{args.output / name}.json  belongs to this tree", flush=True)
-                continue
             try:
+                if here is not None and not staleness(name, result_of(args.output, name), here, one):
+                    print(f"{args.output / name}.json  belongs to this tree", flush=True)
+                    continue
                 results = Results(args.output, name, said=not args.quiet)
                 experiment = importlib.import_module(f"sim.experiments.{name.removesuffix(OF_OTHERS)}")
                 redraw(results, experiment) if args.redraw else make(results, experiment, one)

@@ -192,7 +192,7 @@ def _folder(folder: Path) -> dict[str, Any]:
 
 
 def staleness(name: str, result: Mapping[str, Any] | None, here: Mapping[str, str], options: Options = USUAL) -> str:
-    """Why a result is not that of a tree with these digests and of these options; empty if it is.
+    """The reason why a result is not that of these digests and options; empty if it is.
 
     A folder that the options do not name may have been any.
     """

@@ -29,7 +29,7 @@ class Stream(NamedTuple):
         return self.numbers[: max(least, round(len(self.numbers) * share))]
 
     def overlaps(self, other: Stream) -> bool:
-        """Whether something is drawn in both."""
+        """True if something is drawn in both."""
         return self[:2] == other[:2] and not set(self.numbers).isdisjoint(other.numbers)
 
     def __str__(self) -> str:

@@ -242,7 +242,12 @@ class TestAll:
         assert (results / "table.json").read_text() == before
         assert runs["table"] == 1
 
-    def test_a_file_that_is_no_result_is_named(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_file_that_is_no_result_is_named_and_the_others_are_made(
+        self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        runs["error"] = None
         (tmp_path / "letters.json").write_text("{")
-        assert main(["stale", "--output", str(tmp_path)]) == 1
-        assert f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
+        for command in ("stale", "all"):
+            assert main([command, "--output", str(tmp_path), "--quiet"]) == 1
+            assert f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
+        assert [runs[name] for name in ("letters", "promp", "table")] == [0, 1, 1]
