@@ -49,7 +49,10 @@ def parser() -> argparse.ArgumentParser:
         help="one of the above; all: those whose results in DIR are missing or stale; stale: list these",
     )
     p.add_argument(
-        "--output", metavar="DIR", type=Path, help=f"folder of the results (stale: {RESULTS.name} as shipped)"
+        "--output",
+        metavar="DIR",
+        type=Path,
+        help="folder of the results (for stale: recordings/experiments by default)",
     )
     p.add_argument(
         "--letters",
