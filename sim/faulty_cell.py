@@ -88,7 +88,7 @@ class _Arm:
     def _run(self) -> None:
         before_others()
         with (
-            Bench(HandScript(Scene(), seed=1), settings=self.settings) as bench,
+            Bench(HandScript(Scene(), seed=Scene().seed), settings=self.settings) as bench,
             open_session(connect=[self.endpoint]) as session,
             contextlib.closing(Bridge(session, Live(cell=CELL), bench.joint_names)) as bridge,
         ):

@@ -84,7 +84,7 @@ def track(endpoint: str) -> None:
 
     signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
     signal.signal(signal.SIGUSR2, set_the_clock)
-    script, sides = HandScript(Scene(), seed=1), ("left", "right")
+    script, sides = HandScript(Scene(), seed=Scene().seed), ("left", "right")
     with open_session(connect=[endpoint]) as session:
         publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
         clock, payloads = Deadlines(HANDS_HZ), [b"", b""]

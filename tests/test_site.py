@@ -9,10 +9,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+import jinja2
 import pytest
 
 import kmp
+from sim.experiments.evidence import EXPERIMENTS
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -20,14 +24,19 @@ PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
-def written_by(name: str) -> str:
-    """What a program of the documentation writes."""
+def program(name: str) -> ModuleType:
+    """A program of the documentation."""
     spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return str(module.page())
+    return module
+
+
+def written_by(name: str) -> str:
+    """The page that a program of the documentation writes."""
+    return str(program(name).page())
 
 
 def test_the_page_on_settings_is_that_of_the_settings() -> None:
@@ -41,6 +50,33 @@ def test_the_page_on_the_library_is_that_of_its_docstrings_and_tells_all_that_it
     assert set(kmp.__all__) <= set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
     for called in ("KMP.predict(queries)", "KMP.plot(", "LocalKMP.placed(frames)", "Gaussians.product(*others)"):
         assert called in written
+
+
+def test_the_figures_of_the_experiments_are_those_of_the_results_and_marked_where_they_are_stale() -> None:
+    for page, text in program("experiments_page").pages().items():
+        assert page.read_text(encoding="utf-8") == text, "run `python docs/experiments_page.py`"
+
+
+def test_a_figure_without_a_result_and_a_stale_result_do_not_go_unseen() -> None:
+    page = program("experiments_page")
+    options = {"share": 1.0, "arm": "wam", "set": "test"}
+    results: dict[str, dict[str, Any]] = {
+        name: {"depends_on": dict.fromkeys(one.depends_on, "a"), "options": options, "commit": "1234+"}
+        for name, one in EXPERIMENTS.items()
+    }
+    results["motion"]["depends_on"] |= {"kmp": "b"}
+
+    def written(text: str) -> str:
+        return str(page.templates(results, dict.fromkeys(("core", "learning", "kmp"), "a")).from_string(text).render())
+
+    assert (
+        written("{{ stale('phase', 'motion', 'faults') }}") == "*Measured with an earlier version: `motion` at 1234+.*"
+    )
+    assert written("{{ version('motion') }} {{ version('phase') }}") == "**stale**: 1234+ `1234+`"
+    assert written("{{ stale('phase') }}") == ""
+    assert written("{{ phase.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}") == "1234+, 0.06, 0.360"
+    with pytest.raises(jinja2.UndefinedError, match="tremor"):
+        written("{{ phase.tremor }}")
 
 
 def test_what_users_of_other_libraries_are_told_of_is_there_and_runs() -> None:

@@ -1,4 +1,6 @@
-"""`python -m sim.experiments NAME --output DIR`: makes an experiment, or all of them."""
+"""`python -m sim.experiments NAME --output DIR`: makes an experiment, or all that are stale;
+`python -m sim.experiments stale` lists these.
+"""
 
 from __future__ import annotations
 
@@ -10,40 +12,29 @@ import importlib
 import os
 import sys
 import time
+import traceback
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 from service.contract.explain import ExplainedError, in_words
+from sim.experiments.evidence import EXPERIMENTS, RESULTS, commit, origin, result_of, staleness, tree
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
 from sim.faulty_cell import FaultError
 from sim.parts import PartError
 
-ABOUT = {
-    "hands": "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
-    "statistics": "100 random scenes whose places are taught, side by side with rivals, some without any demonstration",
-    "people": "learned skills on modelled people who did not demonstrate, beside seven rivals told the same places",
-    "partners": "learned skills on recordings of real third hands, and on made tasks that are not soldering",
-    "motion": "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
-    "separation": "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
-    "faults": "what happens when service, tracker, network, router, scribe or disk fail: time to rest, way, loss",
-    "letters": "adaptation of handwritten letters (Figure 1)",
-    "promp": "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
-    "correlation": "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
-    "runs": "ten runs of that search with one letter and one via-point (Figure 3(c))",
-    "table": "DMP, ProMP, mixture regression and KMP on the same letters (Table I)",
-    "phase": "hands that pause and go back pause and reverse the robot",
-    "orientation": "the tool turns the glass to the eyes: orientation predicted with the position, and followed",
-    "demonstrations": "error against the number of demonstrations",
-}
+OF_OTHERS = "-of-others"  # ends the name of a result on recorded hands
+FAILURES = (ExplainedError, ExperimentError, FaultError, PartError, OSError)
 EXAMPLE = """example:
   python -m sim.experiments letters --output results
+  python -m sim.experiments stale --output results
   python -m sim.experiments all --output results
 """
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    names = "\n".join(f"  {name:<15} {about}" for name, about in ABOUT.items())
+    names = "\n".join(f"  {name:<16} {one.about}" for name, one in EXPERIMENTS.items())
     p = argparse.ArgumentParser(
         prog="python -m sim.experiments",
         description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
@@ -51,8 +42,18 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("name", metavar="NAME", choices=[*ABOUT, "all"], help="one of the above, or all")
-    p.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder for the results; made if missing")
+    p.add_argument(
+        "name",
+        metavar="NAME",
+        choices=[*EXPERIMENTS, "all", "stale"],
+        help="one of the above; all: those whose results in DIR are missing or stale; stale: list these",
+    )
+    p.add_argument(
+        "--output",
+        metavar="DIR",
+        type=Path,
+        help="folder of the results (for stale: recordings/experiments by default)",
+    )
     p.add_argument(
         "--letters",
         metavar="DIR",
@@ -97,8 +98,20 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="draw the figures of the numbers in DIR/NAME.json again, without measuring anew",
     )
+    p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
+
+
+def jobs(name: str, options: Options) -> dict[str, Options]:
+    """The results that a name on the command line stands for, with the options that each heeds."""
+    names = [name] if name in EXPERIMENTS else [*EXPERIMENTS]
+    if options.hands is None and name == "all":
+        names.remove("motion" + OF_OTHERS)
+    if options.hands is not None and name == "motion":
+        names = [name + OF_OTHERS]
+    tuning = {"people"} if options.group == "tuning" else set()
+    return {one: options if one.endswith(OF_OTHERS) or one in tuning else replace(options, hands=None) for one in names}
 
 
 def redraw(results: Results, experiment: ModuleType) -> None:
@@ -111,8 +124,22 @@ def redraw(results: Results, experiment: ModuleType) -> None:
     experiment.draw_numbers(results, results.measured())
 
 
+def make(results: Results, experiment: ModuleType, options: Options) -> None:
+    """Runs an experiment and writes its result. Raises one of FAILURES."""
+    known = (result_of(results.folder, results.name) or {}).get("options", {})
+    for one, value in known.items():
+        if isinstance(value, dict) and getattr(options, one) is None:
+            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{one} DIR again")
+    began, results.origin = time.monotonic(), origin(results.name, options)
+    results.say(EXPERIMENTS[results.name].about)
+    numbers = experiment.run(results, options)
+    if (now := commit()) != results.origin["commit"]:
+        results.origin["commit"] += f" to {now}"  # somebody changed the tree meanwhile
+    print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """The exit code: 0, 1 if an experiment failed, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
     if not 0 < args.share <= 1:
@@ -120,21 +147,47 @@ def main(arguments: list[str] | None = None) -> int:
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
     options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
+    wanted = jobs(args.name, options)
+    if args.name.endswith(OF_OTHERS) and args.hands is None and not args.redraw:
+        p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
+    if args.name == "stale":
+        return stale(args.output or RESULTS, wanted)
+    if args.output is None:
+        p.error("--output DIR is missing: the folder for the results")
+    failed = False
     try:
         pyplot()  # what is missing is said now, not after an hour
-        for name in ABOUT if args.name == "all" else [args.name]:
-            began = time.monotonic()
-            results = Results(args.output, name, said=not args.quiet)
-            results.say(ABOUT[name])
-            experiment = importlib.import_module(f"sim.experiments.{name}")
-            if args.redraw:
-                redraw(results, experiment)
-                continue
-            numbers = experiment.run(results, options)
-            print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
-    except (ExplainedError, ExperimentError, FaultError, PartError, OSError) as error:
+        here = tree() if args.name == "all" and not args.anew and not args.redraw else None
+        for name, one in wanted.items():
+            try:
+                if here is not None and not staleness(name, result_of(args.output, name), here, one):
+                    print(f"{args.output / name}.json  belongs to this tree", flush=True)
+                    continue
+                results = Results(args.output, name, said=not args.quiet)
+                experiment = importlib.import_module(f"sim.experiments.{name.removesuffix(OF_OTHERS)}")
+                redraw(results, experiment) if args.redraw else make(results, experiment, one)
+            except Exception as error:
+                failed = True
+                said = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+                sys.stderr.write(f"python -m sim.experiments: {name}: {said}")
+    except FAILURES as error:
         print(f"python -m sim.experiments: {in_words(error)}", file=sys.stderr)
         return 1
+    return int(failed)
+
+
+def stale(folder: Path, wanted: dict[str, Options]) -> int:
+    """Lists the results in a folder that do not belong to this tree; returns the exit code."""
+    try:
+        here = tree()
+        found = {name: staleness(name, result_of(folder, name), here, options) for name, options in wanted.items()}
+    except FAILURES as error:
+        print(f"python -m sim.experiments: {in_words(error)}", file=sys.stderr)
+        return 1
+    for name, why in found.items():
+        if why:
+            print(f"{name:<16} {why}")
+    print(f"{sum(map(bool, found.values()))} of {len(found)} results in {folder} are stale")
     return 0
 
 

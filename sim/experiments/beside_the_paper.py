@@ -9,6 +9,7 @@ that come 8 mm an axis beside where they were said to come, and how much of thei
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -24,11 +25,12 @@ from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array
 from sim.experiments.rivals import COMPONENTS
 from sim.experiments.scenes import OFFSET_M, draw
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import GRASP_DISTANCE, TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 
 PAPER_ELL = 0.5  # of its section III-C, which names no unit: taken as metres
-SCENES = 40
+SCENES = BY_EXPERIMENT["hands"].evaluation["scenes"]
 
 
 class Variant(NamedTuple):
@@ -61,7 +63,7 @@ class Reached(NamedTuple):
 
 def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
     """The figures with our numbers, with each difference undone, and with all undone."""
-    learned = functools.partial(learn, demonstrated(5), components=COMPONENTS)
+    learned = functools.partial(learn, demonstrated(), components=COMPONENTS)
     ours = learned()
     variants = {
         "ours": Variant(ours, bare=False),
@@ -70,15 +72,16 @@ def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
         "one point a place": Variant(ours, bare=True),
         "all three: the paper's": Variant(learned(ell=PAPER_ELL, spread_m=0.0), bare=True),
     }
-    count = max(3, round(SCENES * share))
-    return {name: reached(variant, count).numbers() for name, variant in variants.items()}
+    numbers = SCENES.share(share, least=3)
+    return {name: reached(variant, numbers).numbers() for name, variant in variants.items()}
 
 
-def reached(variant: Variant, count: int) -> Reached:
-    """What a variant does in the first so many random scenes."""
+def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
+    """Errors and steepness of a variant in random scenes."""
     errors, steepness, refused = [], [], 0
-    for number in range(count):
-        scene = draw(number).scene
+    for number in numbers:
+        drawn = draw(number, seed=SCENES.seed)
+        scene = drawn.scene
         via_points = scene.via_points()
         if variant.bare:
             via_points = tuple(msgspec.structs.replace(point, radius=0.0, follow="none") for point in via_points)
@@ -87,7 +90,7 @@ def reached(variant: Variant, count: int) -> Reached:
         except SkillError:
             refused += 1
             continue
-        hands, wanted = at_the_events(scene, number)
+        hands, wanted = at_the_events(scene, drawn.seed)
         errors.append(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
         steepness.append([np.linalg.norm(_slope(taught, row), ord=2) for row in hands])
     return Reached(np.array(errors).reshape(-1, 3), np.array(steepness).reshape(-1, 3), refused)

@@ -20,16 +20,19 @@ from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, im
 from service.config import Settings, robot_description
 from service.core.arm.arm import Arm, Kinematics
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
+from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
 from sim.experiments.writing import TARGETS, write
 
 ELL, LAMBDA, SHARPNESS = 0.1, 2.0, 5.0  # the paper's ell, lambda and gamma; here over seconds and centimetres
-DURATION_S, POINTS, DEMONSTRATIONS, COMPONENTS = 10.0, 100, 4, 8
+DURATION_S, POINTS, COMPONENTS = 10.0, 100, 8
 CENTRE_CM = np.array([55.0, 0.0, 40.0])  # of the letter, frame base
 TILT = np.radians(60)  # of the plane it is written in, against the table
 DEPTH_STD_CM = 0.8
 VIA_ROWS, VIA_STEP_CM, VIA_VARIANCE = (20, 80), 4.0, 1e-6  # where along the letter, how far from it, [cm²]
 JOINT_WEIGHTS = np.array([3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0])  # W: what moves much of the arm costs more
-BASES, EXPLORATION, UPDATES, ROLLOUTS, VIA_POINTS = 8, 0.25, 30, 12, 2
+SEEDS = BY_EXPERIMENT["correlation"]
+LETTERS, VIA_POINTS = SEEDS.evaluation["letters"], SEEDS.evaluation["points"]
+BASES, EXPLORATION, UPDATES, ROLLOUTS = 8, 0.25, 30, 12
 SPREAD = (0.25, 2.0)  # of random Lambda around 1, drawn evenly in the logarithm
 BEYOND = 2.0  # times the cost at first, for each share by which the distance is overdrawn
 WITHIN, SECANTS, LEAST_SLOPE = 0.01, 8, 0.05  # how equal the distances are made, and by how many secants
@@ -45,13 +48,13 @@ METHODS = {
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     names = sorted(TARGETS, key=lambda name: name != SHOWN)[: max(2, round(len(TARGETS) * options.share))]
-    via_points, updates = max(1, round(VIA_POINTS * options.share)), max(2, round(UPDATES * options.share))
+    via_points, updates = VIA_POINTS.share(options.share), max(2, round(UPDATES * options.share))
     joints = Joints()
     trials: list[Trial] = []
     for name in names:
         one = letter(name)
-        trials += [tried(one, number, joints, updates=updates) for number in range(via_points)]
-        results.say(f"{name}: {[_said(each) for each in trials[-via_points:]]}")
+        trials += [tried(one, number, joints, updates=updates) for number in via_points]
+        results.say(f"{name}: {[_said(each) for each in trials[-len(via_points) :]]}")
     _draw(results, letter(SHOWN), trials)
     _record(results, letter(SHOWN), trials[0])
     return {
@@ -60,7 +63,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "lambda": LAMBDA,
         "gamma": SHARPNESS,
         "letters": names,
-        "via_points_each": via_points,
+        "via_points_each": len(via_points),
         "updates": updates,
         "rollouts": ROLLOUTS,
         "search": "PI^BB: noise constant over a rollout, weighed by its total reward; not PI^2",
@@ -223,7 +226,7 @@ def _interval(values: list[float], trials: list[Trial]) -> dict[str, float]:
     for value, trial in zip(values, trials, strict=True):
         each.setdefault(trial.letter, []).append(value)
     means = np.array([np.mean(of_one) for of_one in each.values()])
-    drawn = np.random.default_rng(0).choice(means, (10_000, len(means))).mean(axis=1)
+    drawn = np.random.default_rng(DRAWING).choice(means, (10_000, len(means))).mean(axis=1)
     low, high = np.percentile(drawn, [2.5, 97.5])
     return {
         "mean": float(means.mean()),
@@ -272,8 +275,8 @@ class Joints:
 
 def letter(name: str) -> Letter:
     """A letter before the arm, from the model of handwriting, with some depth."""
-    flat = write(name, count=DEMONSTRATIONS, seed=3)[:, ::2]
-    random = np.random.default_rng(3)
+    flat = write(name, count=len(LETTERS.numbers), seed=LETTERS.seed)[:, ::2]
+    random = np.random.default_rng(LETTERS.seed)
     phase = np.linspace(0, 1, flat.shape[1])
     demonstrations = []
     for one in flat:
@@ -286,7 +289,7 @@ def letter(name: str) -> Letter:
         demonstrations.append(CENTRE_CM + np.column_stack([x, -across, z]))
     stacked = np.array(demonstrations)
     samples = np.concatenate([np.column_stack([TIMES, one]) for one in stacked])
-    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=0, regularization=1e-4)
+    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEEDS.method, regularization=1e-4)
     reference = mixture.regress(TIMES[:, None])
     base = KMP.fit(
         TIMES[:, None], reference, kernel=GaussianKernel(ELL), lambda_mean=LAMBDA, prior_mean=stacked.mean(axis=(0, 1))
@@ -338,7 +341,7 @@ def _draw(results: Results, one: Letter, trials: list[Trial]) -> None:
     third.set_title(f"(c) {len(trials)} trials: letters and via-points", loc="left")
     for row, method in enumerate(METHODS):
         values = np.array([t.beside_c(method) for t in trials])
-        aside = np.random.default_rng(row).uniform(-0.25, 0.25, len(values))
+        aside = np.random.default_rng([DRAWING, row]).uniform(-0.25, 0.25, len(values))
         fourth.plot(values, row + aside, ".", color=OTHER, alpha=0.6)
         fourth.plot([values.mean()] * 2, [row - 0.36, row + 0.36], color="black", lw=2)
     fourth.axvline(1.0, color=ADAPTED, lw=1.6)

@@ -20,22 +20,25 @@ from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import GRASP_DISTANCE, Scene
 
-MOST, DRAWS, HELD_OUT, SCENES = 10, 4, 5, 40
+SEEDS = BY_EXPERIMENT["demonstrations"]
+MOST, ORDERS, SCENES = 10, SEEDS.learned["orders"], SEEDS.evaluation["scenes"]
 EVERY = 4  # of the samples, to save time
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    most, draws = max(2, round(MOST * options.share)), max(1, round(DRAWS * options.share))
-    pool = [one.every(EVERY) for one in demonstrated(2 * MOST + HELD_OUT)]
-    known, held_out = pool[:-HELD_OUT], pool[-HELD_OUT:]
-    random = np.random.default_rng(0)
+    most, orders = max(2, round(MOST * options.share)), ORDERS.share(options.share)
+    known, held_out = (
+        [one.every(EVERY) for one in demonstrated(part["demonstrations"])] for part in (SEEDS.learned, SEEDS.evaluation)
+    )
+    random, draws = np.random.default_rng(ORDERS.seed), len(orders)
     counts = list(range(1, most + 1))
     taught = np.zeros((most, draws))
-    reproduction, events = np.zeros((most, draws)), np.zeros((most, draws, SCENES, 3))
-    for draw_number in range(draws):
+    reproduction, events = np.zeros((most, draws)), np.zeros((most, draws, len(SCENES.numbers), 3))
+    for draw_number in orders:
         order = random.permutation(len(known))
         for count in counts:
             skill = learn([known[k] for k in order[:count]], components=10, seed=draw_number)
@@ -43,7 +46,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             taught[count - 1, draw_number] = _reproduction_mm(
                 adapted(skill, Scene().via_points(), tolerance=TOLERANCE_M), held_out
             )
-            events[count - 1, draw_number] = [_events_mm(skill, number) for number in range(SCENES)]
+            events[count - 1, draw_number] = [_events_mm(skill, number) for number in SCENES.numbers]
         results.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
     floor = _floor_mm(known, held_out)
     success = 100 * (events <= 1000 * GRASP_DISTANCE).all(axis=3).mean(axis=2)
@@ -57,8 +60,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     worst = events.max(axis=3).reshape(most, -1)
     numbers = {
         "draws": draws,
-        "held_out": HELD_OUT,
-        "scenes": SCENES,
+        "held_out": len(held_out),
+        "scenes": len(SCENES.numbers),
         "floor_mm": floor,
         "by_count": {
             count: {
@@ -99,9 +102,10 @@ def _events_mm(skill: StoredSkill, number: int) -> Array:
     """Of the skill taught the places of a random scene: how far its target is at each event (3,),
     hands off by 8 mm per axis.
     """
-    scene = draw(number).scene
+    drawn = draw(number, seed=SCENES.seed)
+    scene = drawn.scene
     taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
-    hands, wanted = at_the_events(scene, number)
+    hands, wanted = at_the_events(scene, drawn.seed)
     return np.asarray(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
 
 

@@ -9,10 +9,13 @@ import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from sim.experiments.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.writing import DURATION_S, TARGETS, TIMES, recorded, write
 
 ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
-COMPONENTS, SEED = 8, 0
+SEEDS = BY_EXPERIMENT["letters"]
+COMPONENTS, SEED = 8, SEEDS.method
+WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
 TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
@@ -88,7 +91,7 @@ def gathered(options: Options) -> dict[str, dict[str, Array]]:
     is given.
     """
     some = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
-    sets = {"model": {name: write(name) for name in some}}
+    sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in some}}
     if options.letters is not None:
         real = recorded(options.letters)
         sets["recorded"] = {name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]}

@@ -29,9 +29,12 @@ from sim.experiments.linear_floor import best_linear
 from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.open_loop import targets
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.workers import shared_out
 
-PEOPLE, SECONDS, STOPS, REACHES = 3, 15.0, 24, 1
+SEEDS = BY_EXPERIMENT["motion"]
+PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "hands"))
+SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # a recording may begin in full motion, with the tool at rest: that is not following
 WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
@@ -48,7 +51,8 @@ HARDER_GROUPS = ("late", "unseen")  # of clean hands: ours alone is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
-TEACHERS, TAUGHT_S, TAUGHT_EVERY = range(100, 105), 20.0, 10  # people whom nobody follows, and ticks a sample
+TEACHERS = SEEDS.learned["teachers"].numbers  # people whom nobody follows
+TAUGHT_S, TAUGHT_EVERY = 20.0, 10  # ticks from one sample to the next
 LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # of their tool
 
 
@@ -107,15 +111,15 @@ def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follo
 def sequences(options: Options, middle: Array) -> list[Moving]:
     """The modelled hands that are followed."""
     share = options.share
-    people = modelled(middle, count=max(1, round(PEOPLE * share)), seconds=max(4.0, SECONDS * share))
+    people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
     if share < 1:  # a quick look
         people = [one for one in people if one.group in FLOOR_GROUPS]
-    count = max(2, round(STOPS * share))
+    numbers = STOPS.share(share, least=2)
     return [
         *people,
-        *reaches(count=REACHES),
-        *stops(middle, count=count),
-        *stops(middle, count=count, rate_hz=30, noise=0.002, group="sudden stops, 30 Hz, 2 mm"),
+        *reaches(seeds=[SCENE.seed]),
+        *stops(middle, numbers=numbers),
+        *stops(middle, numbers=numbers, rate_hz=30, noise=0.002, group="sudden stops, 30 Hz, 2 mm"),
     ]
 
 

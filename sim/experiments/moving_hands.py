@@ -10,6 +10,7 @@ their truth is the recording without what is too fast for a wrist.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -119,10 +120,10 @@ def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
     return np.asarray(sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * rate_hz / cut_hz))))
 
 
-def modelled(middle: Array, *, count: int, seconds: float) -> list[Moving]:
+def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[Moving]:
     """People modelled after the recordings, each seen by the trackers of `recorded`'s groups."""
     out = []
-    for number in range(count):
+    for number in numbers:
         truth = person(number, middle, seconds)
         times = np.arange(len(truth)) * PERIOD_S
         spline = CubicSpline(times, truth)
@@ -171,11 +172,11 @@ def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Gen
 
 
 def stops(
-    middle: Array, *, count: int, rate_hz: float = 100, noise: float = 0.0005, group: str = "sudden stops"
+    middle: Array, *, numbers: Sequence[int], rate_hz: float = 100, noise: float = 0.0005, group: str = "sudden stops"
 ) -> list[Moving]:
     """One hand moves evenly at 0.31 m/s, stops within 80 ms, and rests."""
     out = []
-    for number in range(count):
+    for number in numbers:
         random = np.random.default_rng([number, 7])
         way = np.zeros(6)
         way[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (1.0, 1.0, 0.5)
@@ -193,10 +194,10 @@ def stops(
     return out
 
 
-def reaches(*, count: int) -> list[Moving]:
+def reaches(*, seeds: Sequence[int]) -> list[Moving]:
     """The bench's minimum-jerk hands, with its tremor and noise."""
     out = []
-    for seed in range(1, count + 1):
+    for seed in seeds:
         script = HandScript(Scene(), seed=seed)
         times = np.arange(round(script.duration_s / PERIOD_S)) * PERIOD_S
         truth = np.array([np.concatenate([hand.position for hand in script.truth(t)]) for t in times])

@@ -22,20 +22,22 @@ from service.shipped import shipped_skill
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
 
 EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
 SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
 COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # of the position, as the shipped skill
-SCENES, SEED, RATE_HZ = 5, 31, 250
+SCENES = BY_EXPERIMENT["orientation"].evaluation["scenes"]
+SEED, RATE_HZ = BY_EXPERIMENT["orientation"].evaluation["hands"].seed, 250
 WORK_S = 3.0  # that the hands stay over the board
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    count = round(SCENES * options.share)
-    scenes = {"nominal": Scene(), **{f"scene {number}": draw(number).scene for number in range(count)}}
+    moved = {f"scene {number}": draw(number, seed=SCENES.seed).scene for number in SCENES.share(options.share, least=0)}
+    scenes = {"nominal": Scene(), **moved}
     scenes = {
         name: msgspec.structs.replace(scene, dwells_s=(*scene.dwells_s[:2], WORK_S)) for name, scene in scenes.items()
     }
@@ -82,7 +84,7 @@ def learn_turning() -> StoredSkill:
     there, back = np.array(TOOL_ORIENTATION), facing(scene)
     whole = log(back[None], there)[0]
     turning = []
-    for number, one in enumerate(demonstrated(5)):
+    for number, one in enumerate(demonstrated()):
         random = np.random.default_rng([number, SEED])
         u = np.clip((np.arange(len(one.hands)) * one.period_s - begin) / (end - begin), 0, 1)
         share = u**3 * (10 - 15 * u + 6 * u * u)

@@ -25,6 +25,7 @@ from service.learning.via_points import adapted
 from sim.experiments.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.partner_rivals import RIVALS, left_out_by
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
 
@@ -40,7 +41,9 @@ RECORDED = {  # the beginnings of the files' names
 PEOPLE = ("give",)  # its groups are persons
 NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
 BLOCK = 9  # takes of `walk` that are left out together
-DEMONSTRATORS, EACH, TESTED = 6, 2, 6
+SEEDS = BY_EXPERIMENT["partners"]
+EACH = 2  # takes of a person
+DEMONSTRATORS = len(SEEDS.learned[KINDS[0]].numbers)
 SHOWN = {  # in the figure
     SERVICE: ("service", ADAPTED, "o"),
     "same elapsed time": ("same elapsed time", REFERENCE, "|"),
@@ -78,9 +81,9 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
         groups = [
             [
                 left_out(f"person {take.person} take {i % EACH}", "", take.demonstration)
-                for i, take in enumerate(takes(task, people=range(first, first + people), each=EACH))
+                for i, take in enumerate(takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed))
             ]
-            for first in (0, DEMONSTRATORS)
+            for stream in (SEEDS.learned[task], SEEDS.evaluation[task])
         ]
         return groups[0], groups[1]
     assert data is not None

@@ -8,7 +8,7 @@ many candidates for each method; the figures are those of the test set, whom not
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from service.core.skill.model import LEVELS
 from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
 from sim.experiments.recorded_people import recorded_people
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.seeds import BY_EXPERIMENT, DRAWING, Stream
 from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
 from sim.experiments.trials import (
     FAST_MPS,
@@ -38,11 +39,13 @@ from sim.experiments.workers import shared_out
 from sim.people import Group, person
 from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
 
-DEMONSTRATORS = 6
-PEOPLE: dict[Group, int] = {"tuning": 10, "test": 24}
+SEEDS = BY_EXPERIMENT["people"]
+PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
+DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
+PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
 SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # of each person, half with each sigma
 SIGMAS_M = (0.005, 0.010)
-BREAKING_SCENES: dict[Group, int] = {"tuning": 10, "test": 40}
+BREAKING_SCENES: dict[Group, int] = {group: len(part["breaking"].numbers) for group, part in PARTS.items()}
 RESAMPLED = 2000
 SAME = 0.05  # candidates whose success differs by no more are as good
 TEACHER = "teacher"
@@ -257,7 +260,7 @@ def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, fl
     names = sorted({one.person for one in rows})
     index = np.array([names.index(one.person) for one in rows])
     total, count = np.bincount(index, values), np.bincount(index)
-    drawn = np.random.default_rng(0).integers(len(names), size=(RESAMPLED, len(names)))
+    drawn = np.random.default_rng(DRAWING).integers(len(names), size=(RESAMPLED, len(names)))
     means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
     return float(values.mean()), float(np.percentile(means, 2.5)), float(np.percentile(means, 97.5))
 

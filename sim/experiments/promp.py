@@ -15,6 +15,7 @@ from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
 from sim.experiments.rivals import RIDGE, learned_promp
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.writing import DURATION_S, TIMES
 
 BASES = 20  # for each of x and y
@@ -39,7 +40,7 @@ ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
 SAMPLE_DEVIATION = 0.003  # of a sample as a reference point: lambda Sigma is about WEIGHT_RIDGE
 WEIGHT_RIDGE = 1e-6  # the functions are known without noise
-FUNCTIONS = 5  # random ones, over which times and errors are averaged
+FUNCTIONS = BY_EXPERIMENT["promp"].evaluation["functions"]  # times and errors are averaged over them
 OUTPUTS = 3
 
 
@@ -62,8 +63,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             _record(stream, row, found[row.name], name)
     stream.disconnect()
     _draw_letters(results, sets)
-    functions = max(1, round(FUNCTIONS * options.share))
-    dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, seed) for seed in range(functions)])]
+    functions = FUNCTIONS.share(options.share)
+    dimensions = [one for inputs in DIMENSIONS for one in averaged([grown(inputs, number) for number in functions])]
     results.say("dimensions done")
     numbers["dimensions"] = [one._asdict() for one in dimensions]
     draw_numbers(results, numbers)

@@ -19,9 +19,10 @@ from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop
+from sim.experiments.seeds import SHIPPED, Stream
 from sim.scene import Scene
 from sim.script import Array, HandScript
-from sim.teach import demonstrations
+from sim.teach import demonstrate
 from sim.world import World
 
 TREMOR_M, NOISE_M = 0.0015, 0.0005  # of the hands and of the tracker, each axis
@@ -104,6 +105,6 @@ def rehearse(
     return result
 
 
-def demonstrated(count: int, *, seed: int = 1) -> list[Demonstration]:
-    """Demonstrations of the nominal scene, 100 Hz; the first five of seed 1 are shipped."""
-    return demonstrations(Scene(), count=count, seed=seed)
+def demonstrated(stream: Stream = SHIPPED) -> list[Demonstration]:
+    """Demonstrations of the nominal scene, 100 Hz."""
+    return [demonstrate(Scene(), seed=1000 * stream.seed + n, begin_s=60 * n) for n in stream.numbers]

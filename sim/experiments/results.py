@@ -63,6 +63,7 @@ class Results:
     folder: Path
     name: str
     said: bool = True
+    origin: dict[str, Any] = field(default_factory=dict)  # commit, date, machine, seeds, options, digests
     figures: list[str] = field(default_factory=list)
     began_s: float = field(default_factory=time.monotonic)
 
@@ -90,17 +91,20 @@ class Results:
         return path
 
     def numbers(self, numbers: dict[str, Any]) -> Path:
-        """The path of the JSON file of the numbers, the figures' names and the time it took."""
+        """The path of the JSON file of the numbers, their origin, and the figures' names."""
         path = self.folder / f"{self.name}.json"
         whole = {
             "experiment": self.name,
+            **self.origin,
             "figures": self.figures,
             "seconds": round(time.monotonic() - self.began_s, 1),
             **numbers,
         }
         text = json.dumps(_plain(whole), indent=2)
         text = ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
-        path.write_text(text + "\n", encoding="utf-8")
+        beside = path.with_suffix(".new")
+        beside.write_text(text + "\n", encoding="utf-8")
+        beside.replace(path)
         self.say(f"{path}")
         return path
 

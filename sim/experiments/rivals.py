@@ -28,11 +28,12 @@ from service.learning.via_points import adapted
 from sim.bench import Bench
 from sim.experiments.open_loop import Law, Said, by_law, differences, rival
 from sim.experiments.results import Array, ExperimentError
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.trials import Model
 from sim.people import Places
 from sim.scene import Scene
 
-COMPONENTS, POINTS, SEED = 10, 200, 0
+COMPONENTS, POINTS, SEED = 10, 200, BY_EXPERIMENT["statistics"].method
 PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
 VIA_STD_M, EXACT_STD_M = 0.001, 0.0001
 BASES = 20  # of the ProMP, for each of x, y and z

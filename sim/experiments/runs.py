@@ -25,8 +25,9 @@ from sim.experiments.correlation import (
     letter,
 )
 from sim.experiments.results import OTHER, Array, Options, Results, pyplot
+from sim.experiments.seeds import BY_EXPERIMENT
 
-RUNS = 10
+SEARCHES = BY_EXPERIMENT["runs"].evaluation["searches"]
 VIA_ROW = 50  # of 100 along the letter
 
 
@@ -38,7 +39,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     primitive = one.base.adapt(TIMES[VIA_ROW : VIA_ROW + 1, None], desired, tolerance=DURATION_S / POINTS)
     neutral = Correlation.neutral(np.linspace(0, DURATION_S, BASES)[:, None], width=DURATION_S / BASES, outputs=3)
     updates, costs, misses = max(2, round(UPDATES * options.share)), [], []
-    for seed in range(max(2, round(RUNS * options.share))):
+    for seed in SEARCHES.share(options.share, least=2):
         found = improve(
             primitive,
             lambda trajectory: float(np.exp(-SHARPNESS * joints.cost(trajectory))),

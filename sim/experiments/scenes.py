@@ -1,5 +1,5 @@
-"""Random soldering scenes: places, tempo, pauses and second thoughts of the hands, each from its
-number alone.
+"""Random soldering scenes: places, tempo, pauses and second thoughts of the hands, each from a seed
+and its number.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Drawn(NamedTuple):
         return sum(pause.depth > 1 for pause in self.pauses)
 
 
-def draw(number: int, *, seed: int = 2019) -> Drawn:
+def draw(number: int, *, seed: int) -> Drawn:
     """One random scene.
 
     Handover, glass and soldering place each anywhere within 15 cm of the nominal one, 5 cm above
@@ -72,7 +72,7 @@ def draw(number: int, *, seed: int = 2019) -> Drawn:
     if len(ordered) == 2:
         first, second = ordered
         ordered = [first, second._replace(at_s=second.at_s + first.depth * first.lasts_s)]
-    return Drawn(scene, speed, tuple(_never_before_the_start(ordered, speed)), number)
+    return Drawn(scene, speed, tuple(_never_before_the_start(ordered, speed)), 1000 * seed + number)
 
 
 def _never_before_the_start(pauses: list[Pause], speed: float) -> list[Pause]:

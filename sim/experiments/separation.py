@@ -27,10 +27,11 @@ from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
+from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
-SCENES, RATE_HZ = 100, 250  # half the rate, to save time
+SCENES, RATE_HZ = BY_EXPERIMENT["separation"].evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
 REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
@@ -123,7 +124,7 @@ class Outcome(NamedTuple):
 def run_one(task: tuple[str, int]) -> Outcome:
     """What became of one scene."""
     kind, number = task
-    drawn = draw(number)
+    drawn = draw(number, seed=SCENES.seed)
     script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
     clearances: list[tuple[float, float]] = []
 
@@ -262,16 +263,16 @@ def _allow(distance: Array, coming: Array, brake: float, reaction: float, cleara
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    count = max(1, round(SCENES * options.share))
+    scenes = SCENES.share(options.share)
     found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
-    tasks = [(kind, n) for n in range(count) for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+    tasks = [(kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
     for one in shared_out(run_one, tasks, options.workers):
         found[one.kind].append(one)
-        if len(found[one.kind]) % max(1, count // 5) == 0:
+        if len(found[one.kind]) % max(1, len(scenes) // 5) == 0:
             results.say(f"{one.kind}: {_summary(found[one.kind])}")
     _record(results, found)
     numbers = {
-        "scenes": count,
+        "scenes": len(scenes),
         "rate_hz": RATE_HZ,
         "slip_m_per_s": SLIP,
         **{kind: _summary(rows) for kind, rows in found.items()},

@@ -19,12 +19,13 @@ from sim.experiments.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
+from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
 from sim.experiments.skills import LookUp, NoDemonstrations
 from sim.experiments.workers import shared_out
 from sim.scene import GRASP_DISTANCE
 
-SCENES, LIVE_SCENES = 100, 3
-DEMONSTRATIONS = 5
+SEEDS = BY_EXPERIMENT["statistics"]
+SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
 ELL = 5.0  # of our skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
 METHODS = {
@@ -60,7 +61,7 @@ def prepare() -> None:
     """Learns what each method needs, once in a process."""
     if _adapts:
         return
-    skill, demonstrations = shipped_skill(), demonstrated(DEMONSTRATIONS)
+    skill, demonstrations = shipped_skill(), demonstrated()
     _adapts["ours"] = rivals.ours(skill)
     _adapts["none"] = rivals.of_model(skill, NoDemonstrations(ell=ELL))
     _adapts["look_up"] = rivals.of_model(skill, LookUp())
@@ -74,16 +75,17 @@ def prepare() -> None:
 def outcome(task: tuple[str, int]) -> Outcome:
     """What became of one scene with one method."""
     method, number = task
-    drawn = draw(number)
+    drawn = draw(number, seed=SCENES.seed)
     done = rehearse(drawn.script(), _adapts[method](drawn.scene), rate_hz=OURS_HZ if method == "ours" else RIVALS_HZ)
     return Outcome(method, number, done.errors_mm, done.events.success, done.held_s)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    count = max(1, round(SCENES * options.share))
+    scenes = SCENES.share(options.share)
+    count = len(scenes)
     live_count = LIVE_SCENES if options.share == 1 else 0
-    tasks = [(method, number) for method in METHODS for number in range(count)]
+    tasks = [(method, number) for method in METHODS for number in scenes]
     found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
     if options.workers == 1:
         prepare()
@@ -95,8 +97,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         if len(done) % max(1, count // 5) == 0:
             results.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
     in_real_time = []
-    for number in range(live_count):
-        live, inside = live_run(draw(number), results.folder), found["ours"][number]
+    for inside in found["ours"][:live_count]:
+        number = inside.number
+        live = live_run(draw(number, seed=SCENES.seed), results.folder)
         in_real_time.append(
             {
                 "scene": number,
@@ -153,7 +156,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers: a row a method."""
     plt, found = pyplot(), numbers["methods"]
     figure, (rates, *events) = plt.subplots(1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1))
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(DRAWING)
     for i, (method, one) in enumerate(found.items()):
         colour = ADAPTED if method == "ours" else OTHER
         rate, (low, high) = 100 * one["successes"] / one["of"], one["rate_95_percent_interval"]

@@ -49,7 +49,7 @@ SMALLEST_CURVATURE = 0.05  # [1/cm] below it the pen gains no more speed
 STARTING_SHARE = 0.12  # of the way, in which the pen comes to speed
 
 
-def write(letter: str, *, count: int = DEMONSTRATIONS, seed: int = 0) -> Array:
+def write(letter: str, *, count: int = DEMONSTRATIONS, seed: int) -> Array:
     """Demonstrations (count, 200, 2) [cm] of a letter at even times, 0 to 2 s, from the model."""
     random = np.random.default_rng([seed, ord(letter)])
     return np.stack([_written(np.array(TARGETS[letter], dtype=np.float64), random) for _ in range(count)])

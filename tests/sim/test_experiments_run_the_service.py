@@ -138,7 +138,7 @@ class TestPeople:
 
 def test_motion_follows_through_the_controller() -> None:
     skill = shipped_skill()
-    hands = stops(skill.hands.mean(axis=0), count=1, rate_hz=30, noise=0.002)[0]
+    hands = stops(skill.hands.mean(axis=0), numbers=(0,), rate_hz=30, noise=0.002)[0]
     found = followers.ours(skill, Settings())(hands)
     settle, period_s = followers.SETTLE_TICKS, followers.PERIOD_S
     arrives = np.ceil(hands.stamps / period_s - 1e-9).astype(int) + settle

@@ -1,0 +1,152 @@
+"""`python docs/experiments_page.py` writes the figures of the experiments from
+recordings/experiments: experiments.md from its template, experiments.md.jinja; in the README and
+faults.md what stands between `<!-- evidence -->` marks, and the last cells of the table of faults.
+
+A number of a template is an expression of a result, as `{{ phase.tremor_mm | fixed(1) }}`; without
+that result it is an error. What was measured with another version is marked as stale.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from sim.experiments.evidence import EXPERIMENTS, RESULTS, result_of, staleness, tree
+from sim.experiments.moving_hands import MOST_LATE_S, UNSEEN_S
+
+HERE = Path(__file__).parent
+WIDTH = 100
+WORDS = dict(
+    enumerate(["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"], 1)
+)
+BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTALL)
+BLOCKS = {  # templates of a paragraph in a page
+    "README.md": """{{ stale("people") }}
+With modelled people who did not demonstrate it, the soldering task succeeds in
+{{ people.methods.ours.success.mean | percent }} % of the scenes, in
+{{ people.methods.ours.success_on_the_way.mean | percent }} on the path that a teacher would have
+taken. A table of taught places alone succeeds in {{ people.methods.look_up.success.mean | percent }},
+but {{ share(people.methods.look_up.success_on_the_way.mean) }} on that path.
+[docs/experiments.md](docs/experiments.md) has all results, and how they were measured.""",
+    "docs/faults.md": """{{ stale("faults") }}
+In that run, {{ faults.unaccounted_ticks }} ticks were lost without a mark, and
+{{ faults.unasked_faults }} faults of the service occurred that nobody had caused.""",
+}
+
+
+def pages() -> dict[Path, str]:
+    """The texts of the pages, by their files."""
+    results = {name: result_of(RESULTS, name) or {} for name in EXPERIMENTS}
+    found = templates(results, tree())
+    texts = {HERE / "experiments.md": wrapped(found.get_template("experiments.md.jinja").render())}
+    for name, template in BLOCKS.items():
+        path, paragraph = HERE.parent / name, wrapped(found.from_string(template).render())
+        texts[path] = BLOCK.sub(lambda _, text=paragraph: text, path.read_text(encoding="utf-8"))
+    texts[HERE / "faults.md"] = with_figures(texts[HERE / "faults.md"], results["faults"]["faults"])
+    return texts
+
+
+def with_figures(page: str, faults: Mapping[str, Mapping[str, Any]]) -> str:
+    """A page whose rows of faults end with what was measured of each."""
+    for name, one in faults.items():
+        values = (one.get(key) for key in ("hold_ms", "rest_ms", "travelled_mm", "lost_ticks"))
+        cells = " | ".join("-" if value is None else f"{value:.0f}" for value in values)
+        row = rf"^(\| {re.escape(name)} \| [^|]+ \|)(?: [^|]+ \|){{4}}$"
+        page = re.sub(row, rf"\1 {cells} |", page, flags=re.MULTILINE)
+    return page
+
+
+def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) -> jinja2.Environment:
+    """The templates of a tree with these digests, with the results as variables:
+    `motion_of_others` is motion-of-others.json.
+    """
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HERE), undefined=jinja2.StrictUndefined, line_statement_prefix="%%"
+    )
+    stale = {name for name, result in results.items() if staleness(name, result, here)}
+
+    def at_six(method: str) -> dict[str, Any]:
+        """What a method costs with six inputs."""
+        rows = results["promp"]["dimensions"]
+        return next(row for row in rows if (row["method"], row["inputs"]) == (method, 6))
+
+    def table_miss(who: str) -> float:
+        """The largest miss of a point [cm] by a method of Table I."""
+        rows = [results["table"][letters][who] for letters in ("modelled", "recorded")]
+        return max(row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end"))
+
+    def share(value: float) -> str:
+        """A share of the scenes, in words."""
+        return f"in {100 * value:.0f} %" if value else "never"
+
+    def commit(name: str) -> str:
+        return str(results[name].get("commit", "an unknown commit"))
+
+    def version(*names: str) -> str:
+        """The commit of some results, by which each is marked if it is stale."""
+        cells = [f"**stale**: {commit(name)}" if name in stale else f"`{commit(name)}`" for name in names]
+        return "; ".join(dict.fromkeys(cells))
+
+    def stale_line(*names: str) -> str:
+        """Names what was measured with an earlier version; nothing if none was."""
+        at: dict[str, list[str]] = {}
+        for name in sorted(stale.intersection(names)):
+            at.setdefault(commit(name), []).append(f"`{name}`")
+        said = "; ".join(f"{', '.join(old)} at {where}" for where, old in at.items())
+        return f"*Measured with an earlier version: {said}.*" if at else ""
+
+    found.globals |= {name.replace("-", "_"): result for name, result in results.items()}
+    found.globals |= {
+        "at_six": at_six,
+        "table_miss": table_miss,
+        "share": share,
+        "version": version,
+        "stale": stale_line,
+        "late_ms": round(1000 * MOST_LATE_S),
+    }
+    found.globals["unseen_ms"] = [round(1000 * each) for each in UNSEEN_S]
+    found.filters |= {
+        "fixed": lambda value, digits=0: f"{value:.{digits}f}",
+        "percent": lambda value, digits=0: f"{100 * value:.{digits}f}",
+        "up": lambda value, digits: f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.{digits}f}",
+        "significant": significant,
+        "thousands": lambda value: f"{value:,}".replace(",", " "),
+        "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
+        "word": lambda value: WORDS.get(value, str(value)),
+    }
+    return found
+
+
+def significant(value: float, digits: int) -> str:
+    """A number with so many significant digits."""
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def wrapped(text: str) -> str:
+    """A page with paragraphs and points as wide as a line, a blank line around each, and other
+    lines as they are. A paragraph follows its picture at once.
+    """
+    parts = re.split(r"\n\s*\n|\n(?=[*|] |\|-|!\[|#|<!--)|(?<=\.png\))\n|(?<=\|)\n", text.strip())
+    out, before = [], ""
+    for part in filter(None, (" ".join(part.split()) for part in parts)):
+        kind = next((kind for kind in ("|", "* ", "#", "![", "<!--") if part.startswith(kind)), "")
+        close = (before, kind) in {("|", "|"), ("* ", "* "), ("![", "")}
+        out.append("\n" * bool(out) + "\n" * (bool(out) and not close))
+        out.append(part if kind not in ("", "* ") else _filled(part, "  " * bool(kind)))
+        before = kind
+    return "".join(out) + "\n"
+
+
+def _filled(text: str, indent: str) -> str:
+    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
