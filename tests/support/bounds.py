@@ -23,7 +23,7 @@ POSITION_ROUNDING_M = 1e-6
 AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
 SPEED_ROUNDING_MPS = 1e-6
 STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop, beyond its speed limit
-OTHERS_RISE_MPS = 0.025  # beyond its speed at the start of the stop, for other arms and rates than a WAM at 500 Hz
+OTHERS_RISE_MPS = 0.1  # beyond its speed at the start of the stop, for other arms and rates than a WAM at 500 Hz
 BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
 WAITING_M = 0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
@@ -288,7 +288,7 @@ def tool_speed_is_within_its_limit_while_following(session: Session) -> Vector:
 
 def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
     """Below 1.01 times the greater of its speed and the speed it was coming to, plus 10 mm/s for a
-    WAM at 500 Hz, plus 25 mm/s for others; and always below 1.01 times its limit, plus 10 mm/s.
+    WAM at 500 Hz, plus 100 mm/s for others; and always below 1.01 times its limit, plus 10 mm/s.
     """
     (speed, crest), following = session.tool_speeds, _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
@@ -485,11 +485,13 @@ def _net_motion_m(session: Session) -> float:
 
 
 def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
-    """Once the tool has been at its target for a while: the root mean square of all joint
-    accelerations. A tool that is kept back for as long hardly trembles.
+    """The root mean square of all joint accelerations, once the tool has been at its target for a
+    while. A tool that is kept back for as long hardly trembles. A target that moves is not judged:
+    a steep skill amplifies the noise of a tracker.
     """
     settled = _last(session, SETTLED_S)
-    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any():
+    is_steady = np.ptp(_last(session, LOOK_S)["target"], axis=0).max() < NET_MOTION_M
+    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any() or not is_steady:
         return _at_the_end(session, 0.0)
     off = _norms(settled["tool"] - settled["target"])
     if (off < THERE_M).all():
@@ -506,7 +508,7 @@ def tool_is_never_stuck_in_silence(session: Session) -> Vector:
     if session.quiet_s < SETTLED_S or not _following(session)[-1] or _net_motion_m(session) >= NET_MOTION_M:
         return _at_the_end(session, 0.0)
     lately = _last(session, STUCK_S)
-    if (lately["flags"] & Flag.STUCK).any() or (lately["reason"] == Reason.BLOCKED).any():
+    if (lately["flags"] & Flag.STUCK).any() or (lately["mode"] != Mode.FOLLOW).any():
         return _at_the_end(session, 0.0)
     is_kept_away = bool((lately["flags"] & Flag.SEPARATION).all())
     return _at_the_end(session, _off_target_m(session) - (STUCK_M if is_kept_away else THERE_M))
