@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from service.contract.incidents import figures
@@ -11,12 +12,14 @@ PLAUSIBLE_M = (0.05, 2.5)  # hands and tool are so far from the base plate, in t
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
-    """In words: a position as it was told, the unit that it looks to be in, and what is accepted.
+    """A position as it was reported, the unit that it looks to be in, and what is accepted, in words.
 
-    It was taken to be in `unit`; by which `rule`, if not by `[hands] unit`.
+    It was taken to be in `unit`; by which `rule`, if not by `[hands] unit`. Of the units that fit,
+    the one with the distance nearest to 1 m is named.
     """
     far = sum(v * v for v in position) ** 0.5
     meant = [u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_M[0] < far * m < PLAUSIBLE_M[1]]
-    like = f", which looks like {meant[-1]}" if meant else ""
+    meant.sort(key=lambda u: abs(math.log(far * UNIT_M[u])))
+    like = f", which looks like {meant[0]}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
     return f"at {figures(position)}{like}; {rule}, at most {FARTHEST_M:g} m from the base plate accepted"
