@@ -12,7 +12,7 @@ PLAUSIBLE_M = (0.05, 2.5)  # hands and tool are so far from the base plate, in t
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
-    """A position as it was reported, the unit that it looks to be in, and what is accepted, in words.
+    """A position as it was reported, the unit that it looks to be in, and what is accepted.
 
     It was taken to be in `unit`; by which `rule`, if not by `[hands] unit`. Of the units that fit,
     the one with the distance nearest to 1 m is named.
