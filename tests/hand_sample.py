@@ -5,7 +5,7 @@ files it enters, in order, and how often one calls into another.
 
 Compiled functions run as plain Python here, so that they are seen too. A call from one function of
 a file to a function of another counts once, however often a loop repeats it. A re-entry is such a
-call into a file that was entered before.
+call into a file that was entered before. A stage's class and its compiled step count as one file.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Walk:
         caller = frame.f_back
         while caller is not None and not self._is_ours(caller):
             caller = caller.f_back
-        start = LOOP if caller is None or caller.f_code.co_filename == __file__ else caller.f_code.co_filename
+        start = LOOP if caller is None or caller.f_code.co_filename == __file__ else _file_of(caller)
         function = "" if caller is None else caller.f_code.co_name
-        end = frame.f_code.co_filename
+        end = _file_of(frame)
         call = (start, function, end, frame.f_code.co_name)
         if start != end and call not in self.calls:
             self.calls.append(call)
@@ -75,6 +75,11 @@ class Walk:
     def re_entries(self) -> int:
         """How many calls go into a file that was entered before."""
         return len(self.calls) + 1 - len(self.files)
+
+
+def _file_of(frame: FrameType) -> str:
+    file = frame.f_code.co_filename
+    return file.removesuffix("step.py") + "stage.py" if file.endswith("/step.py") else file
 
 
 def walk() -> Walk:

@@ -29,10 +29,15 @@ ENTRY_POINTS = [
     for path in MODULES
     if not path.is_relative_to(ROOT / "tests") and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
 ]
+STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
+    *("MODES", "STATES", "KEPT", "WAY", "HULL_SPANS", "ORDER", "TURNS", "TURN_INPUTS", "MOST_STAGES", "OUTPUTS"),
+    *("NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_STAGE", "NO_GRIPPER"),
+    *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
+}
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
     "what comes from outside": (
         {
-            "service/core/intake/intake.py": "import time",
+            "service/core/intake/stage.py": "import time",
             "service/contract/cdr.py": "import numpy",
             "service/learning/learn.py": "import mcap",
             "kmp/gmm.py": "import msgspec",
@@ -184,3 +189,20 @@ def test_constraints_name_versions_and_no_places() -> None:
     assert pins
     assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", pin)] == []
     assert [line for line in lines if re.search(r"://|--(extra-)?index|--find-links|@", line)] == []
+
+
+def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
+    """Numbers in tuning.py, compiled functions in step.py, the class in stage.py; no stage imports
+    another one's step.
+    """
+    core = ROOT / "service" / "core"
+    stages = sorted(path.parent for path in core.glob("*/tuning.py"))
+    assert len(stages) == 7
+    for stage in stages:
+        assert {"step.py", "stage.py"} <= {path.name for path in stage.glob("*.py")}
+        for path in stage.glob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            others = [s.name for s in stages if s != stage and f"service.core.{s.name}.step import" in text]
+            assert not others, f"{named(path)} imports the step of {others}"
+            loose = re.findall(r"^([A-Z][A-Z0-9_]+) = [-\d.e]+ *(?:#|$)", text, re.MULTILINE)
+            assert path.name == "tuning.py" or not [n for n in loose if n not in STRUCTURAL], f"{named(path)}: {loose}"

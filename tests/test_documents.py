@@ -17,7 +17,7 @@ from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.frame import FRAME, TIMING_FIELDS
 from service.recording.scribe import Scribe
 from service.viewer.blueprint import plot_views

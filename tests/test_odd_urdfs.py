@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.config import Settings, SettingsError, load, robot_description
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.separation.body import body_of
 from service.described_arm import description
 from service.urdf import Urdf

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.config import Settings, SettingsError, load, parse, robot_description
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.reachable import Shell, workspace_of
 from service.shipped import ARMS, cell_of
 from service.urdf import Urdf

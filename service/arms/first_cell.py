@@ -19,10 +19,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from service.config import Settings, converted, robot_description
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.frame import Vector
 from service.core.separation.body import Body, body_of
-from service.core.separation.separation import Separation
+from service.core.separation.stage import Separation
 from service.described_arm import SettingsError, description
 from service.mesh_cover import found_meshes
 from service.reachable import Shell, Workspace, workspace_of

@@ -18,18 +18,21 @@ from service.contract import cdr
 from service.contract.channels import STREAMS
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.contract.records import GONE_S, Flag, Reason
-from service.core.arm.arm import Arm, Kinematics
-from service.core.decision.decision import (
-    ALONE,
+from service.core.arm.stage import Arm
+from service.core.codes import (
+    ARM_INSIDE,
     FOLLOW,
-    INSIDE,
-    INSIDE_M,
-    NEEDED,
+    HANDS_KNOWN,
+    ONE_HAND,
     READY,
+    STAGE_AMBIGUOUS,
     STARTS_MEASURED,
-    TORN,
-    Decision,
+    UNSEEN,
+    UNSEEN_HAND_NEEDED,
+    WRONG,
 )
+from service.core.decision.stage import Decision
+from service.core.decision.tuning import INSIDE_M
 from service.core.frame import (
     Event,
     Frame,
@@ -43,13 +46,15 @@ from service.core.frame import (
     frame_layout,
     state_layout,
 )
-from service.core.intake.intake import HANDS_KNOWN, UNSEEN, Intake
-from service.core.limiter.limiter import LimiterStage
-from service.core.separation.separation import Separation
-from service.core.setpoint.setpoint import WRONG, SetpointStage
+from service.core.intake.stage import Intake
+from service.core.kinematics import Kinematics
+from service.core.limiter.stage import LimiterStage
+from service.core.separation.stage import Separation
+from service.core.setpoint.stage import SetpointStage
 from service.core.skill.model import Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
-from service.core.skill.skill import NEVER, Skill, SkillStage
+from service.core.skill.skill import NEVER, Skill
+from service.core.skill.stage import SkillStage
 
 # Plain numbers, as an enumeration's members cost a microsecond where they are combined.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
@@ -130,7 +135,7 @@ class Controller:
         unseen = UNSEEN.index(side) if (side := known & sum(UNSEEN)) else None
         wanted = self._skill.step(state, frame, unseen) if known & HANDS_KNOWN else None
         if wanted is not None:
-            known |= TORN * wanted.torn | NEEDED * wanted.needs
+            known |= STAGE_AMBIGUOUS * wanted.torn | UNSEEN_HAND_NEEDED * wanted.needs
         lap("skill")
         here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
@@ -163,14 +168,14 @@ class Controller:
         return self.intake.step(state, frame, tick.index - int(state["tick"]), samples)
 
     def _alone(self, frame: Frame) -> int:
-        """HANDS_KNOWN and ALONE, where one hand conducts the skill and the other never was seen, or
-        has gone. One that was seen lately may be near, so the arm holds; it keeps away ever after
-        from where that was last seen.
+        """HANDS_KNOWN and ONE_HAND, where one hand leads the skill and the other one has never been
+        seen, or has disappeared. A hand that was seen lately may be near, so the arm holds; it
+        keeps away from where that hand was last seen.
         """
         side, ages = self.skill.conductor, frame["hand_ages"]
         if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
             return 0
-        return ALONE | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
+        return ONE_HAND | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
 
     def _adopt(self, skill: Skill) -> None:
         self._skill.adopt(self._state, skill)
@@ -181,7 +186,7 @@ class Controller:
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if state["arm_ready"] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            known |= INSIDE * (self._separation.intrusion(joints)[0] > INSIDE_M)
+            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > INSIDE_M)
         starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])

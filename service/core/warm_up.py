@@ -14,12 +14,12 @@ from kmp import KMP, GaussianKernel, Gaussians
 from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, as_array, order
 from service.core.intake.arm_samples import still_ticks
-from service.core.limiter.limiter import Limiter
-from service.core.separation.separation import Separation
+from service.core.limiter.stage import Limiter
+from service.core.separation.stage import Separation
 from service.core.skill import ORDER
 from service.core.skill.memory import delayed, moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation

@@ -16,11 +16,12 @@ import math
 import numpy as np
 
 from service.config import Settings
-from service.core.arm.arm import Arm, Kinematics
+from service.core.arm.stage import Arm
 from service.core.decision import WAY
 from service.core.frame import Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
-from service.core.separation.separation import Separation
+from service.core.kinematics import Kinematics
+from service.core.separation.stage import Separation
 
 STARTS, ITERATIONS = 60, 120  # of the search for postures, and steps of each
 STEP_RAD = 0.2  # at most, of a joint in one of them

@@ -10,7 +10,7 @@ from service.config import Settings
 from service.contract import cdr
 from service.contract.messages import Attachment
 from service.core.frame import Frame
-from service.core.limiter.limiter import Limiter
+from service.core.limiter.stage import Limiter
 from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import Deadlines
 

@@ -23,7 +23,7 @@ from service.contract.records import Reason
 from service.contract.requests import Status, ViaPoint, encode_json
 from service.core.controller import Controller, outgoing, run
 from service.core.frame import STAGES, Event, Frame, Outputs, Tick, blank, frame_layout, order, timed
-from service.core.separation.clearance import FARTHEST
+from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
 from service.daemon.braking import brake
@@ -97,7 +97,7 @@ class Daemon:
         self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
-        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST, self._controller.max_part_speed
+        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST_REPORTED_M, self._controller.max_part_speed
         self._sources, self._machine = InputMonitor(settings), Machine()
         self._failure = ""  # the service's last one
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))

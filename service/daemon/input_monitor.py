@@ -28,10 +28,10 @@ from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
 from service.core.frame import Record
-from service.core.intake.arm_samples import FARTHEST_OUTSIDE, MAX_JOINT_SPEED
 from service.core.intake.far_away import too_far
-from service.core.intake.intake import Refused
 from service.core.intake.late_samples import lateness_ms
+from service.core.intake.stage import Refused
+from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
 from service.daemon.cell_streams import Arrivals
 
 WINDOW_S = 1.0  # over which rates and clocks are taken
@@ -169,8 +169,8 @@ def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple
     """Measured values that are outside of what is accepted."""
     of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
     for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
-        low, high = lower - FARTHEST_OUTSIDE * per_rad, upper + FARTHEST_OUTSIDE * per_rad
+        low, high = lower - MAX_OUTSIDE_RAD * per_rad, upper + MAX_OUTSIDE_RAD * per_rad
         if not low <= at <= high:
             yield Outside(name, at, low, high, unit)
-        if not abs(speed) <= (fastest := MAX_JOINT_SPEED * per_rad):
+        if not abs(speed) <= (fastest := MAX_JOINT_RADPS * per_rad):
             yield Outside(name, speed, -fastest, fastest, f"{unit}/s")

@@ -12,14 +12,14 @@ from service.contract.incidents import MALFORMED, Evidence, Inside, Outside, Stu
 from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
+from service.core.codes import READY, RETURNING
 from service.core.controller import Controller
-from service.core.decision.decision import READY, RETURNING
 from service.core.frame import Frame, Record
 from service.core.geometry import off_target
-from service.core.intake.intake import SCATTERED_M, SETTLED
+from service.core.intake.tuning import CONTESTED_OFF_SHARE, SCATTER_ON_M
 from service.core.separation.clearance import NEAR_ITSELF
-from service.core.separation.separation import Separation
+from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames
@@ -100,8 +100,8 @@ class CellStatus(NamedTuple):
         limit = settings.tool.fault_speed
         return Evidence(
             sources={name: source for name, source in self.sources.items() if not self._spare(name, source)},
-            contested=SETTLED,
-            scatter_mm=1e3 * SCATTERED_M,
+            contested=CONTESTED_OFF_SHARE,
+            scatter_mm=1e3 * SCATTER_ON_M,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
             measure=skill.model.measure,
             outside=self._outside(),

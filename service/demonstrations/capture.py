@@ -23,7 +23,8 @@ from service.contract.messages import BASE, PoseStamped, WireError, finite
 from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake.arm_samples import in_turn
-from service.core.intake.intake import FARTHEST_M, UNIT_M
+from service.core.intake.stage import UNIT_M
+from service.core.intake.tuning import MAX_HAND_DISTANCE_M
 from service.demonstrations.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.demonstrations.dwells import REST_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
@@ -137,7 +138,7 @@ class Capture:
                     raise CaptureError(f"{problem}. Nothing is recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
                     at = from_tracker(at, hands)
-                if np.linalg.norm(at) > FARTHEST_M:
+                if np.linalg.norm(at) > MAX_HAND_DISTANCE_M:
                     why = far_away(key, pose.frame_id, pose.position, hands)
                     raise CaptureError(f"{key} is {why}. Nothing is recorded")
 

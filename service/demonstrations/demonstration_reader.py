@@ -19,7 +19,8 @@ from service.contract.requests import Hands, encode_json
 from service.core.frame import Vector
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
-from service.core.intake.intake import FARTHEST_M, UNIT_M
+from service.core.intake.stage import UNIT_M
+from service.core.intake.tuning import MAX_HAND_DISTANCE_M
 from service.demonstrations.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
 from service.demonstrations.track import Track
 from service.demonstrations.track_check import LEAST_PIECE_S, Checked, checked, sound
@@ -212,7 +213,7 @@ def _near(recorded: Recorded, track: Track, before: Track, hands: HandSettings) 
     `before`: as published.
     """
     with np.errstate(all="ignore"):
-        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > FARTHEST_M
+        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > MAX_HAND_DISTANCE_M
     if len(is_far) and is_far.all():
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
         if recorded.is_captured:
@@ -228,7 +229,9 @@ def _none_in(tracks: Sequence[Track]) -> list[str]:
     """In words, how many poses of the tracks are NaN; nothing where none is."""
     none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
     count = sum(len(track.poses) for track in tracks)
-    return [f"{none} of {count} poses are none, or farther than {FARTHEST_M:g} m, and left out"] if none else []
+    return (
+        [f"{none} of {count} poses are none, or farther than {MAX_HAND_DISTANCE_M:g} m, and left out"] if none else []
+    )
 
 
 def _in_order(path: str | Path, track: Track) -> Track:

@@ -25,7 +25,7 @@ from service.contract.messages import BASE, JointState, PoseStamped, WireError
 from service.contract.printable import printable
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
-from service.core.intake.intake import UNIT_M
+from service.core.intake.stage import UNIT_M
 from service.demonstrations.motion_capture import FRAME, Captured, read_c3d, read_motive
 from service.demonstrations.tool_poses import tool_poses
 from service.demonstrations.track import Track, clock_parts

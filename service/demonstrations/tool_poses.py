@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.config import Settings
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.frame import Vector
 
 MOST_HZ = 100  # of poses; arms publish their joints more often than a demonstration needs

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.frame import Vector
-from service.core.intake.hand_estimator import LATE_S
+from service.core.intake.tuning import MAX_LATE_S
 
 WINDOW = 3  # stamps that are compared with as many before them
 
@@ -42,6 +42,6 @@ def clock_parts(stamps: Stamps) -> list[Rows]:
         return [np.arange(len(stamps))]
     windows = np.lib.stride_tricks.sliding_window_view(stamps, WINDOW)
     before, behind = np.median(windows[:-WINDOW], axis=1), windows[WINDOW:].max(axis=1)
-    is_anew = behind < before - 1e9 * LATE_S
+    is_anew = behind < before - 1e9 * MAX_LATE_S
     is_anew[1:] &= ~is_anew[:-1]
     return np.split(np.arange(len(stamps)), np.flatnonzero(is_anew) + WINDOW)

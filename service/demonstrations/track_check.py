@@ -29,8 +29,9 @@ from service.config import HandSettings, Settings
 from service.contract.messages import BASE, PoseStamped
 from service.contract.records import Cause, Reason
 from service.core.frame import Vector, as_array, blank, state_layout
-from service.core.intake.intake import GATHERED_M, MEMORY_S, SETTLED, Intake, is_contested
-from service.core.intake.plausibility import AGREE_MPS
+from service.core.intake.stage import Intake
+from service.core.intake.step import is_contested
+from service.core.intake.tuning import AGREE_MPS, CONTESTED_MEMORY_S, CONTESTED_OFF_SHARE, SCATTER_OFF_M
 from service.demonstrations.track import Track
 from service.demonstrations.track_offsets import STEP_M, displaced
 
@@ -169,10 +170,10 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
         is_disputed = bool(is_contested(as_array(state), bool(state["reason"] == Reason.TWO_SOURCES)))
         state["reason"] = Reason.TWO_SOURCES if is_disputed else Reason.NONE
         for one in range(len(tracks)) if is_disputed else ():
-            if state["contested"][one] > SETTLED or state["noise_variance"][one] > GATHERED_M**2:
+            if state["contested"][one] > CONTESTED_OFF_SHARE or state["noise_variance"][one] > SCATTER_OFF_M**2:
                 disputed_ns[one].append(stamp_ns + start_ns)
     for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
-        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * MEMORY_S))
+        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * CONTESTED_MEMORY_S))
         for i in np.flatnonzero(mask).tolist():
             verdict.why[i] = CONTESTED
     return out

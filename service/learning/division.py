@@ -15,18 +15,9 @@ from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import stillness_of
-from service.core.skill.stages import (
-    HASTE_MPS,
-    LEFT,
-    MOST_STAGES,
-    NONE,
-    RIGHT,
-    add_followed,
-    along_way,
-    on_way,
-    recognise,
-)
+from service.core.skill.stages import LEFT, MOST_STAGES, NONE, RIGHT, add_followed, along_way, on_way, recognise
 from service.core.skill.task import Indices, NamedViaPoints, Task
+from service.core.skill.tuning import DIRECTION_SPEED_MPS
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import SkillError
 
@@ -178,7 +169,7 @@ def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], perio
         off = ((at - begins - along[:, :, None] * way) ** 2).sum(axis=2)
         goes = np.where(moves, velocity @ way.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
         goes -= 0.7 * ~moves * np.linalg.norm(velocity, axis=1)[:, None]
-        cost += np.minimum(off / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / HASTE_MPS)
+        cost += np.minimum(off / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / DIRECTION_SPEED_MPS)
     cost *= period_s / CORRELATED_S
     change = np.where(np.eye(count, k=1) > 0, NEXT, ANOTHER) * (1.0 - np.eye(count))
     total, back = cost[0] + LATER * np.arange(count), []

@@ -18,8 +18,7 @@ from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector
 from service.core.geometry import angles
-from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation
-from service.core.skill.skill import decided
+from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from service.learning.ambiguity import ambiguity
 from service.learning.choice import Choice, Parameters, rms
 from service.learning.judgement import Posed

@@ -21,7 +21,7 @@ from service.contract.requests import TOLERANCE_M
 from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import LEVELS, NORMAL, REGION_95, Regions, standard_deviations
-from service.core.skill.skill import recent
+from service.core.skill.step import recent
 from service.learning.choice import mahalanobis
 from service.learning.demonstration import Demonstration, at_the_moment
 from service.learning.judgement import HeldOut

@@ -28,9 +28,10 @@ from service.contract.explain import ExplainedError, validated
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.model import FARTHEST_M, LEVELS, NORMAL, REGION_95, Model, Regions
+from service.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
+from service.core.skill.tuning import MAX_SKILL_DISTANCE_M
 
 POSED = 4  # the format of a skill that has orientation or gripper; of others it is the model's
 FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
@@ -42,15 +43,16 @@ LONGEST_TEXT = 200  # letters
 LONGEST_FIGURES = 1_000_000
 RANGES = {  # of the numbers in each array
     "threshold": (1e-6, HIGHEST_GATE_M, "m"),
-    "tolerance": (0.0, FARTHEST_M, "m"),
+    "tolerance": (0.0, MAX_SKILL_DISTANCE_M, "m"),
     "ell": (1e-3, 1e4, "1/m²"),
     "lambda_mean": (1e-9, 1e9, ""),
     "lambda_covariance": (1e-9, 1e9, ""),
     "components": (0, 10_000, ""),
-    "box": (-FARTHEST_M, FARTHEST_M, "m"),
+    "box": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "orientation": (-1.001, 1.001, ""),
     **dict.fromkeys(
-        ("base_inputs", "base_mean", "via_inputs", "via_mean", "prior_mean"), (-FARTHEST_M, FARTHEST_M, "m")
+        ("base_inputs", "base_mean", "via_inputs", "via_mean", "prior_mean"),
+        (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     ),
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),

@@ -15,9 +15,10 @@ from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
 from service.core.skill.model import Model
-from service.core.skill.staged import APART, APART_BESIDE, Placed, StagedKMP
+from service.core.skill.staged import Placed, StagedKMP
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
+from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.learning.choice import rms
 from service.learning.demonstration import Demonstration, lag
 from service.learning.division import NEAR, Encoded, along_all, ordered, recognised
@@ -64,7 +65,7 @@ class Samples(NamedTuple):
         labels = np.concatenate([one.labels[rows] for one, rows in zip(encoded, each, strict=True)])
         outputs = np.concatenate([one.wanted[rows] for one, rows in zip(encoded, each, strict=True)])
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
-        return Samples(encoded, inputs_of(along, labels, count, APART), outputs, owner)
+        return Samples(encoded, inputs_of(along, labels, count, STAGE_DISTANCE), outputs, owner)
 
     def residuals(self, parameters: Parameters) -> Vector:
         """By how much the others miss each demonstration's samples, by block inverses (Rasmussen
@@ -123,7 +124,7 @@ class Samples(NamedTuple):
                 elif usual > 1.0 - NEAR:
                     known.append((*corner, k, 1.0))
         found = np.array(known)
-        return inputs_of(found[:, :2], found[:, 2].astype(np.int64), len(shown[0].stages), APART), found[:, 3]
+        return inputs_of(found[:, :2], found[:, 2].astype(np.int64), len(shown[0].stages), STAGE_DISTANCE), found[:, 3]
 
 
 def _seen(shown: Sequence[Encoded], corner: tuple[float, float], stages: Sequence[int]) -> tuple[float, Vector]:
@@ -199,7 +200,7 @@ def learned(
         most = belief.argmax(axis=1)
         found = np.empty((len(late), 4))
         along_all(late, one.stillness, most, placed.stages, found)
-        inputs.append(np.hstack([found[:, :2], APART_BESIDE * belief[:, : len(stages)]]))
+        inputs.append(np.hstack([found[:, :2], STAGE_DISTANCE_BESIDE * belief[:, : len(stages)]]))
         beliefs.append(belief)
         lates.append(late)
     kept = [_kept(*one, ERRORS_KEPT // len(encoded)) for one in zip(inputs, errors, strict=True)]

@@ -17,7 +17,7 @@ from service.contract.incidents import word
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
 from service.core.geometry import between_segments, off_target, place
-from service.core.separation.clearance import FARTHEST
+from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.viewer.banner import banner, line
@@ -278,7 +278,7 @@ class DynamicScene:
         body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
         placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
         place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
-        if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST):
+        if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST_REPORTED_M):
             for side in np.flatnonzero(seen):
                 hand = np.stack([frame["hands"][side], frame["hands"][side] + self._forearm])
                 for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):

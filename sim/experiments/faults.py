@@ -27,7 +27,7 @@ from service.client import RefusedError
 from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.records import Mode, Reason
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.recording.recording import Recording
 from service.shipped import cell_of
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot

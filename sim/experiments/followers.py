@@ -17,10 +17,10 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from service.config import Settings, robot_description
 from service.contract.records import SIDES, Flag
-from service.core.arm.arm import Arm, Closing
+from service.core.arm.stage import Arm, Closing
 from service.core.frame import Event, Tick, Vector
-from service.core.limiter.limiter import Limiter
-from service.core.separation.clearance import FARTHEST
+from service.core.limiter.stage import Limiter
+from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.skill.skill import Skill
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.moving_hands import PERIOD_S, Moving
@@ -55,8 +55,8 @@ def ours(skill: Skill, settings: Settings) -> Follower:
     skill = replace(skill, threshold=math.inf)
     settings = msgspec.structs.replace(
         settings,
-        people=msgspec.structs.replace(settings.people, clearance=-FARTHEST),
-        obstacles=msgspec.structs.replace(settings.obstacles, clearance=-FARTHEST),
+        people=msgspec.structs.replace(settings.people, clearance=-FARTHEST_REPORTED_M),
+        obstacles=msgspec.structs.replace(settings.obstacles, clearance=-FARTHEST_REPORTED_M),
     )
 
     def follow(hands: Moving) -> Followed:

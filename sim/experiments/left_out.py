@@ -21,11 +21,14 @@ from service.config import Reach, Settings
 from service.contract.explain import in_words
 from service.contract.records import SIDES
 from service.contract.requests import Hands, ViaPoint
+from service.core.codes import HANDS_KNOWN
 from service.core.controller import start_state
 from service.core.frame import Event, blank, frame_layout
-from service.core.intake.intake import HANDS_KNOWN, Intake
+from service.core.intake.stage import Intake
 from service.core.skill.model import CHI_SQUARE
-from service.core.skill.skill import UNSURE_M, Skill, SkillStage
+from service.core.skill.skill import Skill
+from service.core.skill.stage import SkillStage
+from service.core.skill.tuning import UNSURE_M
 from service.learning.demonstration import Demonstration
 from service.shipped import shipped_skill
 from sim.closed_loop import START_NS, hand_event

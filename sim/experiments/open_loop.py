@@ -21,7 +21,7 @@ from service.core.frame import Frame, Tick
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Known, Prediction, Skill, clamp
-from service.core.skill.stages import CALM_MPS, MAX_MPS2, STEP_S
+from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2, MOTION_STEP_S
 from sim.experiments.results import Array
 
 Law: TypeAlias = Callable[[Array], Array]
@@ -54,14 +54,14 @@ def along_hands(law: Law, hands: Array, velocities: Array, accelerations: Array)
     """
     speed = np.repeat(np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2), 3, axis=1)
     goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
-    step, bend = STEP_S * goes * velocities, 0.5 * STEP_S**2 * goes * accelerations
+    step, bend = MOTION_STEP_S * goes * velocities, 0.5 * MOTION_STEP_S**2 * goes * accelerations
     return differences(*(law(hands + way * step + abs(way) * bend) for way in (-1.0, 0.0, 1.0)))
 
 
 def differences(behind: Array, now: Array, ahead: Array) -> Array:
-    """Positions (..., 3) [m] that are STEP_S apart as the middle one's motion (..., 3, 3)."""
-    acceleration = (ahead - 2.0 * now + behind) / STEP_S**2
-    motion = [now, (ahead - behind) / (2.0 * STEP_S), np.clip(acceleration, -MAX_MPS2, MAX_MPS2)]
+    """The middle one's motion (..., 3, 3), from positions (..., 3) [m] MOTION_STEP_S apart."""
+    acceleration = (ahead - 2.0 * now + behind) / MOTION_STEP_S**2
+    motion = [now, (ahead - behind) / (2.0 * MOTION_STEP_S), np.clip(acceleration, -MAX_TARGET_MPS2, MAX_TARGET_MPS2)]
     return np.stack(motion, axis=-2)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
 from service.core.skill.skill import Skill
-from service.core.skill.stages import STEP_S
+from service.core.skill.tuning import MOTION_STEP_S
 from service.core.skill.via_points import neighbourhoods
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import StoredSkill
@@ -165,7 +165,7 @@ def promp(skill: Skill, demonstrations: Sequence[Demonstration]) -> Adapt:
 
         def says(bench: Bench) -> Said:
             """Its tool now; it is told when the hands begin."""
-            rows = (spline(np.clip(bench.time_s + way * STEP_S, 0.0, lasts_s)) for way in (-1, 0, 1))
+            rows = (spline(np.clip(bench.time_s + way * MOTION_STEP_S, 0.0, lasts_s)) for way in (-1, 0, 1))
             return Said(differences(*rows))
 
         return lambda bench: rival(skill, lambda *moving: says(bench))

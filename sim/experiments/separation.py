@@ -20,7 +20,9 @@ from service.config import Settings, robot_description
 from service.contract.records import Flag
 from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
-from service.core.separation.separation import SLIP, Separation, allowed_speed
+from service.core.separation.stage import Separation
+from service.core.separation.step import allowed_speed
+from service.core.separation.tuning import SLIP_SPEED_MPS
 from service.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
@@ -113,7 +115,7 @@ class Outcome(NamedTuple):
     excess_at_once: float  # [m/s] over the rule, the most
     excess_after_reaction: float  # over the most that the rule allowed within the reaction time
     excess_hurried: float  # the same at hands that were faster meanwhile than the rule had assumed
-    excess_lasts_s: float  # that a part is above the rule at once by more than SLIP without a break
+    excess_lasts_s: float  # that a part is above the rule at once by more than SLIP_SPEED_MPS without a break
     fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
     limited_s: float  # in which separation held the arm back
     self_mm: float  # nearest that links come to each other, which are kept apart
@@ -180,7 +182,7 @@ def _judged(
         float((speed - allowed)[began].max()),
         float(np.where(assumed, over, -1.0)[began].max()),
         float(np.where(assumed, -1.0, over)[began].max()),
-        dt * _longest(((speed - allowed > SLIP) & assumed)[began]),
+        dt * _longest(((speed - allowed > SLIP_SPEED_MPS) & assumed)[began]),
         float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
         1000 * float(own.min()),
@@ -274,7 +276,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     numbers = {
         "scenes": len(scenes),
         "rate_hz": RATE_HZ,
-        "slip_m_per_s": SLIP,
+        "slip_m_per_s": SLIP_SPEED_MPS,
         **{kind: _summary(rows) for kind, rows in found.items()},
         "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
         "later_for_a_thrust_s": _later_for(found["thrust"], found["random"]),
@@ -310,7 +312,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "excess_after_reaction": max(one.excess_after_reaction for one in rows),
         "excess_hurried": max(one.excess_hurried for one in rows),
         "excess_lasts_s": max(one.excess_lasts_s for one in rows),
-        "above_after_reaction": sum(one.excess_after_reaction > SLIP for one in rows),
+        "above_after_reaction": sum(one.excess_after_reaction > SLIP_SPEED_MPS for one in rows),
         "fastest_hand": max(one.fastest_hand for one in rows),
         "limited_s": float(np.mean([one.limited_s for one in rows])),
         "self_mm": min(one.self_mm for one in rows),

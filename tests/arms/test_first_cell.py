@@ -14,8 +14,8 @@ import pytest
 
 from service.arms.first_cell import PLACES, Proposal, plate_of, proposed, rates, turn_of_tool, written
 from service.config import load, robot_description
-from service.core.arm.arm import Arm
-from service.core.separation.separation import Separation
+from service.core.arm.stage import Arm
+from service.core.separation.stage import Separation
 from service.described_arm import description
 from service.learning.via_points import adapted
 from service.shipped import shipped_skill

@@ -16,8 +16,8 @@ from service.arms.drive import DriveError
 from service.arms.playback import Playback
 from service.client import Command
 from service.config import JointSettings, Settings, robot_description
-from service.core.arm.arm import Arm
-from service.core.limiter.limiter import Limiter
+from service.core.arm.stage import Arm
+from service.core.limiter.stage import Limiter
 from support.franka_cell import STANDS, assert_allowed, cell, fr3, robot, simulated
 
 TICK, PERIOD = 0.002, franka.PERIOD_S  # [s]

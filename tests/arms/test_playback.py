@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from service.arms.playback import REJOIN_AFTER_S, REJOIN_RAD, Playback
 from service.client import BRAKE_AFTER_S, Command
 from service.config import JointSettings
-from service.core.limiter.limiter import Limiter
+from service.core.limiter.stage import Limiter
 
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
-from service.core.arm.arm import Arm
-from service.core.limiter.limiter import Limiter
+from service.core.arm.stage import Arm
+from service.core.limiter.stage import Limiter
 from service.core.skill.skill import clamp
 from support.wam import JOINT_NAMES, URDF
 

@@ -14,7 +14,7 @@ import pytest
 from service.config import Settings, load, robot_description
 from service.contract.messages import JointState
 from service.contract.records import Cause, Mode, Reason
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Event, Frame, Tick, Vector, order
 from service.core.geometry import quaternion_of

@@ -9,9 +9,10 @@ import pytest
 from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
 from service.core.frame import blank
-from service.core.intake.intake import Intake
-from service.core.setpoint.setpoint import LATE_MOST, SetpointGenerator
+from service.core.intake.stage import Intake
+from service.core.setpoint.stage import SetpointGenerator
 from service.core.setpoint.tracker import tracker_gains
+from service.core.setpoint.tuning import LATE_STOP_MAX_M
 from service.core.skill.model import Target
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE
@@ -112,7 +113,7 @@ def test_a_target_that_goes_to_and_fro_faster_than_the_arm_can_is_still_met(
 
 
 def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
-    """Of a target that stops at once, from 0.4 m/s. While it moves, that costs LATE_MOST."""
+    """Of a target that stops at once, from 0.4 m/s. While it moves, that costs LATE_STOP_MAX_M."""
     velocity, passed, behind = np.array([0.4, 0.0, 0.0]), [], []
     for response_s in (0.0235, 0.04):
         generator, state, farthest = SetpointGenerator(Settings()), blank(STATE), 0.0
@@ -128,7 +129,7 @@ def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
         passed.append(farthest)
     assert passed[0] > 0.005
     assert passed[1] < 0.002
-    assert behind[1] - behind[0] < LATE_MOST + 0.002
+    assert behind[1] - behind[0] < LATE_STOP_MAX_M + 0.002
 
 
 def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:

@@ -10,8 +10,8 @@ import pytest
 from service.config import HandSettings
 from service.core.frame import Vector
 from service.core.intake import MODES, STATES, mode_filter
-from service.core.intake.hand_estimator import LEAST_NOISE, MOST_NOISE
 from service.core.intake.motion_model import REST, model
+from service.core.intake.tuning import LEAST_NOISE_M, MAX_NOISE_M
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 
@@ -57,7 +57,7 @@ def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
     states = follow(hands, lambda t: still, until_s=6.0, noise=noise)
     assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.65 * noise_m
     found = math.sqrt(hands.state["noise_variance"][LEFT])
-    assert max(noise_m, LEAST_NOISE) * 0.7 < found < max(noise_m, LEAST_NOISE) * 1.4
+    assert max(noise_m, LEAST_NOISE_M) * 0.7 < found < max(noise_m, LEAST_NOISE_M) * 1.4
 
 
 def test_what_is_said_of_the_noise_makes_no_difference_after_a_second_and_a_half() -> None:
@@ -96,7 +96,7 @@ def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() 
         assert np.linalg.eigvalsh(covariance).min() > 0
     assert state["mode_probabilities"][LEFT].sum() == pytest.approx(1.0)
     assert (state["mode_probabilities"][LEFT] > 0).all()
-    assert LEAST_NOISE**2 <= state["noise_variance"][LEFT] <= MOST_NOISE**2
+    assert LEAST_NOISE_M**2 <= state["noise_variance"][LEFT] <= MAX_NOISE_M**2
     assert np.isfinite(state["hands"]).all()
 
 

@@ -7,12 +7,15 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from service.config import robot_description
-from service.core.arm.arm import DAMPING, TURN_LEVER, Arm
-from service.core.arm.inverse_kinematics import describe, tool_speed_after, tool_speeds
 from service.core.arm.least_squares import least_squares
-from service.core.decision.decision import measured_error
+from service.core.arm.stage import Arm
+from service.core.arm.step import describe
+from service.core.arm.tuning import DAMPING_M2, TURN_LEVER_M
+from service.core.decision.step import measured_error
 from service.core.frame import parameters
-from service.core.setpoint.setpoint import GAP_FREE, GAP_SLOW, slow_down
+from service.core.kinematics import tool_speed_after, tool_speeds
+from service.core.setpoint.step import slow_down
+from service.core.setpoint.tuning import GAP_FREE_M, GAP_SLOW_M
 from service.shipped import cell_of
 
 
@@ -35,12 +38,12 @@ def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> Non
 def test_tasks_are_the_tool_s_velocity_and_what_turns_it(count: int) -> None:
     random = np.random.default_rng(1)
     jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
-    arm = parameters(turn_lever=TURN_LEVER, damping=DAMPING, singular_damping=2e-3, singular_volume=0.04)
+    arm = parameters(turn_lever=TURN_LEVER_M, damping=DAMPING_M2, singular_damping=2e-3, singular_volume=0.04)
     here = parameters(tasks=np.empty((count, 7)), damping=0.0, jacobian=np.empty((6, 7)), rotation=np.empty((3, 3)))
     describe(arm, here, jacobian, rotation)
-    expected = np.vstack([jacobian[:3], TURN_LEVER * rotation.T @ jacobian[3:]])[:count]
+    expected = np.vstack([jacobian[:3], TURN_LEVER_M * rotation.T @ jacobian[3:]])[:count]
     np.testing.assert_allclose(here["tasks"][0], expected, rtol=1e-12, atol=1e-15)
-    assert here["damping"][0] == DAMPING  # far from singular
+    assert here["damping"][0] == DAMPING_M2  # far from singular
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
@@ -73,7 +76,7 @@ def test_the_tool_s_speed_after_a_way_of_the_joints_is_that_of_pinocchio(name: s
 
 def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
     setpoint, tool = np.zeros((3, 3)), np.zeros(3)
-    setpoint[0, 0], setpoint[1, 0] = GAP_FREE + GAP_SLOW, 0.2
+    setpoint[0, 0], setpoint[1, 0] = GAP_FREE_M + GAP_SLOW_M, 0.2
     assert slow_down(setpoint, tool, 1.0, 0.8) == pytest.approx(0.5)
     assert slow_down(setpoint, tool, 0.4, 0.8) == pytest.approx(0.1)  # of 0.8 m/s, where 0.08 are allowed
     setpoint[1, 0] = -0.2  # it comes back

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from service.contract.records import SIDES, Cause, Mode
 from service.core.controller import Controller
 from service.core.frame import Tick
-from service.core.setpoint.setpoint import STOP_BRAKE
+from service.core.setpoint.tuning import HAND_BRAKE_MPS2
 from service.learning.skill_file import decoded
 from support.in_process import ASSUMED, LEFT, RIGHT, hand
 from support.paths import RECORDINGS
@@ -44,7 +44,7 @@ def test_a_legal_hand_never_faults_nor_jumps_and_hardly_holds(
     way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
     far = np.linalg.norm(way, axis=1).max()
     # a minimum-jerk reach, which no hand brakes harder at its end than the setpoint takes it to
-    lasts = max(1.875 * far / max_speed, math.sqrt(5.774 * far / STOP_BRAKE))
+    lasts = max(1.875 * far / max_speed, math.sqrt(5.774 * far / HAND_BRAKE_MPS2))
     stamps = np.arange(0.0, SECONDS, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
     for at in random.uniform(0.0, SECONDS, 2):

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.config import JointSettings
-from service.core.limiter.limiter import Limited, Limiter, approach_gain
+from service.core.joint_limits import approach_gain
+from service.core.limiter.stage import Limited, Limiter
 
 PERIOD = 0.002  # [s]
 LIMITS = JointSettings()

@@ -12,7 +12,8 @@ from service.contract.records import Field
 from service.core.frame import blank
 from service.core.skill import ORDER, TURNS
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import LAG_S, TURN_M, features, moving_features, remember
+from service.core.skill.memory import features, moving_features, remember
+from service.core.skill.tuning import MEMORY_LAG_S, TURN_WEIGHT_M
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill, decoded
@@ -52,7 +53,7 @@ def both_remembered(
         if tick not in unseen:
             state["hand_ticks"], state["hands"][:, 0] = tick, both.reshape(2, 3)
             state["hand_turns"] = turn.reshape(2, 9)
-            remember(states, period_s, LAG_S)
+            remember(states, period_s, MEMORY_LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
         turned.append(state["turns"].reshape(TURNS, 18).copy())
     return np.array(out), np.array(turned)
@@ -72,7 +73,7 @@ def test_hands_are_turned_live_as_they_were_learned_at_any_rate(rate_hz: int) ->
     shown = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
     told = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
     live = both_remembered(told[:, :6], told, 1.0 / rate_hz)[1][:: rate_hz // 50, -1]
-    assert np.abs(TURN_M * live - shown).max() < 0.0005
+    assert np.abs(TURN_WEIGHT_M * live - shown).max() < 0.0005
 
 
 def test_hands_that_rest_are_remembered_where_they_are_and_those_that_come_first_at_once() -> None:
@@ -101,7 +102,7 @@ def test_inputs_move_as_their_velocity_and_acceleration_say() -> None:
         slope = np.gradient(found[:, order], h, axis=0)[late]
         assert np.abs(slope - found[late, order + 1]).max() < 0.01
         assert np.abs(slope[:, -18:]).max() > 0.01
-    assert LAG_S * ORDER == 2.0
+    assert MEMORY_LAG_S * ORDER == 2.0
 
 
 def takes(count: int, *, remembers: bool) -> list[Demonstration]:

@@ -9,7 +9,7 @@ import pytest
 
 from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.skill.skill import Skill

@@ -20,7 +20,7 @@ from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, copied, parameters
-from service.core.intake import intake, plausibility
+from service.core.intake import plausibility, step
 from service.core.skill.skill import Skill
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from support.tracked import LEFT as LEFT_SIDE
@@ -341,7 +341,7 @@ def test_one_sudden_move_of_both_hands_is_followed_without_a_hold(skill: Skill) 
 @given(STAMPS, STAMPS, st.booleans(), st.floats(0.0, 10.0))
 @example_settings(max_examples=200, deadline=None, derandomize=True)
 def test_stamps_are_judged_as_the_plain_rule_says(stamp: int, newest: int, fresh: bool, passed_s: float) -> None:
-    found = intake.refusal(stamp, newest, fresh, passed_s, 0.1, 0.05)
+    found = step.refusal(stamp, newest, fresh, passed_s, 0.1, 0.05)
     if stamp == newest:
         wanted = Cause.REPEATED
     elif fresh and newest - stamp > 50_000_000:
@@ -360,7 +360,7 @@ def test_compiled_and_plain_memory_agree() -> None:
         ticks, answers = int(random.integers(0, 12)), []
         for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
             state["tick"] += ticks
-            way(intake.note)(state.base.view(np.recarray), 0, jumped, 0.002)
+            way(step.note)(state.base.view(np.recarray), 0, jumped, 0.002)
             answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), given, 0, at))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)

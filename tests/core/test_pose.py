@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.config import Settings
 from service.contract import cdr
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller, outgoing
 from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
-from service.core.limiter.limiter import Limiter
-from service.core.setpoint.setpoint import TURN_SPEED_SHARE, OrientationSetpoint
-from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation
-from service.core.skill.skill import MOVES_S, Skill, decided
+from service.core.limiter.stage import Limiter
+from service.core.setpoint.orientation import OrientationSetpoint
+from service.core.setpoint.tuning import ORIENTATION_SPEED_SHARE
+from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
+from service.core.skill.skill import Skill
+from service.core.skill.tuning import GRIPPER_MOVES_S
 from service.learning.via_points import adapted
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
@@ -95,7 +97,7 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
         lead.step(state, target.as_quat(), np.zeros(3))
         seen.append(state["turning"].copy())
     speeds = np.array(seen)
-    assert np.linalg.norm(speeds, axis=1).max() <= TURN_SPEED_SHARE * FASTEST + 1e-6
+    assert np.linalg.norm(speeds, axis=1).max() <= ORIENTATION_SPEED_SHARE * FASTEST + 1e-6
     assert np.linalg.norm(np.diff(speeds, axis=0), axis=1).max() <= HARDEST * PERIOD_S + 1e-6
     off = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])
@@ -145,7 +147,7 @@ def test_a_gripper_is_decided_with_hysteresis() -> None:
         assert decided(CLOSED, closure) == CLOSED
     assert decided(OPEN, 0.95) == CLOSED
     assert decided(CLOSED, 0.05) == OPEN
-    assert decided(CLOSED, 0.05, since_s=0.5 * MOVES_S) == CLOSED  # it is still on its way
+    assert decided(CLOSED, 0.05, since_s=0.5 * GRIPPER_MOVES_S) == CLOSED  # it is still on its way
     assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is not there yet
     assert [decided(one, NO_GRIPPER) for one in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
 

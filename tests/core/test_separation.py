@@ -16,20 +16,17 @@ import pytest
 
 from service.config import Box, Obstacles, Settings, Table, robot_description
 from service.contract.records import Flag, Mode
-from service.core.arm.arm import Arm, Kinematics
+from service.core.arm.stage import Arm
 from service.core.controller import Controller, start_state
 from service.core.frame import Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
-from service.core.limiter.limiter import LimiterStage
+from service.core.kinematics import Kinematics
+from service.core.limiter.stage import LimiterStage
 from service.core.separation.body import Body, body_of
 from service.core.separation.clearance import NEAR_ITSELF, NOBODY
-from service.core.separation.separation import (
-    RETREAT_SPEED,
-    SLIP,
-    TABLE_DEPTH,
-    Separation,
-    allowed_speed,
-)
+from service.core.separation.stage import Separation
+from service.core.separation.step import allowed_speed
+from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS, TABLE_DEPTH_M
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from service.shipped import shipped_skill
@@ -137,7 +134,10 @@ def test_constraints_are_how_fast_distances_shrink() -> None:
         ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
     )
     apart, table = Separation(settings, URDF), settings.table
-    low, high = np.array(table.centre) - [*table.half_size, TABLE_DEPTH], np.add(table.centre, [*table.half_size, 0.0])
+    low, high = (
+        np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M],
+        np.add(table.centre, [*table.half_size, 0.0]),
+    )
     boxes = np.array([[low, high], [(0.45, -0.05, 0.15), (0.55, 0.05, 0.25)]])
     state = start_state(settings, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"], state["hands"][:, 0] = 0, np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]
@@ -208,7 +208,7 @@ def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
     people = ASSUMED.people
     allowed = np.array([allowed_speed(d, 0.0, people.brake, 0.13, people.clearance) for d in distance[late].ravel()])
-    assert (speed[late].ravel() - allowed).max() <= SLIP + 1e-3
+    assert (speed[late].ravel() - allowed).max() <= SLIP_SPEED_MPS + 1e-3
 
 
 def test_distance_and_limit_are_in_the_frame(taught: Skill) -> None:
@@ -293,9 +293,9 @@ def test_parts_that_are_too_near_each_other_go_apart_and_hardly_slip(arm: str) -
             continue
         separation.step(start_state(cell, shipped_skill()), blank(frame_layout(len(q))), kinematics.at(q).record)
         least = separation.constraints[: separation.count]
-        assert least["allowed"].min() == pytest.approx(0.1 * SLIP)
+        assert least["allowed"].min() == pytest.approx(0.1 * SLIP_SPEED_MPS)
         planned.append(least["planned"].min())
-    assert min(planned) == pytest.approx(-RETREAT_SPEED)
+    assert min(planned) == pytest.approx(-RETREAT_SPEED_MPS)
     assert max(planned) <= 0.0  # some parts that joints can hardly move stay where they are
 
 
@@ -357,11 +357,11 @@ def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -
             place, *others = taught.via_points
             apart.set_contacts([msgspec.structs.replace(place, left=tuple(here.position.tolist())), *others])
         apart.step(state, FRAME, here.record)
-        allowed = apart.constraints["allowed"][: apart.count] - SLIP
+        allowed = apart.constraints["allowed"][: apart.count] - SLIP_SPEED_MPS
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
         state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, here.position  # the other hand receives nothing
         apart.step(state, FRAME, here.record)
-        assert not (abs(apart.constraints["allowed"][: apart.count] - SLIP - 0.25) < 1e-9).any()
+        assert not (abs(apart.constraints["allowed"][: apart.count] - SLIP_SPEED_MPS - 0.25) < 1e-9).any()
         state["hands"][0, 0], state["hands"][1, 0] = here.position, Scene().right_start
         apart.step(state, FRAME, here.record)
         assert apart.speed_limit == 0.0  # no other part may come nearer

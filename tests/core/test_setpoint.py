@@ -12,19 +12,15 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.config import Settings, ToolSettings
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.frame import Vector, blank, copied, frame_layout
-from service.core.setpoint.bounds import (
-    HULL_MARGIN,
-    HULL_TIME_S,
-    RETURN_SHARE,
-    fastest_stop,
-    speed_to_come,
-    stop_distance,
-)
-from service.core.setpoint.setpoint import SetpointGenerator, SetpointStage, slow_down
+from service.core.setpoint.bounds import speed_to_come, stop_distance
+from service.core.setpoint.stage import SetpointGenerator, SetpointStage
+from service.core.setpoint.step import slow_down
 from service.core.setpoint.tracker import waiting
+from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
 from service.core.skill.model import Target, Wanted
+from service.core.stops import fastest_stop
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE, URDF
@@ -49,8 +45,8 @@ def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings
     positions = np.array([states[0, 0], *(target[0] for target in targets)])
     for k in range(0, len(targets), 7):
         last = positions[max(0, k + 1 - WAY_TICKS) : k + 2]
-        assert (states[k + 1, 0] >= last.min(axis=0) - HULL_MARGIN - 1e-9).all()
-        assert (states[k + 1, 0] <= last.max(axis=0) + HULL_MARGIN + 1e-9).all()
+        assert (states[k + 1, 0] >= last.min(axis=0) - HULL_MARGIN_M - 1e-9).all()
+        assert (states[k + 1, 0] <= last.max(axis=0) + HULL_MARGIN_M + 1e-9).all()
 
 
 # --- bounds ------------------------------------------------------------
@@ -91,7 +87,7 @@ def test_an_axis_that_wild_ones_starve_comes_back(
         sign = (-1.0) ** (k // ticks)
         targets.append(np.array([(0.5, y, z), (0.0, 0.0, 0.0), (0.0, sign * wild, -sign * wild)]))
     states, _ = driven(targets, start=at_rest(start))
-    back_s = (abs(start[0] - 0.5) - HULL_MARGIN) / (RETURN_SHARE * TOOL.max_speed)
+    back_s = (abs(start[0] - 0.5) - HULL_MARGIN_M) / (RETURN_SHARE * TOOL.max_speed)
     if back_s < len(targets) * PERIOD_S - 2 * HULL_TIME_S:
         assert abs(states[-1, 0, 0] - 0.5) <= margin(TOOL) + 1e-6
 
@@ -107,8 +103,8 @@ def test_what_alternates_is_followed_no_farther_than_it_goes(rate_hz: int, apart
     states, _ = driven(targets)
     assert_bounds_hold(states, targets)
     swing = states[1500:, 0, 1]
-    assert swing.min() >= -HULL_MARGIN - 1e-9
-    assert swing.max() <= apart_m + HULL_MARGIN + 1e-9
+    assert swing.min() >= -HULL_MARGIN_M - 1e-9
+    assert swing.max() <= apart_m + HULL_MARGIN_M + 1e-9
 
 
 def test_it_does_not_swing_by_itself() -> None:

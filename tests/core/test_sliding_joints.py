@@ -12,12 +12,12 @@ import pytest
 
 from service.config import Settings, robot_description
 from service.contract.records import Cause, Mode, Reason
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.geometry import place
 from service.core.separation.body import body_of
-from service.core.separation.separation import Separation
+from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
 from service.recording.recording import Recorder
 from service.recording.replay import replay

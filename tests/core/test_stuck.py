@@ -17,11 +17,11 @@ from msgspec.structs import replace
 
 from service.config import Settings, robot_description
 from service.contract.records import Flag, Mode, Reason
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller, start_state
 from service.core.decision import WAY
 from service.core.frame import Event, Frame, Tick, Vector, order
-from service.core.separation.separation import Separation
+from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
 from service.learning.via_points import adapted

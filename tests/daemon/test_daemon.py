@@ -23,7 +23,7 @@ from service.cli.main import main
 from service.client import RefusedError
 from service.config import Settings, robot_description
 from service.contract import cdr, messages, requests
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import TURN_LAG_S
+from service.core.skill.tuning import TURN_LAG_S
 from service.learning.demonstration import Demonstration, groups
 from service.learning.inputs import KINDS, Inputs
 from service.learning.judgement import Figures, table

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.config import Reach, Settings, robot_description
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.core.skill.skill import is_reachable
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import StoredSkill

@@ -23,7 +23,7 @@ from service.config import HandSettings, Settings, ToolSettings, robot_descripti
 from service.contract import cdr, channels
 from service.contract.messages import JointState, PoseStamped
 from service.contract.requests import Add, encode_json
-from service.core.arm.arm import Arm
+from service.core.arm.stage import Arm
 from service.demonstrations.capture import (
     JOINT_STATES,
     KEPT_S,

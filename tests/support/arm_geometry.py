@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from service.config import Settings
 from service.core.frame import Vector
 from service.core.separation.body import body_of
-from service.core.separation.separation import TABLE_DEPTH
+from service.core.separation.tuning import TABLE_DEPTH_M
 from service.urdf import Urdf
 
 STEP_S = 1e-5  # of difference quotients
@@ -37,7 +37,7 @@ class ArmGeometry:
         self._names, self._chain = settings.joints.names, Urdf(urdf).chain(settings.arm.plate)
         self._tool = np.array(settings.tool.plate_from_tool[:3])
         centre, half = np.array(settings.table.centre), np.array([*settings.table.half_size, 0.0])
-        boxes = [(centre - half - (0.0, 0.0, TABLE_DEPTH), centre + half)]
+        boxes = [(centre - half - (0.0, 0.0, TABLE_DEPTH_M), centre + half)]
         boxes += [(np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)) for b in settings.obstacles.boxes]
         self.boxes = np.array(boxes)
         toward = np.array(settings.people.toward_elbow)

@@ -10,15 +10,10 @@ import pytest
 from service.config import Settings, ToolSettings
 from service.core.controller import Controller
 from service.core.frame import Record, Vector
-from service.core.setpoint.bounds import (
-    HULL_MARGIN,
-    HULL_SPANS,
-    HULL_TIME_S,
-    RETURN_SHARE,
-    farthest,
-    speed_to_come,
-)
-from service.core.setpoint.setpoint import SetpointGenerator
+from service.core.setpoint import HULL_SPANS
+from service.core.setpoint.bounds import farthest, speed_to_come
+from service.core.setpoint.stage import SetpointGenerator
+from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
 from service.core.skill.model import Target
 from service.core.skill.skill import Skill
 
@@ -28,7 +23,7 @@ def margin(tool: ToolSettings) -> float:
     back = RETURN_SHARE * tool.max_speed
     stop_s = (tool.max_speed + back) / tool.stop_acceleration
     stop_s += (tool.acceleration + tool.stop_acceleration) / tool.stop_jerk
-    return HULL_MARGIN + back * stop_s
+    return HULL_MARGIN_M + back * stop_s
 
 
 class Explained(SetpointGenerator):
@@ -75,5 +70,5 @@ class Explained(SetpointGenerator):
 def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:
     """A controller whose setpoint generator asserts its bound."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.core.setpoint.setpoint.SetpointGenerator", Explained)
+        patch.setattr("service.core.setpoint.stage.SetpointGenerator", Explained)
         return Controller(settings, skill, urdf=urdf)

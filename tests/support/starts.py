@@ -7,7 +7,7 @@ import numpy as np
 from service.config import Settings, robot_description
 from service.core.frame import Vector
 from service.core.separation.clearance import NOBODY
-from service.core.separation.separation import Separation
+from service.core.separation.stage import Separation
 
 
 def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:

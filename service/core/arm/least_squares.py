@@ -9,15 +9,16 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.arm.tuning import (
+    BOUND_ROUNDS,
+    CONSTRAINT_ROUNDS,
+    LEAST_BOUND_GAIN,
+    LEAST_EXCESS,
+    LEAST_FORCE,
+    LEAST_PIVOT,
+    LEAST_SLOPE,
+)
 from service.core.frame import Vector
-
-LEAST_SQUARE = 1e-12  # of a pivot: what is less is rounding
-LEAST_GAIN = 1e-12  # for which a joint leaves its bound
-BOUND_ROUNDS = 12  # joints that may enter or leave their bounds in one step
-ROUNDS = 40  # inequalities that may be met or left in one step
-LEAST_EXCESS = 1e-9  # beyond a limit that counts
-LEAST_SLOPE = 1e-10  # along which a constraint can still be met
-LEAST_FORCE = 1e-12  # of a constraint that may be left
 
 
 @compiled
@@ -30,7 +31,7 @@ def factorise(tasks: Vector, damping: float, root: Vector) -> None:
                 total += tasks[i, k] * tasks[j, k]
             for k in range(j):
                 total -= root[i, k] * root[j, k]
-            root[i, j] = math.sqrt(max(total, LEAST_SQUARE)) if i == j else total / root[j, j]
+            root[i, j] = math.sqrt(max(total, LEAST_PIVOT)) if i == j else total / root[j, j]
 
 
 @compiled
@@ -104,7 +105,7 @@ def least_squares(
             rest[i] = -wanted[i]
             for j in range(joints):
                 rest[i] += tasks[i, j] * result[j]
-        leaving, most = -1, LEAST_GAIN  # the bound whose inside is better by most
+        leaving, most = -1, LEAST_BOUND_GAIN  # the bound whose inside is better by most
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
@@ -199,7 +200,7 @@ def _solve_under(
     normals, moved = np.zeros((joints, joints)), np.zeros((joints, joints))
     normal, way, yielding = np.empty(joints), np.empty(joints), np.empty(joints)
     entering, pushed = -1, 0.0
-    for _ in range(ROUNDS):
+    for _ in range(CONSTRAINT_ROUNDS):
         if entering < 0:
             entering, pushed = _farthest(bounds, rows, limits, x, 0.1 * LEAST_EXCESS), 0.0
             if entering < 0:
@@ -308,7 +309,7 @@ def _yield_to(way: Vector, normals: Vector, moved: Vector, size: int, out: Vecto
                 total += normals[a, j] * moved[b, j]
             for k in range(b):
                 total -= root[a, k] * root[b, k]
-            root[a, b] = math.sqrt(max(total, LEAST_SQUARE)) if a == b else total / root[b, b]
+            root[a, b] = math.sqrt(max(total, LEAST_PIVOT)) if a == b else total / root[b, b]
     substitute(root, right)
     for a in range(size):
         out[a] = right[a]

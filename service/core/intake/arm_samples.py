@@ -12,15 +12,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import JointSettings, Settings
 from service.core.frame import Records, Vector
+from service.core.intake.tuning import ARM_STILL_S, MAX_JOINT_RADPS
 
 TURN = 2.0 * math.pi
-MAX_JOINT_SPEED = 100.0  # [rad/s] beyond it a measured joint is a mistake
-JUMP_RAD = 0.2  # [rad] jump gate of a joint ...
-JUMP_RADPS = 5.0  # [rad/s] ... for each second without a sample, as by hand an arm is moved so fast ...
-JUMP_SPEEDS = 2.0  # ... or as many times its fastest joint's greatest speed, where that is more
-FARTHEST_OUTSIDE = 0.2  # [rad] a joint farther outside its limits is a mistake, or to be brought back by hand
-STILL_RAD = 0.02  # an arm is at rest that stayed within so much ...
-STILL_S = 0.1  # ... for so long
 
 
 def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
@@ -31,7 +25,7 @@ def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
 
 def still_ticks(settings: Settings) -> int:
     """The ticks over which an arm must report one posture before it is believed."""
-    return math.ceil(round(STILL_S / settings.period_s, 6))
+    return math.ceil(round(ARM_STILL_S / settings.period_s, 6))
 
 
 @compiled
@@ -42,7 +36,7 @@ def compared(states: Records, parameters: Records, position: Vector, velocity: V
     state, given, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
     for i in range(len(position)):
         near = near and given.plausible_joints[0, i] <= position[i] <= given.plausible_joints[1, i]
-        near = near and abs(velocity[i]) <= MAX_JOINT_SPEED * given.per_rad[i]
+        near = near and abs(velocity[i]) <= MAX_JOINT_RADPS * given.per_rad[i]
         off = max(off, abs(position[i] - state.measured[i]) / given.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / given.per_rad[i])
     return near, off, moved

@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from service.contract.incidents import figures
-from service.core.intake.intake import FARTHEST_M, UNIT_M
-
-PLAUSIBLE_M = (0.05, 2.5)  # hands and tool are so far from the base plate, in the unit that was meant
+from service.core.intake.stage import UNIT_M
+from service.core.intake.tuning import MAX_HAND_DISTANCE_M, PLAUSIBLE_DISTANCES_M
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
@@ -18,8 +17,10 @@ def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
     the one with the distance nearest to 1 m is named.
     """
     far = sum(v * v for v in position) ** 0.5
-    meant = [u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_M[0] < far * m < PLAUSIBLE_M[1]]
+    meant = [
+        u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_DISTANCES_M[0] < far * m < PLAUSIBLE_DISTANCES_M[1]
+    ]
     meant.sort(key=lambda u: abs(math.log(far * UNIT_M[u])))
     like = f", which looks like {meant[0]}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
-    return f"at {figures(position)}{like}; {rule}, at most {FARTHEST_M:g} m from the base plate accepted"
+    return f"at {figures(position)}{like}; {rule}, at most {MAX_HAND_DISTANCE_M:g} m from the base plate accepted"

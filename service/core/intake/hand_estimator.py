@@ -19,20 +19,34 @@ import numpy as np
 from kmp.compiled import compiled
 from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
+from service.core.geometry import ROUND_TO
 from service.core.intake import KEPT, MODES
 from service.core.intake.mode_filter import advance, start, update
-from service.core.intake.motion_model import CHANGE, INTENSITY, model
+from service.core.intake.motion_model import CHANGE, model
+from service.core.intake.tuning import (
+    DELAY_TOLERANCE_S,
+    DELAY_WINDOW_S,
+    LEAST_NOISE_M,
+    LONE_SAMPLE_S,
+    MAX_LATE_S,
+    MAX_NOISE_M,
+    MAX_STAMP_DIFFERENCE_NS,
+    MODE_INTENSITIES,
+    NOISE_OUTLIER_SHARE,
+    NOISE_SAMPLES,
+    REAPPEARED_VARIANCE_SHARE,
+    STILLNESS_FALL_S,
+    STILLNESS_LOWPASS_S,
+    TICK_ROUNDING,
+)
 
-LOWPASS_S = 0.1  # time constant of the velocity: a tremor of 8 to 12 Hz is nearly gone from it
-FALL_S = 0.03  # in which it is still no more
-ROUND_TO = 1e9  # of what is remembered: machines that differ in the last bits agree
 STILL = np.ones(2)  # both hands
 USUAL = HandSettings()  # of recordings, whose cell nobody knows
 
 
 def smoothing(period_s: float, still_s: float) -> Vector:
     """By how much (3,) the lowpass velocity, rising and falling stillness change in a period."""
-    return 1.0 - np.exp(-period_s / np.array([LOWPASS_S, still_s, FALL_S]))
+    return 1.0 - np.exp(-period_s / np.array([STILLNESS_LOWPASS_S, still_s, STILLNESS_FALL_S]))
 
 
 @compiled
@@ -61,18 +75,7 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
     return out
 
 
-LEAST_NOISE = 7e-4  # [m] of a tracker's standard deviation: below it, hands tremble
-MOST_NOISE = 5e-2  # [m]
-AVERAGED = 60  # samples over which the noise is averaged
-OUTLIER = 9.0  # times the noise variance: as much as one difference may count
-LATE_S = 0.1  # that a sample may be older than the newest one, and later than the quickest: a network's worst delay
-SECOND_S = 1.0  # in which a tracker's quickest sample is as quick as ever: of 30 its delays, 2 ms of 60
-STEADY_S = 0.01  # that it may differ by all the same: clocks that are 1 % apart are not gone by
-EXACT_NS = 2.0**62  # of differences of two stamps that do not overflow
-ROUNDED = 1e-6  # of a tick, that a lateness may lack: sums of periods are not exact
 LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # clocks: in their first second, not steady, steady
-AGAIN = 16.0  # times the variance that a hand seen again may be off
-ALONE_S = 1.0  # since the sample before one that has none: longer than samples are compared over
 
 
 class HandEstimator:
@@ -115,11 +118,11 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
         for axis in range(3):
             third = position[axis] - 3.0 * past[0, axis] + 3.0 * past[1, axis] - past[2, axis]
             square += third * third
-        seen = min(square / 60.0, OUTLIER * variance)
-        samples = min(state.noise_samples[side] + 1, AVERAGED)
+        seen = min(square / 60.0, NOISE_OUTLIER_SHARE * variance)
+        samples = min(state.noise_samples[side] + 1, NOISE_SAMPLES)
         state.noise_samples[side] = samples
         variance += (seen - variance) / (samples + 1.0)
-        state.noise_variance[side] = min(max(variance, LEAST_NOISE**2), MOST_NOISE**2)
+        state.noise_variance[side] = min(max(variance, LEAST_NOISE_M**2), MAX_NOISE_M**2)
     for axis in range(3):
         past[2, axis] = past[1, axis]
         past[1, axis] = past[0, axis]
@@ -173,7 +176,7 @@ def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> 
     for axis in range(3):
         square += (position[axis] - state.hands[side, 0, axis]) ** 2
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(is_fresh(states, side, unseen_ticks) and square < AGAIN * variance)
+    return bool(is_fresh(states, side, unseen_ticks) and square < REAPPEARED_VARIANCE_SHARE * variance)
 
 
 @compiled
@@ -186,8 +189,8 @@ def _response_s(states: Records, period_s: float) -> float:
         more = max(state.kept[side] - 1, 0)  # of them, so that an interval in which one is late counts little
         if more > 0:
             passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
-            each_s = min(passed * period_s / more, LATE_S)
-            slowest = max(slowest, state.noise_variance[side] * each_s / INTENSITY[CHANGE])
+            each_s = min(passed * period_s / more, MAX_LATE_S)
+            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES[CHANGE])
     return float(np.rint(slowest ** (1.0 / 6.0) * ROUND_TO) / ROUND_TO)
 
 
@@ -211,7 +214,7 @@ def turn_to(states: Records, side: int, turn: tuple[float, float, float, float],
 def seconds_after(stamp_ns: int, other_ns: int) -> float:
     """How much later a stamp is than another one [s], whatever both are."""
     apart_ns = float(stamp_ns) - float(other_ns)
-    return 1e-9 * (float(stamp_ns - other_ns) if abs(apart_ns) < EXACT_NS else apart_ns)
+    return 1e-9 * (float(stamp_ns - other_ns) if abs(apart_ns) < MAX_STAMP_DIFFERENCE_NS else apart_ns)
 
 
 @compiled
@@ -230,7 +233,7 @@ def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> in
     if states[0].clock[side] != BELIEVED:
         return 0
     late_s = max(_later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s))
-    return int(min(max(late_s, 0.0), LATE_S) / period_s + ROUNDED)
+    return int(min(max(late_s, 0.0), MAX_LATE_S) / period_s + TICK_ROUNDING)
 
 
 @compiled
@@ -239,12 +242,12 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
     state = states[0]
     stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
     known = state.clock_tick[side] >= 0
-    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > LATE_S):
+    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > MAX_LATE_S):
         stamps[:], ticks[:] = stamp_ns, state.tick
         state.clock[side], state.clock_tick[side] = LEARNING, state.tick
-    elif (state.tick - state.clock_tick[side]) * period_s >= SECOND_S:
+    elif (state.tick - state.clock_tick[side]) * period_s >= DELAY_WINDOW_S:
         apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
-        steady = abs(apart_s) <= STEADY_S and state.clock[side] != LEARNING
+        steady = abs(apart_s) <= DELAY_TOLERANCE_S and state.clock[side] != LEARNING
         state.clock[side] = BELIEVED if steady else DOUBTED
         stamps[1], ticks[1] = stamps[0], ticks[0]
         stamps[0], ticks[0] = stamp_ns, state.tick
@@ -293,7 +296,7 @@ def take(
     state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, state.tick
     state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
     state.kept_positions[side, at] = position
-    filter_in(states, side, at, ALONE_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
+    filter_in(states, side, at, LONE_SAMPLE_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
     look_ahead(states, models, side)
 
 

@@ -16,17 +16,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector
 from service.core.intake import KEPT
-from service.core.intake.hand_estimator import (
-    ALONE_S,
-    BELIEVED,
-    ROUNDED,
-    filter_in,
-    look_ahead,
-    order_of,
-    seconds_after,
-    slot,
-)
+from service.core.intake.hand_estimator import BELIEVED, filter_in, look_ahead, order_of, seconds_after, slot
 from service.core.intake.mode_filter import advance
+from service.core.intake.tuning import LONE_SAMPLE_S, TICK_ROUNDING
 
 
 @compiled
@@ -40,7 +32,7 @@ def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, 
         behind = slot(states, side, order - 1)
         if state.clock[side] != BELIEVED:
             passed_s = seconds_after(state.kept_stamps_ns[side, slot(states, side, 0)], stamp_ns)
-            tick = state.kept_ticks[side, slot(states, side, 0)] - int(passed_s / period_s + ROUNDED)
+            tick = state.kept_ticks[side, slot(states, side, 0)] - int(passed_s / period_s + TICK_ROUNDING)
         tick = min(tick, state.kept_ticks[side, behind])
     if order < state.kept[side]:
         tick = max(tick, state.kept_ticks[side, slot(states, side, order)])
@@ -116,7 +108,7 @@ def take_late(
         anew = first or state.kept_restarts[side, at] > 0
         if not anew:
             _move_on(means, covariances, models, ticks)
-        filter_in(states, side, at, ALONE_S if first else ticks * given.period_s, anew)
+        filter_in(states, side, at, LONE_SAMPLE_S if first else ticks * given.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _move_on(means, covariances, models, ticks)
     look_ahead(states, models, side)

@@ -23,19 +23,22 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 from service.core.intake import MODES, STATES
-from service.core.intake.motion_model import REST, TREMOR, TREMOR_RATE
-
-PRIOR = np.array([0.3, 0.5, 0.2])  # their probabilities, when nothing is known
-SWITCH_RATES = np.array([0.03, 3.0, 3.0])  # [1/s] at which they are left: rest for what is seen, not for noise
-START_SPEED = 0.3  # [m/s] standard deviation for a hand of which one sample is known
-START_ACCELERATION = 1.0  # [m/s²] likewise
-SLOW = 0.01  # [m/s] standard deviation of one that rests, each axis: hands that hold something drift
-SLOW_CHANGE = 0.01  # [m/s²] likewise: it comes to that speed within a second
-MOST_SLOW = 0.03  # [m/s] it is no faster: reaches begin and end at once, and are to be followed so
-MOST_TREMOR = 6e-3  # [m] of amplitude, which only the ill have more of
-LEAST_PROBABILITY = 1e-4  # of a mode
-MOST_INNOVATION = 60.0  # squared and normalised: beyond it all modes are equally unlikely
-ROUND_PROBABILITY_TO = 1e12  # of probabilities: machines that differ in the last bits agree
+from service.core.intake.motion_model import REST
+from service.core.intake.tuning import (
+    LEAST_MODE_PROBABILITY,
+    MAX_INNOVATION,
+    MAX_TREMOR_M,
+    MODE_PRIOR,
+    MODE_SWITCH_RATES_PER_S,
+    PROBABILITY_ROUND_TO,
+    REST_ACCELERATION_STD_MPS2,
+    REST_MAX_SPEED_MPS,
+    REST_SPEED_STD_MPS,
+    START_ACCELERATION_STD_MPS2,
+    START_SPEED_STD_MPS,
+    TREMOR_RATE_PER_S,
+    TREMOR_STDS_M,
+)
 
 
 @compiled
@@ -47,10 +50,10 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
         for axis in range(3):
             means[mode, 0, axis] = position[axis]
         covariances[mode, 0, 0] = noise
-        covariances[mode, 1, 1] = START_SPEED**2
-        covariances[mode, 2, 2] = START_ACCELERATION**2
+        covariances[mode, 1, 1] = START_SPEED_STD_MPS**2
+        covariances[mode, 2, 2] = START_ACCELERATION_STD_MPS2**2
         _tremble(means[mode], covariances[mode], mode)
-        modes[mode] = PRIOR[mode]
+        modes[mode] = MODE_PRIOR[mode]
 
 
 @compiled
@@ -87,14 +90,14 @@ def _tremble(mean: Vector, covariance: Vector, mode: int) -> None:
     mean[3:] = 0.0
     covariance[3:, :] = 0.0
     covariance[:, 3:] = 0.0
-    covariance[3, 3], covariance[4, 4] = TREMOR[mode] ** 2, (TREMOR[mode] * TREMOR_RATE) ** 2
+    covariance[3, 3], covariance[4, 4] = TREMOR_STDS_M[mode] ** 2, (TREMOR_STDS_M[mode] * TREMOR_RATE_PER_S) ** 2
 
 
 @compiled
 def _come_to_rest(mean: Vector, covariance: Vector) -> None:
     """A mode of motion, known to be slow: so are its velocity and its acceleration."""
     for known in range(1, 3):
-        spread = SLOW if known == 1 else SLOW_CHANGE
+        spread = REST_SPEED_STD_MPS if known == 1 else REST_ACCELERATION_STD_MPS2
         row_of = covariance[known, :3].copy()
         variance = row_of[known] + spread * spread
         for axis in range(3):
@@ -125,14 +128,16 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
     interval later; it comes to rest when it is slow.
     """
     for i in range(MODES):
-        stay = math.exp(-SWITCH_RATES[i] * interval_s)
+        stay = math.exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
         for j in range(MODES):
-            shares[i, j] = modes[i] * ((1.0 - stay) * PRIOR[j] + (stay if i == j else 0.0))
+            shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
         if i != REST:
             square = 0.0
             for axis in range(3):
                 square += means[i, 1, axis] ** 2
-            slow = math.exp(-0.5 * min(square / (covariances[i, 1, 1] + SLOW * SLOW), MOST_INNOVATION))
+            slow = math.exp(
+                -0.5 * min(square / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS), MAX_INNOVATION)
+            )
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
 
@@ -176,9 +181,9 @@ def _beyond_rest(mean: Vector) -> float:
     speed = tremor = 0.0
     for axis in range(3):
         speed += mean[1, axis] ** 2
-        tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE) ** 2
-    trembles = max(tremor - MOST_TREMOR**2, 0.0) / float(TREMOR[REST]) ** 2
-    return max(speed - MOST_SLOW**2, 0.0) / SLOW**2 + trembles
+        tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE_PER_S) ** 2
+    trembles = max(tremor - MAX_TREMOR_M**2, 0.0) / float(TREMOR_STDS_M[REST]) ** 2
+    return max(speed - REST_MAX_SPEED_MPS**2, 0.0) / REST_SPEED_STD_MPS**2 + trembles
 
 
 @compiled
@@ -208,7 +213,7 @@ def update(
             for column in range(row, STATES):
                 p[row, column] -= seen[row] * seen[column] / variance
                 p[column, row] = p[row, column]
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MOST_INNOVATION)
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MAX_INNOVATION)
         if i == REST:
             likelihood[i] -= 0.5 * _beyond_rest(mean)
         best = max(best, likelihood[i])
@@ -216,10 +221,10 @@ def update(
         modes[i] = expected[i] * math.exp(likelihood[i] - best)
     _normalise(modes)
     for i in range(MODES):
-        modes[i] = max(modes[i], LEAST_PROBABILITY)
+        modes[i] = max(modes[i], LEAST_MODE_PROBABILITY)
     _normalise(modes)
     for i in range(MODES):
-        modes[i] = np.rint(modes[i] * ROUND_PROBABILITY_TO) / ROUND_PROBABILITY_TO
+        modes[i] = np.rint(modes[i] * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO
 
 
 @compiled

@@ -12,23 +12,24 @@ velocity, and its acceleration fades: that its motion will end would say too ear
 from __future__ import annotations
 
 import functools
-import math
 
 import numpy as np
 from scipy.linalg import expm
 
 from service.core.frame import Records, Vector, structured
 from service.core.intake import MODES, STATES
+from service.core.intake.tuning import (
+    ACCELERATION_FADE_PER_S,
+    MODE_ACCELERATION_REVERSIONS_PER_S,
+    MODE_INTENSITIES,
+    MODE_VELOCITY_REVERSIONS_PER_S2,
+    TREMOR_DAMPING,
+    TREMOR_RATE_PER_S,
+    TREMOR_STDS_M,
+    VELOCITY_KEPT_S,
+)
 
 REST, REACH, CHANGE = range(MODES)  # the modes
-INTENSITY = np.array([1e-6, 1.0, 30.0])  # [m²/s⁵] of the modes
-REVERT_A = np.array([10.0, 14.0, 14.0])  # [1/s] of the acceleration
-REVERT_V = np.array([0.3, 95.0, 95.0])  # [1/s²] of the velocity: slow hands go on, reaches end
-KEPT_ON_S = 0.06  # [s] since the newest sample, in which velocity is kept, and ...
-FADING = 5.0  # [1/s] ... acceleration fades so fast
-TREMOR = np.array([5e-4, 3e-4, 0.0])  # [m] standard deviation, each axis: more is told from motion by its rhythm
-TREMOR_RATE = 2.0 * math.pi * 10.0  # [1/s] people's is of 8 to 12 Hz ...
-TREMOR_DAMPING = 0.18  # ... each of its own
 
 
 @functools.cache
@@ -40,8 +41,11 @@ def models(period_s: float, count: int) -> Records:
     out = structured(count, [*kinds, ("onward", np.float64, (MODES, 3, 3))])
     for ticks, one in enumerate(out):
         one["transition"], one["noise"] = model(ticks * period_s)
-        kept_on_s = min(ticks * period_s, KEPT_ON_S)
-        one["onward"] = model(ticks * period_s - kept_on_s)[0][:, :3, :3] @ _over(_motion(0.0, FADING), kept_on_s)[0]
+        kept_on_s = min(ticks * period_s, VELOCITY_KEPT_S)
+        one["onward"] = (
+            model(ticks * period_s - kept_on_s)[0][:, :3, :3]
+            @ _over(_motion(0.0, ACCELERATION_FADE_PER_S), kept_on_s)[0]
+        )
         one["onward"][REST] = one["transition"][REST, :3, :3]
     return out
 
@@ -49,13 +53,15 @@ def models(period_s: float, count: int) -> Records:
 def model(interval_s: float) -> tuple[Vector, Vector]:
     """Transitions and process noise (MODES, STATES, STATES) of the modes over an interval."""
     transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
-    dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE]])
+    dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE_PER_S**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S]])
     trembles, driven = _over(dynamics, interval_s)
     for mode in range(MODES):
-        moves, driving = _over(_motion(REVERT_V[mode], REVERT_A[mode]), interval_s)
-        transition[mode, motion, motion], noise[mode, motion, motion] = moves, INTENSITY[mode] * driving
+        moves, driving = _over(
+            _motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], MODE_ACCELERATION_REVERSIONS_PER_S[mode]), interval_s
+        )
+        transition[mode, motion, motion], noise[mode, motion, motion] = moves, MODE_INTENSITIES[mode] * driving
         transition[mode, tremor, tremor] = trembles
-        noise[mode, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE**3 * TREMOR[mode] ** 2 * driven
+        noise[mode, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S**3 * TREMOR_STDS_M[mode] ** 2 * driven
     return transition, noise
 
 

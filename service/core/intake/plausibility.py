@@ -27,19 +27,20 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import slot
-
-CONFIRMED = 3  # samples in a row that agree
-CONFIRMED_S = 0.02  # over so long at least
-SWAPPED_M = 0.05  # so near to where the other hand was ...
-SWAPPED_MPS = 0.2  # [m/s] ... which may have moved on
-AGREE_M = 0.03  # samples of a hand that jumped agree within this ...
-AGREE_MPS = 2.0  # [m/s] ... and what a fast hand moves
-OFFSET_M = 0.03  # so much alike is the way from one of two sources to the other, each time ...
-OFFSET_MPS = 0.5  # [m/s] ... and so fast it changes
-PLACES_M = 0.012  # so far apart at least are the places of which two sources tell ...
-PLACE_SHARE = 0.4  # ... and so much of that is what each tells of one
-TO_AND_FRO = (0b0010, 0b0100, 0b0110, 0b0101)  # which of four samples are of one place, the rest of the other
-RETURNS = 12  # samples among which a source that is three times as slow as the other returns twice at least
+from service.core.intake.tuning import (
+    AGREE_M,
+    AGREE_MPS,
+    CONFIRMED_S,
+    CONFIRMED_SAMPLES,
+    OFFSET_CHANGE_MPS,
+    OFFSET_TOLERANCE_M,
+    RETURN_SAMPLES,
+    SOURCE_SPREAD_SHARE,
+    SOURCES_APART_M,
+    SWAPPED_M,
+    SWAPPED_MPS,
+    TO_AND_FRO_PATTERNS,
+)
 
 
 @compiled
@@ -50,7 +51,7 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
     """
     state, given, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
-    far = _distance(offset, state.other_offset[side]) > OFFSET_M + OFFSET_MPS * passed * given.period_s
+    far = _distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * given.period_s
     in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
     returns = passed < given.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
     state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
@@ -88,7 +89,7 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     if count > 1 and unseen and _is_at_other(states, parameters, side, position):
         state.jump_is_swap[side] = 1
     enough_s = given.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
-    return bool(count >= CONFIRMED and (state.tick - first + 0.5) * given.period_s >= enough_s)
+    return bool(count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * given.period_s >= enough_s)
 
 
 @compiled
@@ -124,11 +125,11 @@ def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
     around it: a second source is there again, where one tracker's mistake is another each time.
     """
     state, around = states[0], np.empty((3, 3))
-    for before in range(order + 2, min(order + RETURNS, state.kept[side] - 1)):
+    for before in range(order + 2, min(order + RETURN_SAMPLES, state.kept[side] - 1)):
         for k in range(3):
             around[k] = state.kept_positions[side, slot(states, side, before - 1 + k)]
         off = around[1] - 0.5 * (around[0] + around[2])
-        if _distance(off, offset) <= PLACE_SHARE * _distance(offset, np.zeros(3)):
+        if _distance(off, offset) <= SOURCE_SPREAD_SHARE * _distance(offset, np.zeros(3)):
             return True
     return False
 
@@ -140,7 +141,7 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
     """
     samples = np.empty((4, 3))
     samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
-    for places in TO_AND_FRO:
+    for places in TO_AND_FRO_PATTERNS:
         within, apart = 0.0, np.inf
         for i in range(4):
             for j in range(i):
@@ -151,7 +152,7 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
                     within = max(within, square)
                 else:
                     apart = min(apart, square)
-        if apart >= PLACES_M**2 and within <= PLACE_SHARE**2 * apart:
+        if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
             odd = 1 if places == 0b0010 else 2 if places == 0b0100 else 0  # that alone is elsewhere
             return odd == 0 or _returns(states, side, order + odd - 1, samples[odd] - samples[0])
     return False

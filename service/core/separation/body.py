@@ -15,18 +15,13 @@ import numpy as np
 from service.config import Settings
 from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
+from service.core.separation.tuning import CAPSULE_EXCESS_M, CAPSULE_FITS, LEAST_TOOL_M, OWN_CLEARANCE_M, UNMOVED_M
 from service.urdf import Joint, Shape, Urdf
-
-LEAST_TOOL = 0.01  # [m] a tool point nearer to the plate than this is on it
-UNMOVED = 1e-9  # [m]
-OWN_M = 0.01  # that parts keep from each other at most: where they are is known, and more keeps them from folding
-OVER_M = 0.01  # that capsules around meshes stand out: so much nearer seem links with one link between them
-FITS = 101  # lengths tried for a capsule
 
 
 def own_clearance(settings: Settings) -> float:
     """How far parts of the arm keep from each other [m]."""
-    return min(settings.obstacles.clearance, OWN_M)
+    return min(settings.obstacles.clearance, OWN_CLEARANCE_M)
 
 
 class Body(NamedTuple):
@@ -73,7 +68,7 @@ def body_of(settings: Settings, description: str) -> Body:
                 )
                 found.append((number, end + travel, settings.arm.link_radius))
     tool = np.array(settings.tool.plate_from_tool[:3])
-    if math.hypot(*tool) > LEAST_TOOL:
+    if math.hypot(*tool) > LEAST_TOOL_M:
         found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
     found.sort(key=lambda one: one[0])
     capsules = structured(len(found), CAPSULE)
@@ -89,8 +84,8 @@ def body_of(settings: Settings, description: str) -> Body:
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
-            over = OVER_M if meshes and links[j] - links[i] == 2 else 0.0
-            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > UNMOVED:
+            over = CAPSULE_EXCESS_M if meshes and links[j] - links[i] == 2 else 0.0
+            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > UNMOVED_M:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 
@@ -158,7 +153,7 @@ def _capsule(shape: Shape) -> tuple[Vector, float]:
 
 def _around(half: float, radius: float) -> tuple[float, float]:
     """Half the axis and the radius of the smallest capsule around a cylinder [m]."""
-    axes = np.linspace(0.0, half, FITS)
+    axes = np.linspace(0.0, half, CAPSULE_FITS)
     radii = np.hypot(radius, half - axes)
     best = int(np.argmin(radii**2 * (2.0 * axes + 4.0 / 3.0 * radii)))
     return float(axes[best]), float(radii[best])

@@ -7,8 +7,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
+from service.core.separation.tuning import FARTHEST_REPORTED_M
 
-FARTHEST = 3.0  # [m] no distance is reported as greater
 PEOPLE, THINGS, ITSELF = 0, 1, 2  # of a rule's parameters
 NEAR_HAND, NEAR_ITSELF = -1, -2  # what a capsule is nearest to, but for boxes
 NOBODY = np.empty((0, 3))  # hands
@@ -22,7 +22,7 @@ def clearance(
     given, near, forearm = parameters[0], np.empty(9), np.empty((2, 3))
     placed = np.empty((len(capsules), 2, 3))
     place(joints, given.frames, given.axes, capsules, placed)
-    least, part, thing = FARTHEST, -1, -1
+    least, part, thing = FARTHEST_REPORTED_M, -1, -1
     for capsule in range(given.first, len(capsules)):
         radius = capsules[capsule].radius
         for hand in range(len(hands)):

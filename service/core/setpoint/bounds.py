@@ -13,119 +13,17 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.setpoint import HULL_SPANS
+from service.core.setpoint.tuning import (
+    BOUND_ROUNDING_M,
+    HULL_MARGIN_M,
+    ON_BOUND_M,
+    RETURN_SHARE,
+    STOP_SECANT_TOLERANCE_M,
+    STOP_SECANTS,
+)
+from service.core.stops import fastest_stop
 
 Pair: TypeAlias = tuple[float, float]
-LEAST_SHARE = 1e-3  # of its acceleration with which an axis waits for the slowest
-HALVINGS = 40  # in which that share is found
-SPARE, SECANTS = 1e-3, 8  # [m] of a room left unused, and steps to that: in long ticks it is no straight line
-
-
-@compiled
-def fastest_stop(
-    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float, dt: float, out: Vector
-) -> None:
-    """The fastest stop of one axis within `max_acceleration` and `max_jerk`.
-
-    out (6,): velocity, acceleration and way after dt, least and greatest way until rest, duration.
-    """
-    then = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
-    sign = -1.0 if then > 0.0 else 1.0  # with it the stop is a push in positive direction
-    v, a = sign * velocity, sign * acceleration
-    peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
-    hold = 0.0
-    if a > max_acceleration:  # beyond its limit it comes down to that first
-        peak = max_acceleration
-        hold = max(-v - a * a / (2.0 * max_jerk), 0.0) / max_acceleration
-    elif peak > max_acceleration:
-        peak = max_acceleration
-        hold = (-v + (a * a - 2.0 * max_acceleration * max_acceleration) / (2.0 * max_jerk)) / max_acceleration
-    else:
-        peak = max(peak, a)
-    x = t = low = high = 0.0
-    found = False
-    after_x = after_v = after_a = 0.0
-    for phase in range(3):
-        if phase == 0:
-            jerk, lasts = (max_jerk, (peak - a) / max_jerk) if a <= peak else (-max_jerk, (a - peak) / max_jerk)
-        elif phase == 1:
-            jerk, lasts = 0.0, hold
-        else:
-            jerk, lasts = -max_jerk, peak / max_jerk
-        if lasts <= 0.0:
-            continue
-        if not found and dt <= t + lasts:
-            h = dt - t
-            after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-            after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
-            found = True
-        # the least and greatest way inside the phase are where the velocity is 0
-        disc = a * a - 2.0 * jerk * v
-        for root in (-1.0, 1.0):
-            h = 0.0
-            if jerk != 0.0 and disc >= 0.0:
-                h = (-a + root * math.sqrt(disc)) / jerk
-            elif jerk == 0.0 and a != 0.0:
-                h = -v / a
-            if 0.0 < h < lasts:
-                way = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-                low, high = min(low, way), max(high, way)
-        x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
-        v += lasts * (a + lasts * jerk / 2.0)
-        a += lasts * jerk
-        t += lasts
-        low, high = min(low, x), max(high, x)
-    if not found:
-        after_x, after_v, after_a = x, 0.0, 0.0
-    out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
-    out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)
-    out[5] = t
-
-
-@compiled
-def stop_together(
-    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, dt: float
-) -> Vector:
-    """One dt of a stop at whose end all axes (J,) come to rest at once, as soon as the slowest can.
-
-    (3, J): ways, velocities, accelerations. The others brake less than they could, so that what
-    they move together slows down on its way.
-    """
-    count = len(velocities)
-    out, stop, slower = np.zeros((3, count)), np.zeros(6), np.empty(count)
-    braking_together(velocities, accelerations, max_acceleration, max_jerk, slower)
-    for i in range(count):
-        fastest_stop(velocities[i], accelerations[i], slower[i], max_jerk[i], dt, stop)
-        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
-    return out
-
-
-@compiled
-def braking_together(
-    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, out: Vector
-) -> None:
-    """Into out (J,) the accelerations with which all axes come to rest at once."""
-    stop, duration = np.zeros(6), 0.0
-    for i in range(len(velocities)):
-        fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], 0.0, stop)
-        duration = max(duration, stop[5])
-    for i in range(len(velocities)):
-        low, share = LEAST_SHARE, 1.0
-        if velocities[i] != 0.0 or accelerations[i] != 0.0:
-            for _ in range(HALVINGS):
-                middle = 0.5 * (low + share)
-                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], 0.0, stop)
-                if stop[5] <= duration:
-                    share = middle
-                else:
-                    low = middle
-        out[i] = share * max_acceleration[i]
-
-
-HULL_TIME_S = 0.35  # the setpoint stays near the targets of so long
-HULL_MARGIN = 0.03  # [m] around these
-RETURN_SHARE = 1 / 16  # of the speed it may have with which a setpoint comes back at least, each axis
-ON_BOUND = 1e-9  # [m] beyond a bound that are rounding
-ROUNDING = 1e-12  # [m] away from a bound that are rounding
 BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
 
 
@@ -163,8 +61,8 @@ def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector)
         least, greatest = hull[0, 0, axis], hull[0, 1, axis]
         for span in range(1, HULL_SPANS):
             least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
-        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN)
-        high[axis] = min(box[1, axis], greatest + HULL_MARGIN)
+        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN_M)
+        high[axis] = min(box[1, axis], greatest + HULL_MARGIN_M)
 
 
 @compiled
@@ -216,11 +114,11 @@ def take_safe(
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
             if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
                 continue
-            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + ON_BOUND:
+            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + ON_BOUND_M:
                 stays = False
                 continue
             here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
-            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + ROUNDING:
+            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + BOUND_ROUNDING_M:
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
                 mixed = True
     if mixed:  # the norms of what the others do beside it
@@ -248,8 +146,8 @@ def _fall_back(
     bound, along the fastest change to `back` [m/s] inwards.
     """
     max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
-    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND
-    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND - low
+    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND_M
+    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND_M - low
     if over and under:  # it crosses the box
         over = setpoint[1, axis] > 0.0
         under = not over
@@ -325,11 +223,11 @@ def stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: 
     (brake, change), (wanted, chosen) = brakes, jerks
     limit = way + comes - kept * (way - stop_distance(v, a, brake, change))
     most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
-    for _ in range(SECANTS):
+    for _ in range(STOP_SECANTS):
         chosen = between(wanted, chosen, most, passed, limit)
         if chosen >= wanted:
             break
         passed = _stop_after(v, a, chosen, brakes, dt)
-        if limit - passed < SPARE:
+        if limit - passed < STOP_SECANT_TOLERANCE_M:
             break
     return chosen

@@ -19,7 +19,7 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.geometry import round_to
 from service.core.skill import ORDER, TURNS
-from service.core.skill.memory import TURN_M, moving_features
+from service.core.skill.memory import moving_features
 from service.core.skill.model import (
     COVARIANCE_ROUND_TO,
     MOTION_ROUND_TO,
@@ -30,6 +30,7 @@ from service.core.skill.model import (
     standard_deviations,
 )
 from service.core.skill.stages import MOST_STAGES
+from service.core.skill.tuning import TURN_WEIGHT_M
 from service.core.skill.via_points import neighbourhoods
 
 TURN_INPUTS = 18  # the entries of both hands' rotation matrices
@@ -38,8 +39,8 @@ TURN_INPUTS = 18  # the entries of both hands' rotation matrices
 @dataclass(frozen=True, eq=False)
 class HandsKMP:
     """A model whose inputs are both hands' positions (6) [m], then how far behind them rows of
-    their memory are (6 each) [m], then, where they are turned, their rotation matrices times TURN_M
-    (9 each) [m]; whose outputs are the tool's (3) [m].
+    their memory are (6 each) [m], then, where they are turned, their rotation matrices times
+    TURN_WEIGHT_M (9 each) [m]; whose outputs are the tool's (3) [m].
 
     A hand of which nobody says how it is turned is turned as in the mean of the demonstrations. See
     `Model`.
@@ -117,7 +118,7 @@ class HandsKMP:
         if not (self.order or self.turned):
             return moving
         if self.turned and not len(turns):
-            turns = np.tile(self._usual_turns / TURN_M, (TURNS, 1))
+            turns = np.tile(self._usual_turns / TURN_WEIGHT_M, (TURNS, 1))
         out = np.empty((3, self.shape[0]))
         moving_features(moving, past[: self.order], turns, out)
         return out

@@ -12,12 +12,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.skill import TURNS
-
-LAG_S = 0.5  # of each: with twice as much or half, recorded partners are predicted no better
-TURN_LAG_S = 0.03  # of each filter of a hand's turn: trackers tell it with some hundredths of a radian of noise
-TURN_M = 0.1  # a rotation matrix's entries count as distances so far from the hand, as of a tool fixed to it
-STEP_S = 0.004  # of the filters along a demonstration: as fine as the service's own periods
-LONGEST_S = 0.1  # that passes from one step to the next: while a hand is not seen, nothing is forgotten
+from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, MEMORY_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
 
 
 @compiled
@@ -40,7 +35,7 @@ def remember(states: Records, period_s: float, lag_s: float) -> None:
         share = turn_share = 1.0
         if state.memory_ticks[side] >= 0:
             passed_s = (state.tick - state.memory_ticks[side]) * period_s
-            share = 1.0 - math.exp(-min(passed_s, LONGEST_S) / lag_s) if lag_s > 0.0 else 1.0
+            share = 1.0 - math.exp(-min(passed_s, MEMORY_LONGEST_STEP_S) / lag_s) if lag_s > 0.0 else 1.0
             turn_share = 1.0 - math.exp(-passed_s / TURN_LAG_S)
         state.memory_ticks[side] = state.tick
         for i in range(3):
@@ -52,7 +47,7 @@ def remember(states: Records, period_s: float, lag_s: float) -> None:
 @compiled
 def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) -> None:
     """Positions, how far behind them the rows (K, D) of a memory are, and how hands are turned, the
-    last of `turns` (TURNS, E) times TURN_M, of hands that move so (3, D): with velocity and
+    last of `turns` (TURNS, E) times TURN_WEIGHT_M, of hands that move so (3, D): with velocity and
     acceleration into `out` (3, (1 + K) D + E).
     """
     width = moving.shape[1]
@@ -61,8 +56,8 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
         at, rate, bend = moving[0, i], moving[1, i], moving[2, i]
         for row in range(len(memory)):
             value = memory[row, i]
-            bend = (rate - (at - value) / LAG_S) / LAG_S
-            rate = (at - value) / LAG_S
+            bend = (rate - (at - value) / MEMORY_LAG_S) / MEMORY_LAG_S
+            rate = (at - value) / MEMORY_LAG_S
             at = value
             column = (row + 1) * width + i
             out[0, column] = value - moving[0, i]
@@ -71,9 +66,9 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
     first = (1 + len(memory)) * width
     for i in range(out.shape[1] - first):
         before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
-        out[0, first + i] = TURN_M * last
-        out[1, first + i] = TURN_M * (between - last) / TURN_LAG_S
-        out[2, first + i] = TURN_M * (before - 2.0 * between + last) / TURN_LAG_S**2
+        out[0, first + i] = TURN_WEIGHT_M * last
+        out[1, first + i] = TURN_WEIGHT_M * (between - last) / TURN_LAG_S
+        out[2, first + i] = TURN_WEIGHT_M * (before - 2.0 * between + last) / TURN_LAG_S**2
 
 
 @compiled
@@ -109,7 +104,7 @@ def _filtered(values: Vector, share: float, steps: int, out: Vector) -> None:
 
 def along(values: Vector, period_s: float, lag_s: float, rows: int) -> Vector:
     """The rows (T, K, D) of filters of this lag along values (T, D)."""
-    out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / STEP_S))
+    out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / MEMORY_STEP_S))
     _filtered(np.ascontiguousarray(values), 1.0 - math.exp(-period_s / steps / lag_s), steps, out)
     return out
 
@@ -118,7 +113,7 @@ def features(hands: Vector, period_s: float, order: int, turns: Vector | None = 
     """Positions of hands (T, D) [m], how far behind them `order` rows of their memory are, and how
     they are turned, where that is given as rotation matrices (T, E): (T, (1 + order) D + E) [m].
     """
-    parts = [hands, (along(hands, period_s, LAG_S, order) - hands[:, None]).reshape(len(hands), -1)]
+    parts = [hands, (along(hands, period_s, MEMORY_LAG_S, order) - hands[:, None]).reshape(len(hands), -1)]
     if turns is not None:
-        parts.append(TURN_M * along(turns, period_s, TURN_LAG_S, TURNS)[:, -1])
+        parts.append(TURN_WEIGHT_M * along(turns, period_s, TURN_LAG_S, TURNS)[:, -1])
     return np.hstack(parts)

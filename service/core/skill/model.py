@@ -16,12 +16,9 @@ from service.core.frame import Vector
 
 MOTION_ROUND_TO = 1e6  # [1/m] micrometres, to which positions and their derivatives are rounded
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] the same for covariances
-FARTHEST_M = 10.0  # of anything in a skill's file from the base plate
-
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose reach a skill knows
 CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # that reach, of a normal in space
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
-
 Arrays = Mapping[str, NDArray[Any]]
 
 

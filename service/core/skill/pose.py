@@ -14,6 +14,24 @@ from kmp import KMP
 from kmp.compiled import compiled
 from service.core.frame import Vector
 from service.core.geometry import turn_on
+from service.core.skill.tuning import GRIPPER_CLOSE_ABOVE, GRIPPER_MOVES_S, GRIPPER_OPEN_BELOW, GRIPPER_THERE_M
+
+
+def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
+    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
+    closure is predicted and the tool is so far off [m].
+
+    With hysteresis, and not before it can have moved: what trembles about the middle changes
+    nothing. Not on the way: a tool that is late would open or close elsewhere.
+    """
+    if closure == NO_GRIPPER:
+        return gripper
+    if gripper == UNKNOWN:
+        return CLOSED if closure > 0.5 else OPEN
+    if since_s < GRIPPER_MOVES_S or off > GRIPPER_THERE_M or GRIPPER_OPEN_BELOW <= closure <= GRIPPER_CLOSE_ABOVE:
+        return gripper
+    return CLOSED if closure > GRIPPER_CLOSE_ABOVE else OPEN
+
 
 TURN_ROUND_TO = 1e6  # [1/rad] microradians, to which orientations and angular velocities are rounded
 COVARIANCE_ROUND_TO = 1e10  # [1/rad²] the same for covariances

@@ -15,27 +15,19 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.immutable import Immutable, frozen
-from service.config import Reach, Settings
-from service.contract.records import Reason
+from service.config import Reach
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.core.frame import Record, Vector, as_array
+from service.core.frame import Vector
 from service.core.intake.hand_estimator import STILL
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import LAG_S, delayed, remember
-from service.core.skill.model import COVARIANCE_ROUND_TO, NORMAL, REGION_95, Model, Regions, Seen, Target, Wanted
-from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedGripper, LearnedOrientation, Turn
+from service.core.skill.memory import delayed
+from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
+from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
-from service.core.skill.unseen import off_m
+from service.core.skill.tuning import MAX_TARGET_M
 
-LARGEST_M = 1e3  # beyond it a target is as good as there
-OPEN_BELOW, CLOSE_ABOVE = 0.1, 0.9  # of the closure; between them it stays as it is
-MOVES_S = 0.5  # for so long it is let be once it was told to move
-THERE_M = 0.01  # a tool that is no farther off is where it is to be
-UNSURE_M = 0.10  # a 95 % region that reaches farther is told: so far off, a tool is at another thing than was meant
-TRAIL_S = 0.2  # over which the tool's motion counts: who is late is still off when the prediction has come to rest
 NEVER = -(2**60)  # a tick so long ago that nothing is left of it
-SURE_SHARE = 0.8  # of that, under which it is told no longer: what trembles about the one changes nothing
 
 
 def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach) -> Target:
@@ -48,7 +40,7 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
     boxed = np.minimum(np.maximum(position, box[0]), box[1])
     inside = boxed == position
     velocity, acceleration = velocity * inside, acceleration * inside
-    reached, outward = _nearest(np.minimum(np.maximum(boxed, -LARGEST_M), LARGEST_M), reach)
+    reached, outward = _nearest(np.minimum(np.maximum(boxed, -MAX_TARGET_M), MAX_TARGET_M), reach)
     if not outward:
         return Target(boxed, velocity, acceleration, not inside.all())
     return Target(reached, _without(velocity, outward), _without(acceleration, outward), clamped=True)
@@ -129,10 +121,8 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 
 
 UNTOLD = np.empty((0, 18))  # of hands of which nobody says how they are turned
-
 MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
 """All that a skill may predict with."""
-
 Known: TypeAlias = tuple[Vector, Vector, float]
 """What was predicted at the newest sample of a hand: covariances of position (3, 3) [m²] and
 orientation (3, 3) [rad²], and the closure of the gripper."""
@@ -256,145 +246,3 @@ class Skill(Immutable):
         """Least and greatest corner (2, 2, 3) of where it knows the left and the right hand [m]."""
         hands = self.hands.reshape(-1, 2, 3)
         return np.stack([hands.min(axis=0), hands.max(axis=0)])
-
-
-MOST_TORN, EASE = 0.3, 0.5  # probability that the tool should be elsewhere, which is told; a share below goes on
-TORN_S = 0.3  # so long: from one stage to the next it passes by
-NO_STAGE = -1  # of a frame
-AMBIGUOUS = int(Reason.AMBIGUOUS)
-
-
-class SkillStage:
-    """The skill in force; what it predicted at the newest sample of a hand is kept in the state."""
-
-    def __init__(self, settings: Settings, skill: Skill) -> None:
-        self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
-        self._take(skill)
-
-    def _take(self, skill: Skill) -> None:
-        self.skill = skill
-        delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
-        self._lag_s = LAG_S if skill.model.remembers else delay_s / ORDER
-
-    def adopt(self, state: Record, skill: Skill) -> None:
-        """Another skill from now on; of one with the same via-points the stage is known already."""
-        if skill.model.names != self.skill.model.names:
-            state["stage_belief"] = 0.0
-        if skill.model.remembers != self.skill.model.remembers or skill.model.delay_s != self.skill.model.delay_s:
-            state["memory_ticks"] = -1
-        self._take(skill)
-        state["skill"] = np.frombuffer(skill.digest, np.uint8)
-        state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
-        state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
-
-    def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
-        """What the skill asks for with the hands, which must be known; `unseen` is the side of one
-        that is not seen now. Covariances and gripper are predicted anew at new samples only.
-        """
-        remember(as_array(state), self._period_s, self._lag_s)
-        hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
-        belief = state["stage_belief"]
-        is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
-        before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
-        found = self.skill.predict(
-            hands[:, 0],
-            hands[:, 1],
-            hands[:, 2],
-            state["hand_stillness"],
-            before=before,
-            past=state["memory"],
-            turns=state["turns"],
-            belief=belief,
-            period_s=self._period_s,
-            lead_s=self._lead_s,
-        )
-        if is_new:
-            state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
-            state["closure"] = found.closure
-        target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
-        _write(frame, found, target)
-        passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
-        recent_mps = recent(found.position, passed_s, state["trail"])
-        reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
-        off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
-        state["unsure"] = math.hypot(reach_m, off) > (SURE_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
-        frame["closure"] = state["closure"]
-        _tell_stage(belief, frame)
-        most = MOST_TORN * (EASE if state["reason"] == AMBIGUOUS else 1.0)
-        if found.torn <= most:
-            state["sure_tick"] = tick
-        torn = (tick - int(state["sure_tick"])) * self._period_s > TORN_S
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn, off > UNSURE_M)
-
-    def set_stage(self, state: Record, name: str) -> None:
-        """The task has come to the via-point of this name. One that it has not changes nothing."""
-        if name in (names := self.skill.model.names):
-            state["stage_belief"] = 0.0
-            state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
-
-    def nothing(self, state: Record, frame: Record) -> None:
-        """Into the frame that nothing is predicted: the target is the setpoint."""
-        state["unsure"], state["sure_tick"] = 0, state["tick"]
-        frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
-        frame["closure"] = state["closure"]
-        _tell_stage(state["stage_belief"], frame)
-
-
-def _tell_stage(belief: Vector, frame: Record) -> None:
-    """Into the frame which stage it is, most probably, and how probable that is."""
-    most = int(belief.argmax())
-    frame["stage_belief"] = belief[most]
-    frame["stage"] = most if belief[most] > 0.0 else NO_STAGE
-
-
-def _write(frame: Record, found: Prediction, target: Target) -> None:
-    frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-    frame["gate_m"] = found.gate_m
-    frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
-
-
-@compiled
-def recent(position: Vector, passed_s: float, trail: Vector) -> Vector:
-    """The tool's velocity over the last TRAIL_S (3,) [m/s], by the trail (3,) [m] that it leaves:
-    a filter of first order, which follows.
-    """
-    out, share = np.empty(3), 1.0 - math.exp(-passed_s / TRAIL_S)
-    for i in range(3):
-        trail[i] += share * (position[i] - trail[i])
-        out[i] = (position[i] - trail[i]) / TRAIL_S
-    return out
-
-
-@compiled
-def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, out: Vector) -> float:
-    """A model's covariance (3, 3) [m²], of a tool that lately moved so (3,) [m/s], as `Regions` has
-    it, rounded, into `out`; how far its 95 % region reaches [m].
-    """
-    for i in range(3):
-        for j in range(3):
-            found = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
-            out[i, j] = np.rint(found * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
-    mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0  # the greatest eigenvalue: Smith 1961
-    a, b, c = out[0, 0] - mean, out[1, 1] - mean, out[2, 2] - mean
-    d, e, f = out[0, 1], out[0, 2], out[1, 2]
-    spread = math.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
-    if spread > 0.0:
-        half = 0.5 * (a * b * c + 2.0 * d * e * f - a * f * f - b * e * e - c * d * d) / spread**3
-        mean += 2.0 * spread * math.cos(math.acos(min(max(half, -1.0), 1.0)) / 3.0)
-    return math.sqrt(REGION_95 * max(mean, 0.0))
-
-
-def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
-    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
-    closure is predicted and the tool is so far off [m].
-
-    With hysteresis, and not before it can have moved: what trembles about the middle changes
-    nothing. Not on the way: a tool that is late would open or close elsewhere.
-    """
-    if closure == NO_GRIPPER:
-        return gripper
-    if gripper == UNKNOWN:
-        return CLOSED if closure > 0.5 else OPEN
-    if since_s < MOVES_S or off > THERE_M or OPEN_BELOW <= closure <= CLOSE_ABOVE:
-        return gripper
-    return CLOSED if closure > CLOSE_ABOVE else OPEN

@@ -25,7 +25,6 @@ from service.core.skill.stages import (
     OUTPUTS,
     PLACED,
     SEEN,
-    STEP_S,
     along_both,
     expected,
     off_all,
@@ -35,10 +34,9 @@ from service.core.skill.stages import (
     tools_at,
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
+from service.core.skill.tuning import BELIEF_PERIODS, MOTION_STEP_S, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.core.skill.via_points import bent
 
-APART = 0.12  # of two stages, as inputs beside how far along hands are: most of what is learned in one holds in all
-APART_BESIDE = 0.5  # the same for orientation and gripper, which are of each stage alone
 NO_PULLS = frozen(np.empty((0, 9)))  # where nothing else is taught
 NO_ERRORS = frozen(np.empty((0, 6)))  # where no covariance is wanted
 
@@ -80,7 +78,7 @@ class Placed(Immutable):
         out, moving = np.zeros(MOST_STAGES), np.zeros((3, 6))
         out[: len(self.stages)] = 1.0 / len(self.stages)
         moving[0] = hands
-        for _ in range(SETTLED):
+        for _ in range(BELIEF_PERIODS):
             recognise(out, moving, 0.1, self.stages)
         return out
 
@@ -114,9 +112,6 @@ class Placed(Immutable):
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
-SETTLED = 20  # periods after which a belief in hands at rest hardly changes
-
-
 def scale_of(primitive: KMP) -> float:
     """Of its kernel exp(-scale |difference|²)."""
     return float(primitive.kernel.coordinates(1)[0])
@@ -124,7 +119,7 @@ def scale_of(primitive: KMP) -> float:
 
 def likeness(primitive: KMP) -> float:
     """What a centre of another stage counts, by how far stages are apart."""
-    return math.exp(-2.0 * scale_of(primitive) * APART**2)
+    return math.exp(-2.0 * scale_of(primitive) * STAGE_DISTANCE**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,16 +215,17 @@ class StagedKMP:
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
         hands, velocity = seen.moving[0], seen.moving[1]
         behind, now, ahead = (
-            self._input(hands + step * velocity, seen.belief, seen.stillness) for step in (-STEP_S, 0.0, STEP_S)
+            self._input(hands + step * velocity, seen.belief, seen.stillness)
+            for step in (-MOTION_STEP_S, 0.0, MOTION_STEP_S)
         )
-        return now, (ahead - behind) / (2.0 * STEP_S)
+        return now, (ahead - behind) / (2.0 * MOTION_STEP_S)
 
     def _input(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
         """How far along each hand is in the most probable stage; and the belief."""
         most = int(belief.argmax())
         stage, hands = self.placed.stages[most], np.ascontiguousarray(hands)
         along = along_both(hands, still, stage)
-        return np.array([*along, *(APART_BESIDE * belief[: len(self.off)])])
+        return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)])])
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> StagedKMP:
         """Nothing is solved: via-points of a known name are where the task is, others pull."""

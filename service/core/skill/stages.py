@@ -11,40 +11,41 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.kernel_row import add_weighted
 from service.core.frame import Record, Records, Vector
-from service.core.geometry import round_to
+from service.core.geometry import ROUND_TO, round_to
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
-from service.core.skill.via_points import NEAR
+from service.core.skill.tuning import (
+    AMBIGUOUS_M,
+    CALM_MPS,
+    DIRECTION_SPEED_MPS,
+    DIRECTION_WEIGHT,
+    ERROR_WIDTH,
+    FIRST_SAMPLE_WEIGHT,
+    FIRST_STAGE_ODDS,
+    FULL_SEGMENT_M,
+    LEAST_SEGMENT_SHARE,
+    LEAST_STAGE_PROBABILITY,
+    LEAST_STD_M,
+    MAX_SQUARED_DEVIATION,
+    MAX_TARGET_MPS2,
+    MOTION_STEP_S,
+    OTHER_STAGE_ERROR_WEIGHT,
+    PULL_SHARPNESS_PER_M2,
+    REST_SHARPNESS,
+    RESTLESS_WEIGHT,
+    SAMPLE_CORRELATION_S,
+    SEGMENT_END_M,
+    SEGMENT_MIDDLE_M,
+    STAGE_ASTRAY_PER_S,
+    STAGE_BACK_PER_S,
+    STAGE_CYCLE_PER_S,
+    STAGE_END_M,
+    STAGE_FORWARD_PER_S,
+    WITH_HAND_POWER,
+)
 
 MOST_STAGES = 64  # that a state has room for
-SHARPNESS = 4.0  # power of the shares of the way of a hand that rests
-AT_M = 0.05  # on a way of full size, a hand that rests as near to an end belongs to it
-AWAY_M = 0.10  # one that rests as far from both waits on its way
-FULL_SIZE_M = 0.3  # on a shorter way so many times less is near ...
-LEAST_SIZE = 0.1  # ... down to this share
 STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # a hand's way squared that does not move; what the tool goes with
-WITH_HAND = 4  # power of the share with which the tool goes with a hand to, or from, a via-point alone
-NEAR_M = 0.08  # of a via-point, within which one stage ends and the next begins
-FORWARD, BACK = 1.5, 1.0  # [1/s] from one stage to the next while hands are there, and to the one before
-ASTRAY = 1e-4  # [1/s] to any other, so that a belief that is wrong comes right
-CYCLE = 0.2  # [1/s] from the last stage to the first, while hands are where that begins
-CORRELATED_S = 0.2  # samples that follow each other so soon tell the same
-FARTHEST = 9.0  # squared deviations beyond which a hand is nowhere: it tells nothing more
-DIRECTED, HASTE_MPS = 1.0, 0.15  # how much it tells that a hand goes the stage's way, and how fast it must be
-RESTLESS = 0.7  # how much of its speed tells against a stage in which it stays
-AT_ONCE = 3.0  # samples that tell as much as the first one does: nothing is known before it
-FIRST = 10.0  # times as probable as any other is the first stage, at the beginning
-ROUND_TO = 1e9  # beliefs, so that machines that differ in the last bits agree
-
 OUTPUTS = 4  # how far along the tool is, and its offset
-ALIKE = 0.2  # width, in the inputs, of what is near to a moment when errors are looked up
-OTHERS_ALIKE = 0.05  # what an error in another stage counts there
-LEAST_STD_M = 0.003  # of a prediction, each axis
-STEP_S = 0.02  # of differences along the hands' motion
-CALM_MPS = 0.2  # a slower hand trembles: its velocity says nothing of where the tool will be
-MAX_MPS2 = 3.0  # of a target's acceleration
-BELIEVED = 0.01  # a stage that is less probable is left out
-TORN_M = 0.05  # from the most probable stage's tool: farther apart there are two of them
-
 # One stage, in compiled loops: its ends, for the left and the right hand and the tool.
 STAGE = np.dtype(
     [
@@ -57,8 +58,6 @@ STAGE = np.dtype(
         ("follow", np.int64, (2,)),  # the hand that the tool goes with, at its begin and at its end
     ]
 )
-
-
 # What is of one size in all stages, in compiled loops.
 PLACED = np.dtype(
     [
@@ -68,7 +67,6 @@ PLACED = np.dtype(
         ("prior", np.float64, (OUTPUTS,)),  # far from all data
     ]
 )
-
 # What is known of the hands, in compiled loops: see `model.Seen`.
 SEEN = np.dtype(
     [
@@ -106,9 +104,11 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
     if square <= STAYS:
         return along
     long = math.sqrt(square)
-    size = min(max(long / FULL_SIZE_M, LEAST_SIZE), 1.0)
-    near = min(max((AWAY_M - min(along, 1.0 - along) * long / size) / (AWAY_M - AT_M), 0.0), 1.0)
-    power = 1.0 + (SHARPNESS - 1.0) * near * still
+    size = min(max(long / FULL_SEGMENT_M, LEAST_SEGMENT_SHARE), 1.0)
+    near = min(
+        max((SEGMENT_MIDDLE_M - min(along, 1.0 - along) * long / size) / (SEGMENT_MIDDLE_M - SEGMENT_END_M), 0.0), 1.0
+    )
+    power = 1.0 + (REST_SHARPNESS - 1.0) * near * still
     one, other = along**power, (1.0 - along) ** power
     return float(one / (one + other))
 
@@ -126,7 +126,7 @@ def _near(hands: Vector, stage: Record) -> float:
     for side in range(2):
         for i in range(3):
             square += (hands[3 * side + i] - stage["begins"][side, i]) ** 2
-    return math.exp(-0.5 * square / NEAR_M**2)
+    return math.exp(-0.5 * square / STAGE_END_M**2)
 
 
 @compiled
@@ -136,13 +136,13 @@ def _likely(moving: Vector, stage: Record) -> float:
     for side in range(2):
         here = slice(3 * side, 3 * side + 3)
         _, off = on_way(moving[0, here], stage, side)
-        out -= 0.5 * min((off / stage["off"][side]) ** 2, FARTHEST)
+        out -= 0.5 * min((off / stage["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
         square, speed, along = stage["square"][side], 0.0, 0.0
         for i in range(3):
             speed += moving[1, 3 * side + i] ** 2
             along += moving[1, 3 * side + i] * stage["way"][side, i]
-        goes = along / math.sqrt(square) if square > STAYS else -RESTLESS * math.sqrt(speed)
-        out += DIRECTED * math.tanh(goes / HASTE_MPS)
+        goes = along / math.sqrt(square) if square > STAYS else -RESTLESS_WEIGHT * math.sqrt(speed)
+        out += DIRECTION_WEIGHT * math.tanh(goes / DIRECTION_SPEED_MPS)
     return out
 
 
@@ -153,27 +153,27 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     A forward filter of a hidden Markov model (Rabiner 1989). One of zeros begins anew.
     """
     count, hands = len(stages), moving[0]
-    total, share = 0.0, min(period_s / CORRELATED_S, 1.0)
+    total, share = 0.0, min(period_s / SAMPLE_CORRELATION_S, 1.0)
     for k in range(count):
         total += belief[k]
     if total <= 0.0:
-        share = AT_ONCE
+        share = FIRST_SAMPLE_WEIGHT
         for k in range(count):
-            belief[k] = (FIRST if k == 0 else 1.0) / (count - 1 + FIRST)
+            belief[k] = (FIRST_STAGE_ODDS if k == 0 else 1.0) / (count - 1 + FIRST_STAGE_ODDS)
     elif count > 1:
         before = belief[0]
         for k in range(count - 1):
             near = _near(hands, stages[k + 1])
-            on = min(FORWARD * period_s * near, 0.5) * before
-            back = min(BACK * period_s * near, 0.5) * belief[k + 1]
+            on = min(STAGE_FORWARD_PER_S * period_s * near, 0.5) * before
+            back = min(STAGE_BACK_PER_S * period_s * near, 0.5) * belief[k + 1]
             before = belief[k + 1]
             belief[k] += back - on
             belief[k + 1] += on - back
-        again = min(CYCLE * period_s * _near(hands, stages[0]), 0.5) * belief[count - 1]
+        again = min(STAGE_CYCLE_PER_S * period_s * _near(hands, stages[0]), 0.5) * belief[count - 1]
         belief[count - 1] -= again
         belief[0] += again
         for k in range(count):
-            belief[k] += ASTRAY * period_s * (1.0 / count - belief[k])
+            belief[k] += STAGE_ASTRAY_PER_S * period_s * (1.0 / count - belief[k])
     told = np.empty(count)
     for k in range(count):
         told[k] = _likely(moving, stages[k])
@@ -202,7 +202,7 @@ def off_all(hands: Vector, stages: Records) -> float:
 def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> None:
     """Adds to `out` (3,) by how much the tool goes with hands (6,), where it is so far along."""
     follow = stage["follow"]
-    power = 1 if follow[0] == follow[1] else WITH_HAND
+    power = 1 if follow[0] == follow[1] else WITH_HAND_POWER
     for end in range(2):
         side = follow[end]
         if side >= 0:
@@ -230,7 +230,7 @@ def _tool_in(
         out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
     add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
-        add_weighted(hands, pulls, NEAR, out)
+        add_weighted(hands, pulls, PULL_SHARPNESS_PER_M2, out)
 
 
 @compiled
@@ -246,7 +246,7 @@ def tools_at(
 ) -> None:
     """The tools into `out` (K, 3) in the stages that are believed in."""
     for k in range(len(stages)):
-        if belief[k] >= BELIEVED:
+        if belief[k] >= LEAST_STAGE_PROBABILITY:
             _tool_in(hands, still, k, stages, sizes[0], rows, pulls, out[k])
 
 
@@ -256,7 +256,7 @@ def expected(belief: Vector, tools: Vector, out: Vector) -> None:
     total = 0.0
     out[:] = 0.0
     for k in range(len(tools)):
-        if belief[k] >= BELIEVED:
+        if belief[k] >= LEAST_STAGE_PROBABILITY:
             total += belief[k]
             for i in range(3):
                 out[i] += belief[k] * tools[k, i]
@@ -273,11 +273,11 @@ def _torn(belief: Vector, tools: Vector) -> float:
             most = k
     out = 0.0
     for k in range(len(tools)):
-        if belief[k] >= BELIEVED and k != most:
+        if belief[k] >= LEAST_STAGE_PROBABILITY and k != most:
             square = 0.0
             for i in range(3):
                 square += (tools[k, i] - tools[most, i]) ** 2
-            if square > TORN_M**2:
+            if square > AMBIGUOUS_M**2:
                 out += belief[k]
     return out
 
@@ -293,7 +293,7 @@ def _around(moving: Vector, out: Vector) -> None:
             square += moving[1, i] * moving[1, i]
         goes = 1.0 - math.exp(-((math.sqrt(square) / CALM_MPS) ** 4))
         for i in range(3 * side, 3 * side + 3):
-            step, bend = STEP_S * goes * moving[1, i], 0.5 * STEP_S**2 * goes * moving[2, i]
+            step, bend = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
             out[0, i], out[1, i], out[2, i] = moving[0, i] - step + bend, moving[0, i], moving[0, i] + step + bend
 
 
@@ -315,14 +315,16 @@ def scatter(
     mean, weights, in_all = np.empty(3), np.empty(len(errors)), 0.0
     expected(belief, tools, mean)
     for k in range(len(stages)):
-        if belief[k] < BELIEVED:
+        if belief[k] < LEAST_STAGE_PROBABILITY:
             continue
         in_all += belief[k]
         one, other = along_both(hands, still, stages[k])
         total = 1e-9
         for m in range(len(errors)):
             square = (one - errors[m, 0]) ** 2 + (other - errors[m, 1]) ** 2
-            weights[m] = math.exp(-0.5 * square / ALIKE**2) * (1.0 if errors[m, 2] == k else OTHERS_ALIKE)
+            weights[m] = math.exp(-0.5 * square / ERROR_WIDTH**2) * (
+                1.0 if errors[m, 2] == k else OTHER_STAGE_ERROR_WEIGHT
+            )
             total += weights[m]
         for i in range(3):
             for j in range(i, 3):
@@ -362,10 +364,10 @@ def predicted(
         tools_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
         expected(belief, tools[n], steps[n])
     for i in range(3):
-        bend = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / STEP_S**2
+        bend = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
         out[0, i] = steps[1, i]
-        out[1, i] = (steps[2, i] - steps[0, i]) / (2.0 * STEP_S)
-        out[2, i] = min(max(bend, -MAX_MPS2), MAX_MPS2)
+        out[1, i] = (steps[2, i] - steps[0, i]) / (2.0 * MOTION_STEP_S)
+        out[2, i] = min(max(bend, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
     if len(errors):
         scatter(hands[1], still, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from service.contract.requests import Name, ViaPoint
 from service.core.frame import Records, Vector, structured
-from service.core.skill.model import FARTHEST_M
 from service.core.skill.stages import MOST_STAGES, NONE, RIGHT, STAGE, STAYS
+from service.core.skill.tuning import LEAST_SEGMENT_M, MAX_SKILL_DISTANCE_M
 
 MOST_NAMES = MOST_STAGES + 1  # via-points of a task
-LEAST_WAY_M = 0.01  # a hand whose places are told to be nearer to each other stays
 TASK_UNITS = (
     "inputs: how far along the left and the right hand are, the stage; outputs: how far along the tool is, its "
     "deviation x y z [m]; frame base"
@@ -23,14 +22,13 @@ TASK_UNITS = (
 TASK_RANGES = {
     "corners": (0, MOST_NAMES, ""),
     "follow": (NONE, RIGHT, ""),
-    "nominal": (-FARTHEST_M, FARTHEST_M, "m"),
-    "off_ways": (1e-3, FARTHEST_M, "m"),
+    "nominal": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
+    "off_ways": (1e-3, MAX_SKILL_DISTANCE_M, "m"),
     "seen": (-0.001, MOST_STAGES, ""),
-    "errors": (-FARTHEST_M, FARTHEST_M, "m"),
+    "errors": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "delay": (0.0, 1.0, "s"),
 }
 """Least, greatest and unit of the numbers in the arrays of a task's model."""
-
 Indices = NDArray[np.int64]
 
 
@@ -60,7 +58,7 @@ class Task(NamedTuple):
         out = structured(len(rows) - 1, STAGE)
         out["begins"], out["way"] = hands[:-1], np.diff(hands, axis=0)
         square = (out["way"] ** 2).sum(axis=2)
-        out["square"] = np.where(square > LEAST_WAY_M**2, square, STAYS)
+        out["square"] = np.where(square > LEAST_SEGMENT_M**2, square, STAYS)
         out["way"] *= (out["square"] > STAYS)[:, :, None]
         out["off"], out["tool"], out["tool_way"] = off, at[:-1, 6:], np.diff(at[:, 6:], axis=0)
         out["follow"] = np.stack([self.follow[:-1], self.follow[1:]], axis=1)

@@ -9,13 +9,13 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array
-from service.core.intake.mode_filter import PRIOR, SWITCH_RATES
+from service.core.intake.tuning import MODE_PRIOR, MODE_SWITCH_RATES_PER_S
 from service.core.skill.model import REGION_95
 
 if TYPE_CHECKING:
     from service.core.skill.skill import Skill
 
-CHANGES_RATE = float(SWITCH_RATES.max())  # [1/s] at which one moves otherwise than it did: nobody sees it
+CHANGES_RATE = float(MODE_SWITCH_RATES_PER_S.max())  # [1/s] at which one moves otherwise than it did: nobody sees it
 STANDS = np.zeros((2, 3))  # both hands: how they move makes no difference to where the tool should be
 
 
@@ -26,8 +26,8 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     """
     state, variance = states[0], 0.0
     stay = math.exp(-CHANGES_RATE * (state.tick - state.hand_ticks[side]) * period_s)
-    for mode in range(len(PRIOR)):
-        share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * PRIOR[mode]
+    for mode in range(len(MODE_PRIOR)):
+        share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * MODE_PRIOR[mode]
         variance += share * state.mode_covariances[side, mode, 0, 0]
     return math.sqrt(variance)
 

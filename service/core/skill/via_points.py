@@ -8,10 +8,9 @@ import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
+from service.core.skill.tuning import LEAST_PULL_VARIANCE_SHARE, PULL_SHARPNESS_PER_M2
 
 NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
-NEAR = 50.0  # [1/m²] of a kernel exp(-NEAR |difference|²) of hands: how far around a via-point the tool is moved
-LEAST = 1e-6  # of its variance, where via-points are exact
 
 
 def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vector]:
@@ -32,8 +31,9 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
 
 
 def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector]:
-    """Centres (X, 6) [m] and weights (X, 3) [m] of kernels NEAR by which a mean of hands at rest,
-    (T, 6) to (T, 3) [m], goes through via-points, and stays at `kept` hands (K, 6).
+    """Centres (X, 6) [m] and weights (X, 3) [m] of kernels of PULL_SHARPNESS_PER_M2, by which a
+    mean of hands at rest, (T, 6) to (T, 3) [m], passes through via-points, and stays at `kept`
+    hands (K, 6).
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     if not len(inputs):
@@ -41,5 +41,5 @@ def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[Vi
     centres = np.concatenate([inputs, kept])
     off = np.concatenate([outputs - mean(inputs), np.zeros((len(kept), 3))])
     square = ((centres[:, None] - centres) ** 2).sum(axis=2)
-    noise = np.concatenate([deviations**2, np.zeros(len(kept))]) + LEAST
-    return centres, np.linalg.solve(np.exp(-NEAR * square) + np.diag(noise), off)
+    noise = np.concatenate([deviations**2, np.zeros(len(kept))]) + LEAST_PULL_VARIANCE_SHARE
+    return centres, np.linalg.solve(np.exp(-PULL_SHARPNESS_PER_M2 * square) + np.diag(noise), off)

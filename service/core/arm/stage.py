@@ -10,35 +10,34 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from service.config import JointSettings, Settings
-from service.core.arm.inverse_kinematics import NEAR, SEPARATED, SPEED, describe, follow, joint_costs, joint_step
-from service.core.arm.inverse_kinematics import tool_speeds as _tool_speeds
-from service.core.frame import Record, Records, Vector, as_array, parameters, structured
-from service.core.separation.separation import Separation
+from service.config import Settings
+from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step
+from service.core.arm.tuning import (
+    CLOSING_BRAKE_SHARE,
+    CLOSING_SPEED_MPS,
+    CONSTRAINED_SPEED_MPS,
+    DAMPING_M2,
+    FAR_DAMPING_S2,
+    MAX_JOINT_RAD,
+    PLANNED_LIMIT_SHARES,
+    POSITION_GAIN_PER_S,
+    POSITION_GAIN_RATE_SHARE,
+    REFERENCE_REACH_M,
+    SINGULAR_DAMPING_M2,
+    SINGULAR_VOLUME_M3,
+    SPARING_POWER,
+    TOOL_SPEED_SHARE,
+    TURN_GAIN_PER_S,
+    TURN_GAIN_RATE_SHARE,
+    TURN_HORIZON_S,
+    TURN_LEVER_M,
+)
+from service.core.frame import Record, Vector, as_array, parameters, structured
+from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
+from service.core.kinematics import Kinematics, joint_costs
+from service.core.kinematics import tool_speeds as _tool_speeds
+from service.core.separation.stage import Separation
 from service.urdf import Urdf
-
-REACH_M = 0.88  # of the WAM, on which the next four were chosen; they are scaled by the arm's own
-TURN_LEVER = 0.0115  # [m] 1 rad/s counts as this many m/s of the tool: position goes first, the posture last
-DAMPING = 1e-5  # [m²] a joint at 1 rad/s costs as much as sqrt(DAMPING) m/s of error
-SINGULAR_DAMPING = 2e-3  # [m²] more at a singular posture
-SINGULAR_VOLUME = 0.04  # [m³] manipulability below which damping grows; 0.06 to 0.13 over the WAM's table
-
-POSITION_GAIN, TURN_GAIN = 50.0, 10.0  # [1/s] of small errors' decay; at most ...
-POSITION_GAIN_SHARE, TURN_GAIN_SHARE = 2.0, 0.4  # ... these of `acceleration_rate`, or joints swing about the target
-CLOSING_SPEED = 0.3  # [m/s] at most, of a large error's
-CLOSING_BRAKES = 0.1  # of the tool's acceleration in a stop; with more, joints at their jerk limit swing about it
-FAR_DAMPING = 4.0  # [s²] more, times the square of the closing speed above FAR_SPEED: steady at unreachable targets
-# [m/s] of the tool that constraints take away, at which half of SINGULAR_DAMPING is added. Where
-# several of them leave few directions free, the least motion would else change the solution much.
-KEPT_SPEED = 0.02
-HORIZON_S = 0.008  # for reaching the joint velocities that an orientation step needs; else it is scaled down
-SPARING = 0.8  # power of a joint's acceleration limit by which its speed is weighed: slow ones are spared
-TOOL_SHARE = 0.985  # of the tool's greatest speed, for closing and forward speed together
-# Of the joints' speed, acceleration and jerk that a plan may use: closing in needs the rest.
-PLANNED_SHARE = np.array([0.97, 0.95, 0.85])
-
-FARTHEST_RAD = 1e4  # beyond it a joint is not calculated with
-MARGIN = 1e-6  # [rad] kept from the position limits, so that rounding along a stop (< 1e-7 rad) does not pass them
 
 
 class Solution(NamedTuple):
@@ -66,47 +65,6 @@ class Closing(NamedTuple):
     far_damping: float
 
 
-class Kinematics:
-    """The arm at some joints, as one record (1,), see `Arm.at`."""
-
-    __slots__ = ("record",)
-
-    def __init__(self, record: Records) -> None:
-        self.record = record
-
-    @property
-    def joints(self) -> Vector:
-        """(J,) [rad]."""
-        return self.record["joints"][0]  # type: ignore[no-any-return]
-
-    @property
-    def position(self) -> Vector:
-        """The tool's (3,) [m], frame base."""
-        return self.record["position"][0]  # type: ignore[no-any-return]
-
-    @property
-    def rotation(self) -> Vector:
-        """The tool's (3, 3), frame base."""
-        return self.record["rotation"][0]  # type: ignore[no-any-return]
-
-    @property
-    def tasks(self) -> Vector:
-        """(5 or 6, J): the tool's velocity by the joints', and what turns it, in its own axes,
-        times the turn lever [m].
-        """
-        return self.record["tasks"][0]  # type: ignore[no-any-return]
-
-    @property
-    def damping(self) -> float:
-        """Of the tasks [m²]."""
-        return float(self.record["damping"][0])
-
-    @property
-    def jacobian(self) -> Vector:
-        """The tool's (6, J), velocity before turning, frame base."""
-        return self.record["jacobian"][0]  # type: ignore[no-any-return]
-
-
 class Arm:
     """The arm that a URDF describes, with a tool on its plate.
 
@@ -124,12 +82,12 @@ class Arm:
         tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
         self._tool = self._model.addFrame(tool)
         self._data = self._model.createData()
-        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / REACH_M
+        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / REFERENCE_REACH_M
         closing = closing or Closing(
-            CLOSING_BRAKES * settings.tool.stop_acceleration, min(top, CLOSING_SPEED), FAR_DAMPING
+            CLOSING_BRAKE_SHARE * settings.tool.stop_acceleration, min(top, CLOSING_SPEED_MPS), FAR_DAMPING_S2
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
-        scale = acceleration**SPARING
+        scale = acceleration**SPARING_POWER
         scale /= np.exp(np.log(scale).mean())
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
@@ -140,18 +98,18 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
-            kept_speed=KEPT_SPEED,
-            max_tool_speed=TOOL_SHARE * top,
+            kept_speed=CONSTRAINED_SPEED_MPS,
+            max_tool_speed=TOOL_SPEED_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
-            position_gain=min(POSITION_GAIN, POSITION_GAIN_SHARE * rate),
-            turn_gain=min(TURN_GAIN, TURN_GAIN_SHARE * rate),
-            turn_lever=TURN_LEVER * size,
-            damping=DAMPING * size**2,
-            singular_damping=SINGULAR_DAMPING * size**2,
-            singular_volume=SINGULAR_VOLUME * size**3,
-            horizon_s=HORIZON_S,
-            lower=np.array(limits.lower) + MARGIN,
-            upper=np.array(limits.upper) - MARGIN,
+            position_gain=min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * rate),
+            turn_gain=min(TURN_GAIN_PER_S, TURN_GAIN_RATE_SHARE * rate),
+            turn_lever=TURN_LEVER_M * size,
+            damping=DAMPING_M2 * size**2,
+            singular_damping=SINGULAR_DAMPING_M2 * size**2,
+            singular_volume=SINGULAR_VOLUME_M3 * size**3,
+            horizon_s=TURN_HORIZON_S,
+            lower=np.array(limits.lower) + LIMIT_MARGIN_RAD,
+            upper=np.array(limits.upper) - LIMIT_MARGIN_RAD,
             approach_gain=approach_gain(limits),
             max_velocity=np.array(limits.velocity, np.float64),
             acceleration=acceleration,
@@ -160,7 +118,7 @@ class Arm:
             per_rad=np.array(limits.per_rad),
             scale=scale,
             spared=spared,
-            planned_limits=PLANNED_SHARE[:, None]
+            planned_limits=PLANNED_LIMIT_SHARES[:, None]
             * np.array([limits.velocity, limits.acceleration, limits.jerk])
             / spared,
         )
@@ -189,7 +147,7 @@ class Arm:
 
     def at(self, q: Vector) -> Kinematics:
         """The arm at joints q (J,) [rad, m]."""
-        q = np.minimum(np.maximum(q, -FARTHEST_RAD), FARTHEST_RAD)
+        q = np.minimum(np.maximum(q, -MAX_JOINT_RAD), MAX_JOINT_RAD)
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
@@ -246,7 +204,7 @@ class Arm:
         goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation
         goal["turning"], goal["acceleration"] = 0.0 if turning is None else turning, 0.0
         goal["moving"] = 0.0 if moving is None else moving
-        goal["horizon_s"] = math.inf if moving is None else HORIZON_S
+        goal["horizon_s"] = math.inf if moving is None else TURN_HORIZON_S
         constraints, count = (
             (self._unseparated, 0) if separation is None else (separation.constraints, separation.count)
         )
@@ -256,18 +214,3 @@ class Arm:
 def _solution(found: Vector, flags: int) -> Solution:
     found.setflags(write=False)
     return Solution(found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
-
-
-def acceleration_rate(limits: JointSettings) -> float:
-    """Jerk by acceleration [1/s] of the joint that changes its acceleration most slowly."""
-    return float((np.array(limits.jerk) / np.array(limits.acceleration)).min())
-
-
-def approach_gain(limits: JointSettings) -> Vector:
-    """Greatest speed toward a position limit per distance to it, (J,) [1/s].
-
-    Braking along it takes at most half of the acceleration and a quarter of the jerk.
-    """
-    velocity = np.array(limits.velocity)
-    gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))
-    return gain

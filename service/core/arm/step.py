@@ -12,130 +12,22 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.least_squares import factorise, solve, substitute
+from service.core.arm.least_squares import solve
+from service.core.arm.tuning import (
+    FAR_SPEED_MPS,
+    IDLE_BRAKE_SHARE,
+    MAX_ERROR_M,
+    NEAR_LIMIT_RAD,
+    POSTURE_GAIN_PER_S,
+    POSTURE_SPEED_RADPS,
+    SPEED_ROUNDING_MPS,
+)
 from service.core.frame import Records, Vector
-from service.core.geometry import quaternion_of, swing, turn_between
+from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
 
-NEAR_LIMIT = 0.1  # [rad]
-POSTURE_GAIN = 1.0  # [1/s]
-POSTURE_SPEED = 0.3  # [rad/s] at most, each joint
-FAR_SPEED = 0.15  # [m/s] a faster approach is damped more
-FARTHEST = 10.0  # [m], [m/s] beyond which errors and velocities are no larger
-IDLE_BRAKE = 0.25  # of the joints' acceleration, with which motion ends that neither moves the tool nor turns it
-ROUNDING = 1e-12  # of a speed
-ROUND_TO = 1e9  # [s/rad], [s²/rad] of the result: machines that differ in the last bits agree
 SPEED = 1  # flag of a step: a joint's speed limit was met
 NEAR = 2  # a joint is near its position limit
 SEPARATED = 4  # separation asked for other velocities
-
-
-@compiled
-def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float, float]:
-    """Speed of the tool now; the greater of it and the speed once each joint has brought its
-    acceleration to 0; and the sum of what the joints contribute to that [m/s].
-
-    The sum bounds the speed whatever the joints' motions cancel of each other now.
-    """
-    tasks = heres[0].tasks
-    now = crest = total = 0.0
-    for axis in range(3):
-        v = v_crest = 0.0
-        for joint in range(len(dq)):
-            v += tasks[axis, joint] * dq[joint]
-            gained = ddq[joint] * abs(ddq[joint]) / (2.0 * jerk[joint])
-            v_crest += tasks[axis, joint] * (dq[joint] + gained)
-        now += v * v
-        crest += v_crest * v_crest
-    for joint in range(len(dq)):
-        column = math.sqrt(tasks[0, joint] ** 2 + tasks[1, joint] ** 2 + tasks[2, joint] ** 2)
-        total += column * (abs(dq[joint]) + ddq[joint] ** 2 / (2.0 * jerk[joint]))
-    return math.sqrt(now), math.sqrt(max(now, crest)), total
-
-
-@compiled
-def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
-    """Speed of the tool [m/s] at joint velocities dq (J,), once the joints have moved by `way` (J,)
-    [rad, or m of a sliding joint].
-
-    Exact, by the product of exponentials: joint i is a screw with axis w and moment u = o × w, or
-    with w = 0 and direction u where it slides, as the Jacobian has them now. The joints before it
-    carry both along, by (R, s) = exp(screw_1 way_1) ... exp(screw_(i-1) way_(i-1)):
-
-        w' = R w,  u' = R u + s × w',  and with all joints  tool' = R tool + s
-
-    and the speed is |sum dq (u' + w' × tool')|.
-    """
-    here, joints = heres[0], len(dq)
-    jacobian, tool = here.jacobian, here.position
-    rotation, shift, turned, moved = np.eye(3), np.zeros(3), np.empty((3, 3)), np.empty(3)
-    linear, angular, axis, moment = np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
-    own, own_shift = np.empty((3, 3)), np.empty(3)
-    for j in range(joints):
-        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
-        # moment about the origin: the tool's velocity less w × tool
-        ux = jacobian[0, j] - (wy * tool[2] - wz * tool[1])
-        uy = jacobian[1, j] - (wz * tool[0] - wx * tool[2])
-        uz = jacobian[2, j] - (wx * tool[1] - wy * tool[0])
-        for i in range(3):
-            axis[i] = rotation[i, 0] * wx + rotation[i, 1] * wy + rotation[i, 2] * wz
-            moment[i] = rotation[i, 0] * ux + rotation[i, 1] * uy + rotation[i, 2] * uz
-        linear[0] += dq[j] * (moment[0] + shift[1] * axis[2] - shift[2] * axis[1])
-        linear[1] += dq[j] * (moment[1] + shift[2] * axis[0] - shift[0] * axis[2])
-        linear[2] += dq[j] * (moment[2] + shift[0] * axis[1] - shift[1] * axis[0])
-        for i in range(3):
-            angular[i] += dq[j] * axis[i]
-        c, s = math.cos(way[j]), math.sin(way[j])
-        turns = wx * wx + wy * wy + wz * wz > 0.5
-        if not turns:
-            c, s = 1.0, 0.0
-        v = 1.0 - c
-        own[0, 0], own[0, 1], own[0, 2] = c + v * wx * wx, v * wx * wy - s * wz, v * wx * wz + s * wy
-        own[1, 0], own[1, 1], own[1, 2] = v * wx * wy + s * wz, c + v * wy * wy, v * wy * wz - s * wx
-        own[2, 0], own[2, 1], own[2, 2] = v * wx * wz - s * wy, v * wy * wz + s * wx, c + v * wz * wz
-        if turns:  # about the point o = w × u of the axis: o - own o
-            ox, oy, oz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
-            own_shift[0] = ox - (own[0, 0] * ox + own[0, 1] * oy + own[0, 2] * oz)
-            own_shift[1] = oy - (own[1, 0] * ox + own[1, 1] * oy + own[1, 2] * oz)
-            own_shift[2] = oz - (own[2, 0] * ox + own[2, 1] * oy + own[2, 2] * oz)
-        else:
-            own_shift[0], own_shift[1], own_shift[2] = ux * way[j], uy * way[j], uz * way[j]
-        for i in range(3):
-            moved[i] = shift[i]
-            for k in range(3):
-                moved[i] += rotation[i, k] * own_shift[k]
-                turned[i, k] = rotation[i, 0] * own[0, k] + rotation[i, 1] * own[1, k] + rotation[i, 2] * own[2, k]
-        rotation[:], shift[:] = turned, moved
-    for i in range(3):
-        moved[i] = rotation[i, 0] * tool[0] + rotation[i, 1] * tool[1] + rotation[i, 2] * tool[2] + shift[i]
-    x = linear[0] + angular[1] * moved[2] - angular[2] * moved[1]
-    y = linear[1] + angular[2] * moved[0] - angular[0] * moved[2]
-    z = linear[2] + angular[0] * moved[1] - angular[1] * moved[0]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@compiled
-def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
-    """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
-    limit, by damped least squares that spare the joints with less of it; by order of the
-    derivative, then by axis. The tool turns where that spares joints.
-    """
-    arm, here = arms[0], heres[0]
-    joints = here.tasks.shape[1]
-    scaled, root, right = np.empty((3, joints)), np.empty((3, 3)), np.empty(3)
-    for order in range(3):
-        for i in range(3):
-            for joint in range(joints):
-                scaled[i, joint] = here.tasks[i, joint] * arm.spared[order, joint]
-        factorise(scaled, here.damping, root)
-        for axis in range(3):
-            right[:] = 0.0
-            right[axis] = 1.0
-            substitute(root, right)
-            for joint in range(joints):
-                moved = 0.0
-                for i in range(3):
-                    moved += scaled[i, joint] * right[i]
-                out[order, axis, joint] = moved / arm.planned_limits[order, joint]
 
 
 @compiled
@@ -214,8 +106,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     wanted, error, linear, turn = np.empty(count_of_tasks), np.empty(3), np.empty(3), np.empty(3)
     distance = 0.0
     for i in range(3):
-        linear[i] = min(max(goal.velocity[i], -FARTHEST), FARTHEST)
-        error[i] = min(max(goal.position[i] - here.position[i], -FARTHEST), FARTHEST) - arm.period_s * linear[i]
+        linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
+        error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M) - arm.period_s * linear[i]
         distance += error[i] * error[i]
     distance = math.sqrt(distance)
     # in proportion to the error when near, braking evenly from afar
@@ -223,7 +115,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     rate = arm.position_gain
     if distance > near:
         rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
-    excess = max(rate * distance - FAR_SPEED, 0.0)
+    excess = max(rate * distance - FAR_SPEED_MPS, 0.0)
     damping += arm.far_damping * excess * excess
     for i in range(3):  # the error decays as it will be, not as it is
         error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)
@@ -236,14 +128,14 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     said, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
-        if min(low, high) < NEAR_LIMIT * arm.per_rad[j]:
+        if min(low, high) < NEAR_LIMIT_RAD * arm.per_rad[j]:
             said |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
-        off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED * arm.per_rad[j]
+        off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED_RADPS * arm.per_rad[j]
         if arm.is_continuous[j]:  # in whichever turn; 0 half a turn away, as no direction is shorter there
             off = math.sin(off)
-        home[j] = min(max(POSTURE_GAIN * off, -most), most) / scale[j]
+        home[j] = min(max(POSTURE_GAIN_PER_S * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
     rows, limits = np.empty((count, joints)), np.empty(count)
@@ -263,7 +155,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     if not near:  # it turns as far as costs its position nothing
         free = np.empty(joints)
         for j in range(joints):
-            brake = IDLE_BRAKE * arm.period_s * arm.acceleration[j]
+            brake = IDLE_BRAKE_SHARE * arm.period_s * arm.acceleration[j]
             home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not kept:  # what keeps distances was found for this solution, not for one on the way to it
@@ -278,7 +170,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
         for order in range(2):
             out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
-    return said | SPEED if excess > 1.0 + ROUNDING else said
+    return said | SPEED if excess > 1.0 + SPEED_ROUNDING_MPS else said
 
 
 @compiled

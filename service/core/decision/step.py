@@ -1,0 +1,182 @@
+"""The decision's compiled step: mode and reason from the arm, the hands and the skill."""
+
+from __future__ import annotations
+
+import math
+
+from kmp.compiled import compiled
+from service.core.codes import (
+    AMBIGUOUS,
+    ARM_ERROR,
+    ARM_HEARD,
+    ARM_INSIDE,
+    ARM_SILENT,
+    ARM_STILL,
+    BLOCKED,
+    CONTESTED,
+    FAR,
+    FAULT,
+    FOLLOW,
+    HELD,
+    HOLD,
+    NO_HANDS,
+    NONE,
+    NOT_READY,
+    NOTICED,
+    ONE_HAND,
+    OPERATOR,
+    READY,
+    RETURNING,
+    STAGE_AMBIGUOUS,
+    STALE_HAND,
+    STARTS_ASSUMED,
+    STARTS_MEASURED,
+    TOOL_SPEED,
+    TWO_SOURCES,
+    UNSEEN,
+    UNSEEN_HAND_NEEDED,
+)
+from service.core.decision.tuning import (
+    ANOTHER_TARGET_M,
+    FREED_SHARE,
+    FREED_TIMEOUT_S,
+    GATE_RETURN_SHARE,
+    PROGRESS_SHARE,
+    PROGRESS_SPEED_SHARE,
+    STUCK_GAP_M,
+    STUCK_S,
+    STUCK_TARGET_M,
+    TOO_FAST_S,
+    WAY_TIMEOUT_S,
+)
+from service.core.frame import Records, Vector
+
+
+@compiled
+def step(
+    states: Records,
+    frames: Records,
+    heres: Records,
+    parameters: Records,
+    known: int,
+    gate_m: float,
+    threshold: float,
+) -> tuple[int, float, float]:
+    """`Decision.step`, and what was measured; -1: nothing."""
+    state = states[0]
+    if state.mode == FAULT:
+        return 0, -1.0, -1.0
+    starts, fault, error, speed = _arm(states, heres, parameters, known)
+    if fault != NONE:
+        state.mode, state.reason = FAULT, fault
+        return starts, error, speed
+    if known & CONTESTED:
+        reason = TWO_SOURCES
+    elif state.arm_ready != READY:
+        reason = NOT_READY
+    elif state.operator_hold:
+        reason = OPERATOR
+    elif math.isnan(gate_m):
+        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ONE_HAND
+        reason = NO_HANDS if unseen else STALE_HAND
+    elif known & sum(UNSEEN) and (known & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
+        reason = STALE_HAND
+    else:
+        ease = GATE_RETURN_SHARE if state.reason == FAR else 1.0
+        reason = FAR if gate_m > ease * threshold else AMBIGUOUS if known & STAGE_AMBIGUOUS else NONE
+    if reason == NONE:
+        state.stuck = _stuck(states, frames, heres, parameters)
+        reason = BLOCKED if state.stuck == HELD else NONE
+    state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+    return starts, error, speed
+
+
+@compiled
+def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
+    """Whether the arm starts, what is wrong with it, its error and speed as measured."""
+    state, given, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & ARM_INSIDE
+    if given.is_assumed:
+        starts = 0 if state.arm_ready else STARTS_ASSUMED
+        state.arm_ready = READY
+        return starts, NONE, -1.0, -1.0
+    moving = False
+    for joint in range(state.joints.shape[1]):
+        moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    if not state.arm_ready:
+        state.stuck = state.way_count = 0
+        if not known & ARM_STILL:
+            state.leaves = 0
+        # what still moves comes to rest first; what was reported must have been one posture
+        if not known & ARM_STILL or moving or (inside and not state.leaves):
+            return 0, NONE, -1.0, -1.0
+        state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
+        state.slow_tick = state.stuck_tick = state.tick
+        return STARTS_MEASURED, NONE, -1.0, -1.0
+    if not heard:
+        if state.mode == FOLLOW or moving:
+            return 0, ARM_SILENT, -1.0, -1.0
+        state.arm_ready = 0
+        return 0, NONE, -1.0, -1.0
+    if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
+        if moving:
+            state.stuck_tick = state.tick
+        if not inside or (state.tick - state.stuck_tick) * given.period_s > FREED_TIMEOUT_S:
+            state.arm_ready, state.leaves = READY, 0
+    error, speed = measured_error(states, heres, parameters)
+    if error > given.max_error_rad:
+        return 0, ARM_ERROR, error, speed
+    if speed <= given.fault_speed:
+        state.slow_tick = state.tick
+    fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
+    return 0, fault, error, speed
+
+
+@compiled
+def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
+    """Whether the tool comes no nearer to where it is to be: NOTICED or HELD; else 0."""
+    state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
+    gap = moved = 0.0
+    for i in range(3):
+        gap += (frame.target[i] - tool[i]) ** 2
+        moved += (frame.target[i] - state.stuck_target[i]) ** 2
+    gap, moved = math.sqrt(gap), math.sqrt(moved)
+    passed_s = (state.tick - state.stuck_tick) * given.period_s
+    if state.way_next < state.way_count and passed_s < WAY_TIMEOUT_S:
+        return HELD
+    if state.stuck == HELD and not state.way_count and moved < ANOTHER_TARGET_M:
+        return HELD
+    state.way_next = state.way_count = 0
+    if state.stuck == NOTICED:
+        least = FREED_SHARE * state.stuck_gap
+    else:
+        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * given.max_speed * STUCK_S)
+    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_TARGET_M:
+        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
+        return 0
+    return NOTICED if passed_s >= STUCK_S else 0
+
+
+@compiled
+def _is_outside(joints: Vector, parameters: Records) -> bool:
+    """Whether a joint (J,) [rad] is outside its limits."""
+    outside = False
+    for j in range(len(joints)):
+        outside = outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
+    return outside
+
+
+@compiled
+def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
+    """Largest difference between measured and commanded joints, by `per_rad` [rad]; and the
+    measured speed of the tool [m/s], from the Jacobian at the commanded joints.
+    """
+    state, here = states[0], heres[0]
+    error = speed = 0.0
+    for joint in range(len(here.joints)):
+        error = max(error, abs(here.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
+    for axis in range(3):
+        along = 0.0
+        for joint in range(len(here.joints)):
+            along += here.tasks[axis, joint] * state.measured_velocities[joint]
+        speed += along * along
+    return error, math.sqrt(speed)

@@ -1,0 +1,152 @@
+"""Hand and arm samples as they come in: checked, mapped to frame `base`, and filtered to a state at
+the tick.
+
+The rules by which a sample is believed, in full: `plausibility`. Those that come late:
+`late_samples`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from service.config import Settings
+from service.contract.channels import BY_KEY
+from service.contract.joint_states import measured
+from service.contract.messages import BASE, JointState, PoseStamped, WireError
+from service.contract.records import SIDES, SOURCES, Cause
+from service.core.frame import Event, Record, as_array, parameters
+from service.core.geometry import rotation
+from service.core.intake.arm_samples import still_ticks
+from service.core.intake.hand_estimator import HandEstimator
+from service.core.intake.motion_model import models
+from service.core.intake.step import ARM, report, take_arm, take_hand
+from service.core.intake.tuning import JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS, MAX_LATE_S, MAX_OUTSIDE_RAD
+
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # of `hands.unit`
+
+
+def _stale_ticks(key: str, settings: Settings) -> int:
+    """The ticks, at least one, after which a channel's source is silent; rounding of the period
+    does not make it one more.
+    """
+    section, name = BY_KEY[key].stale_after or ("", "")
+    duration_ms: float = getattr(getattr(settings, section), name)
+    return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
+
+
+class Refused(NamedTuple):
+    """A sample that was rejected, the stamp [ns] of the newest one accepted before, and for the arm
+    the joints that one measured.
+    """
+
+    cause: Cause
+    sample: PoseStamped | JointState
+    newest_ns: int
+    joints: tuple[float, ...] = ()
+
+
+class Intake:
+    """Hand and arm samples into the state: each hand's estimate, the arm's newest sample.
+
+    For people only, no part of the state: `rejected` counts (sources, causes) what this intake
+    rejected, and `refused` has the newest of it, by source and cause.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        hands = settings.hands
+        self.stale_ticks = _stale_ticks("hands/left", settings)
+        self._silent_ticks = _stale_ticks("joints/state", settings)
+        self._still_ticks = still_ticks(settings)
+        self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        # from the sample before to one that is late, and from that to now
+        unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
+        joints = settings.joints
+        limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
+        self._parameters = parameters(
+            period_s=settings.period_s,
+            stale_ticks=self.stale_ticks,
+            unseen_ticks=unseen_ticks,
+            silent_ticks=self._silent_ticks,
+            still_ticks=self._still_ticks,
+            jump=float(hands.jump),
+            jump_speed=float(hands.jump_speed),
+            swapped_s=float(hands.swapped_s),
+            joint_jump_speed=max(
+                JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS * float((np.array(joints.velocity) / per_rad).max())
+            ),
+            plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
+            per_rad=per_rad,
+            is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
+        )
+        origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+        self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
+        self._in_base = np.eye(3, 4)
+        # a tracker with a frame of its own: what says that it is in base has been mapped already
+        self._maps_base = hands.frame in ("", BASE)
+        self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
+        self.refused: dict[tuple[str, Cause], Refused] = {}
+        self._estimator = HandEstimator(hands, settings.period_s, self._models)
+
+    def begin(self, state: Record) -> None:
+        """Sets in a state of zeros what no sample has reported yet."""
+        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
+            state[field] = -1
+        self._estimator.begin(state)
+
+    def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
+        """Moves the state on by some ticks and takes the samples in; the flags HANDS_KNOWN,
+        ARM_HEARD, ARM_STILL and CONTESTED.
+        """
+        self.advance(state, ticks)
+        for event in samples:
+            if event.kind == "joints/state":
+                self.take_arm(state, event.value)
+            else:
+                self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+        return int(report(as_array(state), as_array(frame), self._parameters))
+
+    def advance(self, state: Record, ticks: int) -> None:
+        """The state moved on by some ticks: fresh hands by their motion, others stand still."""
+        state["tick"] += ticks
+        self._estimator.advance(state, ticks, int(self._parameters["unseen_ticks"][0]))
+
+    def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
+        """One hand's sample filtered in, or counted as rejected."""
+        if sample.frame_id not in self._frames:
+            state["rejected"][Cause.WRONG_FRAME] += 1
+            self._note(state, side, Cause.WRONG_FRAME, sample)
+            return
+        cause = take_hand(
+            as_array(state),
+            self._parameters,
+            self._models,
+            side,
+            sample.stamp_ns,
+            sample.position,
+            sample.orientation,
+            self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
+        )
+        if cause >= 0:
+            self._note(state, side, cause, sample)
+
+    def take_arm(self, state: Record, sample: JointState) -> None:
+        """The arm's sample into the state, or counted as rejected."""
+        try:
+            position, velocity = measured(sample, self._names)
+        except WireError:
+            state["rejected"][Cause.INCOMPLETE] += 1
+            self._note(state, ARM, Cause.INCOMPLETE, sample)
+            return
+        cause = take_arm(as_array(state), self._parameters, sample.stamp_ns, np.array(position), np.array(velocity))
+        if cause >= 0:
+            self._note(state, ARM, cause, sample)
+
+    def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+        newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
+        joints = tuple(state["measured"].tolist()) if source == ARM else ()
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
+        self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other

@@ -1,0 +1,256 @@
+"""The intake's compiled step: samples are checked, compared and taken into the filters."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.contract.records import SOURCES, Cause
+from service.core.codes import ARM_HEARD, ARM_STILL, CONTESTED, FAULT, HANDS_KNOWN, TWO_SOURCES, UNSEEN
+from service.core.frame import Records, Vector
+from service.core.geometry import ROUND_TO
+from service.core.intake import KEPT
+from service.core.intake.arm_samples import compared, unwrap
+from service.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
+from service.core.intake.late_samples import expected, take_late, tick_made
+from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
+from service.core.intake.tuning import (
+    ARM_STILL_RAD,
+    CONTESTED_MEMORY_S,
+    CONTESTED_OFF_SHARE,
+    CONTESTED_ON_SHARE,
+    JOINT_JUMP_RAD,
+    JUMP_NOISE_STDS,
+    LEAST_INTERVAL_S,
+    MAX_HAND_DISTANCE_M,
+    MAX_LATE_S,
+    SAMPLE_MAX_S,
+    SCATTER_LEAST_SAMPLES,
+    SCATTER_OFF_M,
+    SCATTER_ON_M,
+    TO_AND_FRO_MAX_SHARE,
+    TO_AND_FRO_MPS2,
+    TO_AND_FRO_S,
+)
+
+NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
+REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
+JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
+
+
+@compiled
+def is_contested(states: Records, already: bool) -> bool:
+    """Whether some source is contradicted by another; `already`: it was found so before."""
+    share, scatter_m = (CONTESTED_OFF_SHARE, SCATTER_OFF_M) if already else (CONTESTED_ON_SHARE, SCATTER_ON_M)
+    state = states[0]
+    for side in range(2):
+        known = already or state.noise_samples[side] >= SCATTER_LEAST_SAMPLES
+        if known and state.noise_variance[side] > scatter_m**2:
+            return True
+    return bool(state.contested.max() > share)
+
+
+@compiled
+def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float) -> int:
+    """The cause for which a stamp is refused, or -1; the newest one came `passed_s` ago, and one
+    may be older than that by `late_s`.
+    """
+    if stamp_ns == newest_ns:
+        return REPEATED
+    if not fresh:
+        return -1
+    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of integers may overflow
+    if ahead_s > passed_s + silent_s:
+        return AHEAD
+    return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
+
+
+@compiled
+def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
+    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
+    after the other, the samples count alike.
+    """
+    state = states[0]
+    ticks, share = state.sample_ticks[source], state.contested[source]
+    passed = float(state.tick - ticks[0])
+    if ticks[1] < state.tick:
+        passed *= 0.5  # since the sample before the last
+        ticks[0], ticks[1] = ticks[1], state.tick
+    passed_s = min(passed * period_s, SAMPLE_MAX_S)
+    share += (1.0 - math.exp(-passed_s / CONTESTED_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
+    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
+
+
+@compiled
+def has_jumped(
+    states: Records, parameters: Records, side: int, position: Vector, expected: Vector, interval_s: float
+) -> bool:
+    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
+    after the one before, which tells that it was `expected` elsewhere.
+    """
+    state, given = states[0], parameters[0]
+    gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
+    off = 0.0
+    for axis in range(3):
+        off += (position[axis] - expected[axis]) ** 2
+    return bool(off > gate * gate)
+
+
+@compiled
+def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
+    """Whether a hand would turn as none can, by two kept samples and one (3,) [m] after them."""
+    before_s, past, wanted = states[0].kept_noise[side, at, 3], states[0].kept_past[side, at], 0.0
+    if after_s + before_s > TO_AND_FRO_S:
+        return False
+    after_s, before_s = max(after_s, LEAST_INTERVAL_S), max(before_s, LEAST_INTERVAL_S)
+    for axis in range(3):
+        turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
+        wanted += (2.0 * turned / (after_s + before_s)) ** 2
+    return wanted >= TO_AND_FRO_MPS2**2
+
+
+@compiled
+def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
+    """`Intake.take_arm`: the cause for which it was rejected, or -1."""
+    state, given = states[0], parameters[0]
+    passed = state.tick - state.arm_tick
+    passed_s, silent_s = passed * given.period_s, given.silent_ticks * given.period_s
+    fresh = state.arm_tick >= 0 and passed < given.silent_ticks
+    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+        state.rejected[NOT_FINITE] += 1
+        return NOT_FINITE
+    # Before it is ready, and after a silence, an arm is in the turn that it reports: it may have
+    # started anew. While it is commanded, its turns go on.
+    if fresh or (state.arm_ready and state.mode != FAULT):
+        unwrap(states, parameters, position)
+    near, off, moved = compared(states, parameters, position, velocity)
+    cause = -1 if near else OUT_OF_RANGE
+    if near:
+        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
+    if near and cause != REPEATED:
+        jumped = fresh and off > JOINT_JUMP_RAD + given.joint_jump_speed * passed_s
+        note(states, ARM, jumped, given.period_s)
+        if jumped and cause < 0:
+            cause = JUMPED
+    if near and (moved > ARM_STILL_RAD or not fresh):
+        state.arm_still_posture[:] = position
+        state.arm_still_tick = state.tick
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return cause
+    state.measured[:], state.measured_velocities[:] = position, velocity
+    state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
+    return -1
+
+
+@compiled
+def take_hand(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    stamp_ns: int,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    frame: Vector,
+) -> int:
+    """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base: the cause for
+    which it was rejected, or -1.
+    """
+    state, given, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
+    for k in range(4):
+        norm += turn[k] * turn[k]
+    for i in range(3):
+        in_base[i] = frame[i, 3]
+        for k in range(3):
+            in_base[i] += frame[i, k] * position[k]
+        far += in_base[i] * in_base[i]
+    stale_ticks, period_s = given.stale_ticks, given.period_s
+    since = state.tick - state.hand_ticks[side]
+    fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
+    jumped, cause, order, made = False, -1, 0, state.tick
+    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+        cause = NOT_FINITE
+    elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
+        cause = NOT_A_ROTATION
+    elif not far <= MAX_HAND_DISTANCE_M * MAX_HAND_DISTANCE_M:
+        cause = OUT_OF_RANGE
+    else:
+        newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
+        cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, MAX_LATE_S)
+        if cause < 0:
+            if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, given.unseen_ticks)):
+                state.kept[side] = 0
+            elif fresh and stamp_ns < newest_ns:
+                order = order_of(states, side, stamp_ns)
+            late = ticks_late(states, side, stamp_ns, period_s)
+            if order >= KEPT - 1:
+                order, cause = 0, OLDER
+            elif order < 0:
+                cause = REPEATED
+            elif order > 0 or late > 0:
+                made = tick_made(states, side, stamp_ns, order, late, period_s)
+        on_time, there = order == 0 and made == state.tick, np.empty(3)
+        if fresh and cause != REPEATED:
+            there[:] = state.hands[side, 0]
+            if not on_time:
+                expected(states, models, side, order, made, there)
+            at = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
+            passed_s = abs(made - state.kept_ticks[side, at]) * period_s
+            jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
+            another = jumped and is_of_another(states, parameters, side, in_base, there)
+            if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
+                another = _turns_hard(states, side, at, in_base, passed_s)  # no more is needed, it would settle late
+                another = another and is_to_and_fro(states, side, order, in_base)
+            note(states, side, another, period_s)
+        elif cause != REPEATED:
+            note(states, side, False, period_s)
+        if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
+            jumped = is_swapped(states, parameters, side, in_base)
+        if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
+            cause = SWAPPED if state.jump_is_swap[side] else JUMPED
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return cause
+    if order == 0 and made == state.tick:
+        take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
+    else:
+        note_clock(states, side, stamp_ns, period_s, fresh)
+        take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
+    if order == 0:
+        state.jump_count[side] = state.jump_is_swap[side] = 0
+        state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
+        turn_to(states, side, turn, frame)
+        state.hand_stamps_ns[side] = stamp_ns
+        state.hand_ticks[side] = state.tick
+    return -1
+
+
+@compiled
+def report(states: Records, frames: Records, parameters: Records) -> int:
+    """Into the frame what is known of the hands; flags of what is."""
+    frame, state, given = frames[0], states[0], parameters[0]
+    left, right = state.hand_ticks[0], state.hand_ticks[1]
+    if left == right:
+        frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
+    else:
+        frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
+    for side in range(2):
+        seen = state.hand_ticks[side]
+        frame.hand_ages[side] = -1 if seen < 0 else state.tick - seen
+        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
+    frame.tick = state.tick
+    frame.rejected[:] = state.rejected
+    known, least, most = 0, frame.hand_ages.min(), frame.hand_ages.max()
+    if 0 <= least < given.stale_ticks and most < given.unseen_ticks:
+        known = HANDS_KNOWN
+        if most >= given.stale_ticks:
+            known |= UNSEEN[0 if frame.hand_ages[0] == most else 1]
+    if state.arm_tick >= 0 and state.tick - state.arm_tick < given.silent_ticks:
+        known |= ARM_HEARD
+        if state.tick - state.arm_still_tick >= given.still_ticks:
+            known |= ARM_STILL
+    contested = is_contested(states, state.reason == TWO_SOURCES)
+    return known | CONTESTED if contested else known

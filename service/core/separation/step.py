@@ -1,0 +1,266 @@
+"""Separation's compiled step: from hands and posture to inequalities of joint velocities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.core.frame import Records, Vector
+from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
+from service.core.separation.clearance import ITSELF, PEOPLE, THINGS
+from service.core.separation.tuning import (
+    BRAKE_RAMP_S,
+    CLEARANCE_GAIN_PER_S,
+    CONTACT_MARGIN_M,
+    FARTHEST_REPORTED_M,
+    HAND_ACCELERATION_FADE_S,
+    LOOKAHEAD_S,
+    PLANNED_BRAKE_SHARE,
+    RETREAT_AUTHORITY_MPS,
+    RETREAT_SPEED_MPS,
+    SLIP_DEPTH_M,
+    SLIP_SPEED_MPS,
+    UNKNOWN_VELOCITY_STD_MPS,
+    UNSEEN_ACCELERATION_MPS2,
+)
+
+
+@compiled
+def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
+    """Speed [m/s] toward something `distance` [m] away that comes at `hand_speed` [m/s] all the
+    time, from which a stop that begins a reaction time [s] late and brakes so [m/s²] ends
+    `clearance` away.
+    """
+    square = hand_speed**2 + (brake * reaction) ** 2 + 2.0 * brake * (distance - clearance)
+    return max(0.0, math.sqrt(max(square, 0.0)) - brake * reaction - hand_speed)
+
+
+@compiled
+def step(
+    states: Records,
+    heres: Records,
+    parameters: Records,
+    capsules: Records,
+    pairs: Vector,
+    boxes: Vector,
+    contacts: Records,
+    constraints: Records,
+) -> tuple[int, float, float, float]:
+    """`Separation.step`: how many constraints; nearest, speed limit and setpoint's share."""
+    state, here, given = states[0], heres[0], parameters[0]
+    joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
+    later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
+    now, then = placed[0], placed[1]
+    place(here.joints, given.frames, given.axes, capsules, now)
+    nearest_m, setpoint_share = FARTHEST_REPORTED_M, 1.0
+    speed_limit = capsules[0].max_speed
+    for capsule in range(len(capsules)):
+        speed_limit = max(speed_limit, capsules[capsule].max_speed)
+    for side in range(2):
+        if state.hand_ticks[side] < 0:
+            continue
+        variance = 0.0
+        for mode in range(state.mode_probabilities.shape[1]):
+            variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
+        known, receives = (
+            variance <= UNKNOWN_VELOCITY_STD_MPS * UNKNOWN_VELOCITY_STD_MPS,
+            _receives(contacts, state.hands, side),
+        )
+        age_s = (state.tick - state.hand_ticks[side]) * given.period_s
+        # of one that is not seen, while the arm may go on: by so much faster and nearer it may be
+        unseen_s = age_s - given.unseen_s[0] if given.unseen_s[0] < age_s < given.unseen_s[1] else 0.0
+        speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, given.unknown_speed)
+        nearer = speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
+        moment = _swiftness(state.hands[side, 1], given.tremor_speed) if known else 0.0
+        for k in range(len(LOOKAHEAD_S) if moment > 0.0 else 1):
+            ahead = moment * LOOKAHEAD_S[k]
+            parts = now if k == 0 else then
+            if k > 0:
+                for j in range(joints):
+                    later[j] = here.joints[j] + ahead * state.joints[1, j]
+                place(later, given.frames, given.axes, capsules, then)
+            faster = HAND_ACCELERATION_FADE_S * (1.0 - math.exp(-ahead / HAND_ACCELERATION_FADE_S))
+            for i in range(3):
+                v, a = state.hands[side, 1, i], state.hands[side, 2, i]
+                velocity[i] = v + faster * a
+                moved = ahead * v + HAND_ACCELERATION_FADE_S * (ahead - faster) * a
+                forearm[0, i] = state.hands[side, 0, i] + moved
+                forearm[1, i] = forearm[0, i] + given.forearm[i]
+            braked = given.brake[PEOPLE] * max(ahead - BRAKE_RAMP_S, 0.0)
+            for capsule in range(given.first, len(capsules)):
+                part, constraint = capsules[capsule], constraints[count]
+                distance = between_segments(parts[capsule], forearm, near) - part.radius - given.hand_radius
+                if k == 0:
+                    nearest_m = min(nearest_m, distance)
+                distance -= nearer
+                coming = 0.0
+                for i in range(3):
+                    coming -= near[6 + i] * velocity[i]
+                coming = max(coming, 0.0) + speed_up if known else given.unknown_speed
+                least = given.contact_speed if receives and part.link == joints else 0.0
+                if k == 0:
+                    most = max(least, _allowed(parameters, PEOPLE, distance, coming))
+                    speed_limit = min(speed_limit, most)
+                planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+                if planned < part.max_speed:
+                    constraint.planned = planned
+                    constraint.allowed = (
+                        max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + SLIP_SPEED_MPS
+                    )
+                    if k > 0:
+                        carry_back(near, then[capsule], now[capsule])
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
+    for capsule in range(given.first, len(capsules)):
+        part = capsules[capsule]
+        for box in range(len(boxes)):
+            inner = nearest_to_box(now[capsule], boxes[box])
+            for where in range(3):  # the ends too: a capsule that lies along a face may tip
+                share = inner if where == 0 else where - 1.0
+                distance = to_box(now[capsule], share, boxes[box], near) - part.radius
+                planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
+                twice = where > 0 and share == inner
+                if not twice and planned < part.max_speed:
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    planned = _limit(constraints, count, parameters, THINGS, distance, planned)
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, given.max_velocity)
+    for pair in range(len(pairs)):
+        one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
+        distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
+        planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
+        if planned < one.max_speed + other.max_speed:
+            _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
+            _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
+            planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
+            count += _may_pass(constraints, count, planned, given.max_velocity)
+    return count, nearest_m, speed_limit, setpoint_share
+
+
+@compiled
+def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
+    """Speed [m/s] that a rule allows."""
+    given = parameters[0]
+    return allowed_speed(distance, coming, given.brake[rule], given.reaction_s[rule], given.clearance[rule])
+
+
+@compiled
+def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
+    """Speed [m/s] that is planned with: less than the rule allows, but at least `least`, and what
+    is `braked` until then.
+    """
+    given = parameters[0]
+    brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
+    planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.room[rule])
+    return max(PLANNED_BRAKE_SHARE * least, planned) + PLANNED_BRAKE_SHARE * braked
+
+
+@compiled
+def _limit(constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float) -> float:
+    """Set the limits of a constraint to a thing or to another part; the planned speed [m/s].
+
+    With the distance `left` to the clearance, parts slow down to CLEARANCE_GAIN_PER_S * left.
+    Inside of the clearance they return, if the joints can move them, and may slip the less the
+    deeper they are.
+    """
+    given, constraint = parameters[0], constraints[k]
+    left = distance - given.clearance[rule]
+    slip = min(max(1.0 + left / SLIP_DEPTH_M, 0.1), 1.0) * SLIP_SPEED_MPS
+    constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
+    planned = min(planned, max(CLEARANCE_GAIN_PER_S * left, -RETREAT_SPEED_MPS))
+    if planned < 0.0 and not _may_pass(constraints, k, RETREAT_AUTHORITY_MPS, given.max_velocity):
+        planned = 0.0
+    constraint.planned = planned
+    return planned
+
+
+@compiled
+def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) -> int:
+    """1 if joints within their greatest velocities can pass a limit along a constraint, else 0."""
+    most = 0.0
+    for j in range(len(max_velocity)):
+        most += abs(constraints[k].row[j]) * max_velocity[j]
+    return 1 if most > limit else 0
+
+
+@compiled
+def _swiftness(velocity: Vector, tremor_speed: float) -> float:
+    """0 for a hand that rests or trembles, 1 for one that goes somewhere."""
+    speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    return min(max(speed / tremor_speed - 1.0, 0.0), 1.0)
+
+
+@compiled
+def _share(near: Vector, limit: float, velocity: Vector) -> float:
+    """How much of a velocity (3,) stays under a limit along the normal."""
+    along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    limit = max(limit, 0.0)
+    return limit / along if along > limit else 1.0
+
+
+@compiled
+def _receives(contacts: Records, hands: Vector, side: int) -> bool:
+    """Whether the hands are at a via-point where the tool goes with this one."""
+    for contact in contacts:
+        if contact.side == side:
+            far = 0.0
+            for hand in range(2):
+                for i in range(3):
+                    far = max(far, abs(hands[hand, 0, i] - contact.hands[hand, i]))
+            if far <= contact.radius + CONTACT_MARGIN_M:
+                return True
+    return False
+
+
+@compiled
+def _bring_together(
+    constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
+) -> None:
+    """Adds to a constraint's row the speed along the normal, times the sign, of the point
+    near[at:at + 3] of a link that the first joints move.
+    """
+    row, tool, jacobian = constraints[k].row, heres[0].position, heres[0].jacobian
+    if sign > 0.0:
+        row[:] = 0.0
+    x, y, z = near[at] - tool[0], near[at + 1] - tool[1], near[at + 2] - tool[2]
+    n0, n1, n2 = near[6], near[7], near[8]
+    for j in range(link):
+        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        speed = n0 * (jacobian[0, j] + wy * z - wz * y)
+        speed += n1 * (jacobian[1, j] + wz * x - wx * z)
+        speed += n2 * (jacobian[2, j] + wx * y - wy * x)
+        row[j] += sign * speed
+
+
+@compiled
+def share_of(constraints: Records, count: int, velocity: Vector) -> float:
+    """`Separation.share`."""
+    share = 1.0
+    for k in range(count):
+        speed = 0.0
+        for j in range(len(velocity)):
+            speed += constraints[k].row[j] * velocity[j]
+        limit = max(constraints[k].planned, 0.5 * SLIP_SPEED_MPS)
+        if speed > limit:
+            share = min(share, limit / speed)
+    return share
+
+
+@compiled
+def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
+    """`Separation.excess`, and of which constraint."""
+    most, which = -math.inf, 0
+    for k in range(count):
+        constraint = constraints[k]
+        now = crest = 0.0
+        for j in range(len(dq)):
+            now += constraint.row[j] * dq[j]
+            crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
+        if max(now, crest) - constraint.allowed > most:
+            most, which = max(now, crest) - constraint.allowed, k
+    return most, which

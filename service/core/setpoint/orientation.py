@@ -1,0 +1,77 @@
+"""The orientation setpoint: it turns toward its target within limits of speed and acceleration."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.config import Settings
+from service.core.frame import Record, Records, Vector, parameters
+from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
+from service.core.setpoint.tuning import ORIENTATION_BRAKE_SHARE, ORIENTATION_GAIN_PER_S, ORIENTATION_SPEED_SHARE
+
+
+class OrientationSetpoint:
+    """Turns the state's orientation (4,), at an angular velocity (3,) [rad/s], toward targets."""
+
+    def __init__(self, settings: Settings) -> None:
+        tool = settings.tool
+        self.parameters = parameters(
+            max_speed=ORIENTATION_SPEED_SHARE * tool.max_turn_speed,
+            max_acceleration=float(tool.max_turn_acceleration),
+            about=int(tool.orientation == "full"),
+            period_s=settings.period_s,
+        )
+
+    def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
+        """Puts it where the tool is, before there are targets: rotation (3, 3), turning (3,)
+        [rad/s].
+        """
+        quaternion_of(rotation, state["orientation"])
+        state["turning"] = turning
+
+    def step(self, state: Record, orientation: Vector, turning: Vector) -> None:
+        """Turns it one period on toward an orientation (4,) that turns itself (3,) [rad/s].
+
+        Where the settings say that a direction is followed, +z goes the shortest way.
+        """
+        turn_orientation(state["orientation"], state["turning"], orientation, turning, self.parameters)
+
+
+@compiled
+def turn_orientation(
+    quaternion: Vector, turning: Vector, target: Vector, target_turning: Vector, parameters: Records
+) -> None:
+    """One period, in place."""
+    given, dt = parameters[0], parameters[0].period_s
+    error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
+    axis_of(quaternion, axis)
+    along = 0.0
+    if given.about:
+        turn_between(quaternion, target, error)
+    else:
+        swing(axis, target, error)
+        for i in range(3):
+            along += target_turning[i] * axis[i]
+    angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
+    # in proportion to the error when near, braking evenly from afar
+    brake, rate = ORIENTATION_BRAKE_SHARE * given.max_acceleration, ORIENTATION_GAIN_PER_S
+    near = brake / ORIENTATION_GAIN_PER_S**2
+    if angle > near:
+        rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
+    speed = 0.0
+    for i in range(3):
+        wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
+        speed += wanted[i] * wanted[i]
+    slower = min(1.0, given.max_speed / max(math.sqrt(speed), 1e-12))
+    change = 0.0
+    for i in range(3):
+        wanted[i] = slower * wanted[i] - turning[i]
+        change += wanted[i] * wanted[i]
+    share = min(1.0, given.max_acceleration * dt / max(math.sqrt(change), 1e-12))
+    for i in range(3):
+        turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
+        wanted[i] = dt * turning[i]
+    turn_on(quaternion, wanted)

@@ -1,0 +1,235 @@
+"""The setpoint's compiled step: see `stage` for the method, `bounds` for what it keeps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from service.core.codes import PLANNED, STOPPED, WRONG
+from service.core.frame import Records, Vector
+from service.core.kinematics import joint_costs
+from service.core.setpoint.bounds import between, bounds_around, stopping, take_safe, what_is_wrong
+from service.core.setpoint.orientation import turn_orientation
+from service.core.setpoint.tuning import (
+    BARRIER_RATE_PER_S,
+    BARRIER_TIME_S,
+    DECELERATION_LOOKAHEAD_S,
+    GAP_FREE_M,
+    GAP_SLOW_M,
+    HAND_BRAKE_MPS2,
+    LATE_STOP_MAX_M,
+    LATE_STOP_SHARE,
+    LEAST_SPEED_MPS,
+    MEETING_BRAKE_LEAST_SHARE,
+    MEETING_BRAKE_SHARE,
+    MEETING_OVERSHOOT_M,
+    PLANNED_BRAKE_SHARE,
+    PLANNED_SPEED_SHARE,
+    PROMPT_RESPONSE_S,
+    STOP_JERK_ERROR_M,
+    STOP_OVERSHOOT_M,
+    STOP_REACTION_S,
+)
+
+
+@compiled
+def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) -> float:
+    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
+    where it comes back; and for one that may keep only a share of its own speed.
+    """
+    along = gap = 0.0
+    for i in range(3):
+        ahead = setpoint[0, i] - tool[i]
+        along += ahead * setpoint[1, i]
+        gap += ahead * ahead
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE_M) / GAP_SLOW_M)
+    if share < 1.0:
+        slow = min(slow, share * _norm(setpoint[1]) / max_speed)
+    return slow
+
+
+@compiled
+def lead(
+    states: Records,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    parameters: Records,
+    box: Vector,
+    costs: Vector,
+    slow: float,
+) -> int:
+    """`SetpointGenerator.step`."""
+    state, given, setpoint = states[0], parameters[0], states[0].setpoint
+    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
+    target[0], target[1], target[2] = position, velocity, acceleration
+    state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
+    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
+    late_s = LATE_STOP_SHARE * max(0.0, state.response_s - PROMPT_RESPONSE_S)
+    met = _track(setpoint, target, parameters, costs, slow, late_s, box, jerk)
+    for i in range(3):
+        x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
+        ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
+        ahead[1, i] = v + dt * (a + dt * j / 2.0)
+        ahead[2, i] = a + dt * j
+    if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
+        met = STOPPED
+    if what_is_wrong(setpoint, before, state.hull, box, parameters):
+        setpoint[:] = before
+        return WRONG
+    return met
+
+
+@compiled
+def _track(
+    setpoint: Vector,
+    target: Vector,
+    parameters: Records,
+    costs: Vector,
+    slow: float,
+    late_s: float,
+    box: Vector,
+    jerk: Vector,
+) -> int:
+    """The tracker's jerk (3,), less of it along the motion where the stop, the target's speed or
+    the greatest one asks for that. A stop of the hands is seen `late_s` later than by most.
+    """
+    given = parameters[0]
+    gains, dt = given.gains, given.period_s
+    max_speed = given.max_speed
+    speed, target_speed = _norm(setpoint[1]), _norm(target[1])
+    feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
+    for i in range(3):
+        jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
+        if feasible == 1.0:  # what a target does beyond the speed limit is not followed
+            jerk[i] += gains[2] * target[2, i]
+        jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
+    _approach_sides(setpoint, parameters, box, jerk)
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    if speed <= LEAST_SPEED_MPS:
+        return 0
+    along = np.empty(3)
+    a = u = way = v_target = a_target = 0.0
+    for i in range(3):
+        along[i] = setpoint[1, i] / speed
+        a += along[i] * setpoint[2, i]
+        u += along[i] * jerk[i]
+        way += along[i] * (target[0, i] - setpoint[0, i])
+        v_target += along[i] * feasible * target[1, i]
+        a_target += along[i] * target[2, i]
+    brake = PLANNED_BRAKE_SHARE * min(given.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = PLANNED_BRAKE_SHARE * min(given.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
+    change = min(change, STOP_JERK_ERROR_M * gains[0])
+    top = slow * PLANNED_SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
+    coming = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
+    room = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
+    room += given.stop_room * (STOP_REACTION_S * coming + coming * coming / (2.0 * HAND_BRAKE_MPS2))
+    # with less jerk than the lowest it would brake on after it rests, and swing back
+    now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
+    lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
+    # what is left of a room shrinks at BARRIER_RATE_PER_S at most
+    kept = 1.0 - min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt)
+    chosen = stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
+    faster, a_faster = speed - v_target, a - a_target
+    if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
+        meeting = max(MEETING_BRAKE_SHARE * brake + min(a_target, 0.0), MEETING_BRAKE_LEAST_SHARE * brake)
+        chosen = stopping(
+            way + MEETING_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), kept, dt
+        )
+    limit = top - kept * (top - now)
+    most = _coasting(speed, a, chosen, change, dt)
+    chosen = between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
+    if chosen >= u:
+        return 0
+    for i in range(3):
+        jerk[i] += (chosen - u) * along[i]
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    return PLANNED
+
+
+@compiled
+def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Vector) -> None:
+    """Limit the jerk (3,) so that the setpoint approaches each side of the workspace without
+    passing it: with h the distance to the side, (d/dt + p)³ h >= 0, that is
+
+        jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = gains[0]^(1/3).
+
+    A setpoint whose target lies on a side then comes to rest there. Without this, the tracker
+    passes its target by a little, each time into the fastest stop, and swings for ever. Beyond a
+    side h is 0: the setpoint goes no farther, and its targets bring it back.
+    """
+    given = parameters[0]
+    p = given.gains[0] ** (1.0 / 3.0)
+    for i in range(3):
+        x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
+        damping = -3.0 * p * (p * v + a)
+        highest = max(p**3 * max(box[1, i] - x, 0.0) + damping, -given.stop_jerk)
+        lowest = min(p**3 * min(max(box[0, i], given.lowest[i]) - x, 0.0) + damping, given.stop_jerk)
+        jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
+
+
+@compiled
+def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
+    """The speed [m/s] at which the acceleration, after dt of a jerk, comes to 0 by `change`."""
+    then = a + dt * jerk
+    return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
+
+
+@compiled
+def _largest(costs: Vector, motion: Vector) -> float:
+    """How much of its limit the busiest joint needs for a tool motion (3,), with costs (3, J)."""
+    largest = 0.0
+    for joint in range(costs.shape[1]):
+        needed = costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
+        largest = max(largest, abs(needed))
+    return largest
+
+
+@compiled
+def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
+    """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of tool and
+    joints.
+    """
+    given, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
+    for i in range(3):
+        ahead[i] = acceleration[i] + dt * jerk[i]
+    excess = max(_norm(ahead) / given.max_acceleration, _largest(costs[1], ahead))
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
+    excess = max(_norm(jerk) / given.max_jerk, _largest(costs[2], jerk))
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] /= excess
+
+
+@compiled
+def _norm(vector: Vector) -> float:
+    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+@compiled
+def ready(states: Records, heres: Records, arms: Records, max_speed: float, share: float, costs: Vector) -> float:
+    """The joints' costs of tool motion into `costs`; share of the speed that is allowed."""
+    joint_costs(arms, heres, costs)
+    return slow_down(states[0].setpoint, heres[0].position, share, max_speed)
+
+
+@compiled
+def finish(states: Records, frames: Records, parameters: Records) -> None:
+    """Turns the orientation's setpoint on toward the frame's target, and shows the setpoints."""
+    state, frame = states[0], frames[0]
+    turn_orientation(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
+    write(states, frames)
+
+
+@compiled
+def write(states: Records, frames: Records) -> None:
+    """Into the frame where the setpoints are."""
+    state, frame = states[0], frames[0]
+    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
+    frame.setpoint_acceleration[:] = state.setpoint[2]
+    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
+    frame.gripper = state.gripper

@@ -1,0 +1,111 @@
+"""The skill in force, as a stage of the core: it predicts at each sample of a hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from service.config import Settings
+from service.core.codes import AMBIGUOUS
+from service.core.frame import Record, Vector, as_array
+from service.core.skill import ORDER
+from service.core.skill.memory import remember
+from service.core.skill.model import Wanted
+from service.core.skill.pose import NO_GRIPPER
+from service.core.skill.skill import NEVER, Skill, clamp
+from service.core.skill.step import calibrate, recent, write
+from service.core.skill.tuning import (
+    AMBIGUOUS_OFF_SHARE,
+    AMBIGUOUS_PROBABILITY,
+    AMBIGUOUS_S,
+    MEMORY_LAG_S,
+    UNSURE_M,
+    UNSURE_OFF_SHARE,
+)
+from service.core.skill.unseen import off_m
+
+NO_STAGE = -1  # of a frame
+
+
+class SkillStage:
+    """The skill in force; what it predicted at the newest sample of a hand is kept in the state."""
+
+    def __init__(self, settings: Settings, skill: Skill) -> None:
+        self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
+        self._take(skill)
+
+    def _take(self, skill: Skill) -> None:
+        self.skill = skill
+        delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
+        self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
+
+    def adopt(self, state: Record, skill: Skill) -> None:
+        """Another skill from now on; of one with the same via-points the stage is known already."""
+        if skill.model.names != self.skill.model.names:
+            state["stage_belief"] = 0.0
+        if skill.model.remembers != self.skill.model.remembers or skill.model.delay_s != self.skill.model.delay_s:
+            state["memory_ticks"] = -1
+        self._take(skill)
+        state["skill"] = np.frombuffer(skill.digest, np.uint8)
+        state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
+        state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
+
+    def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
+        """What the skill asks for with the hands, which must be known; `unseen` is the side of one
+        that is not seen now. Covariances and gripper are predicted anew at new samples only.
+        """
+        remember(as_array(state), self._period_s, self._lag_s)
+        hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
+        belief = state["stage_belief"]
+        is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
+        before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
+        found = self.skill.predict(
+            hands[:, 0],
+            hands[:, 1],
+            hands[:, 2],
+            state["hand_stillness"],
+            before=before,
+            past=state["memory"],
+            turns=state["turns"],
+            belief=belief,
+            period_s=self._period_s,
+            lead_s=self._lead_s,
+        )
+        if is_new:
+            state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
+            state["closure"] = found.closure
+        target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
+        write(frame, found, target)
+        passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
+        recent_mps = recent(found.position, passed_s, state["trail"])
+        reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
+        off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
+        state["unsure"] = math.hypot(reach_m, off) > (UNSURE_OFF_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
+        frame["closure"] = state["closure"]
+        _tell_stage(belief, frame)
+        most = AMBIGUOUS_PROBABILITY * (AMBIGUOUS_OFF_SHARE if state["reason"] == AMBIGUOUS else 1.0)
+        if found.torn <= most:
+            state["sure_tick"] = tick
+        torn = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn, off > UNSURE_M)
+
+    def set_stage(self, state: Record, name: str) -> None:
+        """The task has come to the via-point of this name. One that it has not changes nothing."""
+        if name in (names := self.skill.model.names):
+            state["stage_belief"] = 0.0
+            state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
+
+    def nothing(self, state: Record, frame: Record) -> None:
+        """Into the frame that nothing is predicted: the target is the setpoint."""
+        state["unsure"], state["sure_tick"] = 0, state["tick"]
+        frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
+        frame["closure"] = state["closure"]
+        _tell_stage(state["stage_belief"], frame)
+
+
+def _tell_stage(belief: Vector, frame: Record) -> None:
+    """Into the frame which stage it is, most probably, and how probable that is."""
+    most = int(belief.argmax())
+    frame["stage_belief"] = belief[most]
+    frame["stage"] = most if belief[most] > 0.0 else NO_STAGE
