@@ -65,7 +65,7 @@ def damage(path: Path, how: str) -> None:
 
 
 REASONS = {
-    "a folder": ("Is a directory",),
+    "a folder": ("Is a directory; a file needed, and that is a folder",),
     "a pipe": ("it is not a file",),
     "a huge file": (f"it has {1 << 40} bytes, at most {LARGEST_BYTES} accepted",),
     "a link to itself": ("Too many levels of symbolic links",),

@@ -69,7 +69,7 @@ def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(s
     assert found.unsafe == ()
     assert found.all.error_mm < min(found.all.other_mm.values())
     assert found.beside > 80
-    assert f"holds {found.beside:.0f} % of the hand 30 cm beside\n" in table(found)
+    assert f"in wrong samples: {found.beside:.0f} % of the hand 30 cm beside\n" in table(found)
     assert "swapped" not in table(found)
     again, still = decoded(skill.file, origin="a file"), np.zeros((2, 3))
     assert again.conductor == skill.conductor

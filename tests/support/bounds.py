@@ -23,7 +23,7 @@ POSITION_ROUNDING_M = 1e-6
 AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
 SPEED_ROUNDING_MPS = 1e-6
 STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop, beyond its speed limit
-OTHERS_RISE_MPS = 0.1  # beyond its speed at the start of the stop, for other arms and rates than a WAM at 500 Hz
+SLOW_RISE_MPS = 0.1  # the same, beyond its speed at the start of the stop
 BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
 WAITING_M = 0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
@@ -287,8 +287,8 @@ def tool_speed_is_within_its_limit_while_following(session: Session) -> Vector:
 
 
 def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
-    """Below 1.01 times the greater of its speed and the speed it was coming to, plus 10 mm/s for a
-    WAM at 500 Hz, plus 100 mm/s for others; and always below 1.01 times its limit, plus 10 mm/s.
+    """Below 1.01 times the greater of its speed and the speed it was coming to, plus 100 mm/s; and
+    always below 1.01 times its limit, plus 10 mm/s.
     """
     (speed, crest), following = session.tool_speeds, _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
@@ -296,11 +296,9 @@ def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
     is_over = ~session.frames["joint_velocities"].any(axis=1)
     is_over |= session.frames["reason"] == Reason.BLOCKED  # or on a way out, which is no stop
     stop_limit = limit
-    is_usual = not session.settings.arm.urdf and session.settings.rate_hz == 500
-    rise_mps = STOP_RISE_MPS if is_usual else OTHERS_RISE_MPS
     for k in range(len(speed)):
         if following[k]:
-            stop_limit = STOP_RISE * max(speed[k], crest[k]) + rise_mps
+            stop_limit = STOP_RISE * max(speed[k], crest[k]) + SLOW_RISE_MPS
         elif is_over[k]:
             stop_limit = limit
         allowed[k] = min(limit, stop_limit) if not following[k] else np.inf
@@ -475,6 +473,10 @@ def _last(session: Session, seconds: float) -> np.ndarray:
     return session.frames[-max(2, round(seconds / session.settings.period_s)) :]
 
 
+def _is_target_steady(session: Session) -> bool:
+    return bool(np.ptp(_last(session, LOOK_S)["target"], axis=0).max() < NET_MOTION_M)
+
+
 def _off_target_m(session: Session) -> float:
     return float(np.linalg.norm(session.frames["tool"][-1] - session.frames["target"][-1]))
 
@@ -490,8 +492,7 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
     a steep skill amplifies the noise of a tracker.
     """
     settled = _last(session, SETTLED_S)
-    is_steady = np.ptp(_last(session, LOOK_S)["target"], axis=0).max() < NET_MOTION_M
-    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any() or not is_steady:
+    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any() or not _is_target_steady(session):
         return _at_the_end(session, 0.0)
     off = _norms(settled["tool"] - settled["target"])
     if (off < THERE_M).all():
@@ -505,12 +506,14 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
 
 def tool_is_never_stuck_in_silence(session: Session) -> Vector:
     """At the end the tool is at its target, on its way, or reported to be stuck or kept away."""
-    if session.quiet_s < SETTLED_S or not _following(session)[-1] or _net_motion_m(session) >= NET_MOTION_M:
+    if session.quiet_s < SETTLED_S or not _is_target_steady(session):
+        return _at_the_end(session, 0.0)
+    if not _following(session)[-1] or _net_motion_m(session) >= NET_MOTION_M:
         return _at_the_end(session, 0.0)
     lately = _last(session, STUCK_S)
     if (lately["flags"] & Flag.STUCK).any() or (lately["mode"] != Mode.FOLLOW).any():
         return _at_the_end(session, 0.0)
-    is_kept_away = bool((lately["flags"] & Flag.SEPARATION).all())
+    is_kept_away = bool((lately["flags"] & Flag.SEPARATION).any())
     return _at_the_end(session, _off_target_m(session) - (STUCK_M if is_kept_away else THERE_M))
 
 

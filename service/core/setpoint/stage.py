@@ -26,7 +26,7 @@ from service.core.arm.stage import Arm
 from service.core.frame import Record, Vector, as_array, parameters
 from service.core.kinematics import Kinematics
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import BOUNDS, what_is_wrong
+from service.core.setpoint.bounds import BOUNDS, farthest, what_is_wrong
 from service.core.setpoint.orientation import OrientationSetpoint
 from service.core.setpoint.step import finish, lead, ready, write
 from service.core.setpoint.tracker import gains_for, waiting
@@ -72,6 +72,16 @@ class SetpointGenerator:
         motion = target.position, target.velocity, target.acceleration
         return int(lead(as_array(state), *motion, self._parameters, box, costs, slow))
 
+    def stretched(self, box: Vector, setpoint: Vector) -> Vector:
+        """A workspace (2, 3) [m] in which a setpoint (3, 3) can stop, so that one that is outside
+        of its workspace and waits for its tool need not return.
+        """
+        limits = self._parameters[0]["stop_acceleration"], self._parameters[0]["stop_jerk"]
+        ends = np.array(
+            [[-farthest(setpoint, i, -1.0, *limits, 0.0), farthest(setpoint, i, 1.0, *limits, 0.0)] for i in range(3)]
+        )
+        return np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
+
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
         """What of its bounds a setpoint passed since `before` (3, 3), seen from outside."""
         return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
@@ -102,8 +112,8 @@ class SetpointStage:
         gap_m = math.dist(state["setpoint"][0].tolist(), tool.tolist())
         if gap_m > GAP_WAITING_M:
             target = waiting(target, state["setpoint"], tool)
-        if gap_m > GAP_STOPPED_M:  # it waits, also outside of the workspace
-            box = np.array([np.minimum(box[0], state["setpoint"][0]), np.maximum(box[1], state["setpoint"][0])])
+        if gap_m > GAP_STOPPED_M:
+            box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
         if state["closure"] != NO_GRIPPER:
             self._grip(state, wanted, here)
