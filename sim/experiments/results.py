@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import re
 import sys
@@ -129,6 +130,7 @@ def pyplot() -> Any:
             "the experiments draw with Matplotlib, which is not installed: pip install 'thirdhand[experiments]'"
         ) from None
     mpl.use("Agg")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # axes of equal scale give up a limit: no news
     from matplotlib import pyplot as plt
 
     plt.rcParams.update(

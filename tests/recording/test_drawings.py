@@ -49,6 +49,7 @@ def span_s(view: Any, part: str) -> tuple[float, float]:
     return found["start"] / 1e9, found["end"] / 1e9
 
 
+@pytest.mark.usefixtures("drawing")
 def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(600):
