@@ -14,17 +14,17 @@ STATE = (
     Field("arm_tick", "int64"),
     Field("arm_still_tick", "int64"),  # tick since which the arm has reported `arm_still_posture`
     Field("sample_ticks", "int64", (len(SOURCES), 2)),  # the last two ticks with a plausible sample
-    Field("jump_first_tick", "int64", (2,)),  # first of the successive samples that jumped
-    Field("jump_newest_tick", "int64", (2,)),  # newest of them
-    Field("jump_count", "int64", (2,)),  # number of them
-    Field("quickest_stamps_ns", "int64", (2, 2)),  # of the samples with the minimum delay: this window, last one
-    Field("quickest_ticks", "int64", (2, 2)),  # ticks at which they arrived
+    Field("jump_first_tick", "int64", (2,)),  # tick of the first one of the successive samples that jumped
+    Field("jump_newest_tick", "int64", (2,)),  # tick of the newest one of these samples
+    Field("jump_count", "int64", (2,)),  # number of these samples
+    Field("quickest_stamps_ns", "int64", (2, 2)),  # stamps of minimum delay: this window, the last one
+    Field("quickest_ticks", "int64", (2, 2)),  # ticks in which the samples with these stamps arrived
     Field("clock_tick", "int64", (2,)),  # begin of this window; -1: no sample yet
     Field("kept", "int64", (2,)),  # number of retained samples
     Field("kept_newest", "int64", (2,)),  # index of the newest sample in all rings `kept_*`
     Field("kept_stamps_ns", "int64", (2, KEPT)),
     Field("kept_ticks", "int64", (2, KEPT)),  # ticks in which the samples were made
-    Field("other_tick", "int64", (2,)),  # of the newest sample that jumped, accepted or not
+    Field("other_tick", "int64", (2,)),  # tick of the newest sample that jumped, accepted or not
     Field("other_after_ns", "int64", (2,)),  # stamp of the newest accepted sample at that time
     Field("even_samples", "int64", (2,)),  # number of `past_samples` that are evenly spaced
     Field("noise_samples", "int64", (2,)),  # number of samples averaged in the noise variance
@@ -36,14 +36,14 @@ STATE = (
     Field("mode_covariances", "float64", (2, MODES, STATES, STATES)),
     Field("mode_probabilities", "float64", (2, MODES)),
     Field("noise_variance", "float64", (2,)),  # variance of the samples on each axis [m²]
-    Field("sample_interval_s", "float64", (2,)),  # between the two newest samples
+    Field("sample_interval_s", "float64", (2,)),  # interval between the two newest samples
     Field("response_s", "float64"),  # time in which the hand filter follows a change of motion
     Field("past_samples", "float64", (2, 3, 3)),  # the last three positions, newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),
     Field("kept_means", "float64", (2, KEPT, MODES, STATES, 3)),  # `mode_means` after each retained sample
-    Field("kept_covariances", "float64", (2, KEPT, MODES, STATES, STATES)),  # `mode_covariances` after it
-    Field("kept_probabilities", "float64", (2, KEPT, MODES)),  # `mode_probabilities` after it
-    Field("kept_past", "float64", (2, KEPT, 3, 3)),  # `past_samples` after it
+    Field("kept_covariances", "float64", (2, KEPT, MODES, STATES, STATES)),  # `mode_covariances`, also
+    Field("kept_probabilities", "float64", (2, KEPT, MODES)),  # `mode_probabilities`, also
+    Field("kept_past", "float64", (2, KEPT, 3, 3)),  # `past_samples`, also
     Field("kept_noise", "float64", (2, KEPT, 4)),  # noise_variance, noise_samples, even_samples, sample_interval_s
     Field("jumped_to", "float64", (2, 3)),  # position of the newest sample that jumped [m]
     Field("other_offset", "float64", (2, 3)),  # from the expected position to that of the newest sample that jumped [m]
@@ -51,7 +51,7 @@ STATE = (
     Field("arm_still_posture", "float64", (PER_JOINT,)),  # posture in which the arm is at rest
     Field("measured", "float64", (PER_JOINT,)),
     Field("measured_velocities", "float64", (PER_JOINT,)),
-    Field("kept_late", "int32", (2, KEPT)),  # ticks from when each sample was made to its arrival
+    Field("kept_late", "int32", (2, KEPT)),  # ticks between making and arrival of each sample
     Field("rejected", "uint32", (len(Cause),)),  # rejected samples by cause, since start
     Field("clock", "uint8", (2,)),  # LEARNING, DOUBTED or BELIEVED: trust in a tracker's clock
     Field("kept_restarts", "uint8", (2, KEPT)),  # 1: the filter started anew with this sample
