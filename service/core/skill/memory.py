@@ -23,8 +23,8 @@ from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, MEMOR
 
 @compiled
 def _follow(now: float, share: float, rows: Vector) -> None:
-    """Update of a cascade (K,) by the input x: m_1 += share (x - m_1), then m_k += share (m_(k-1) -
-    m_k).
+    """Update a cascade m (K,), `rows`, by the input x, `now`, from the first filter to the last:
+    m_1 = m_1 + share (x - m_1), then m_k = m_k + share (m_(k-1) - m_k).
     """
     for row in range(len(rows)):
         rows[row] += share * (now - rows[row])
@@ -34,9 +34,10 @@ def _follow(now: float, share: float, rows: Vector) -> None:
 @compiled
 def remember(states: Records, period_s: float, lag_s: float) -> None:
     """Update the memory of both hands' positions, with the time constant `lag_s`, and of their
-    orientations, with TURN_LAG_S: `share` = 1 - exp(-elapsed time / time constant).
+    orientations, with TURN_LAG_S: share = 1 - exp(-elapsed time / time constant).
 
-    Of a hand's first sample, all filters take the value.
+    For positions, the elapsed time is at most MEMORY_LONGEST_STEP_S. A hand's first sample is taken
+    into all filters at once.
     """
     state = states[0]
     for side in range(2):
