@@ -269,12 +269,16 @@ def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
 
 
 def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Joint command as CDR bytes; None while nothing is commanded."""
     if not frame["commanded"]:
         return None
     return cdr.encode_command(stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist())
 
 
 def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Target pose and covariance (6, 6), position [m²] then orientation [rad²], as CDR bytes; None
+    while nothing is predicted.
+    """
     if not frame["covariance"].any():
         return None
     covariance = [0.0] * 36
@@ -288,6 +292,7 @@ def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | Non
 
 
 def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Setpoint pose as CDR bytes."""
     message = PoseStamped(
         stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["setpoint_orientation"].tolist())
     )
@@ -295,6 +300,7 @@ def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | N
 
 
 def _gripper(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Command 0 (open) or 1 (closed) as CDR bytes; None while the gripper's state is unknown."""
     if frame["gripper"] == UNKNOWN:
         return None
     return cdr.encode_command(stamp_ns, (GRIPPER,), [float(frame["gripper"] == CLOSED)], [0.0])

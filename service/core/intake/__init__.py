@@ -15,8 +15,8 @@ STATE = (
     Field("arm_still_tick", "int64"),  # tick since which the arm has reported `arm_still_posture`
     Field("sample_ticks", "int64", (len(SOURCES), 2)),  # the last two ticks with a plausible sample
     Field("jump_first_tick", "int64", (2,)),  # tick of the first one of the successive samples that jumped
-    Field("jump_newest_tick", "int64", (2,)),  # tick of the newest one of these samples
-    Field("jump_count", "int64", (2,)),  # number of these samples
+    Field("jump_newest_tick", "int64", (2,)),  # tick of the newest one of the successive samples that jumped
+    Field("jump_count", "int64", (2,)),  # number of successive samples that jumped
     Field("quickest_stamps_ns", "int64", (2, 2)),  # stamps of minimum delay: this window, the last one
     Field("quickest_ticks", "int64", (2, 2)),  # ticks in which the samples with these stamps arrived
     Field("clock_tick", "int64", (2,)),  # begin of this window; -1: no sample yet
@@ -41,9 +41,9 @@ STATE = (
     Field("past_samples", "float64", (2, 3, 3)),  # the last three positions, newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),
     Field("kept_means", "float64", (2, KEPT, MODES, STATES, 3)),  # `mode_means` after each retained sample
-    Field("kept_covariances", "float64", (2, KEPT, MODES, STATES, STATES)),  # `mode_covariances`, also
-    Field("kept_probabilities", "float64", (2, KEPT, MODES)),  # `mode_probabilities`, also
-    Field("kept_past", "float64", (2, KEPT, 3, 3)),  # `past_samples`, also
+    Field("kept_covariances", "float64", (2, KEPT, MODES, STATES, STATES)),  # `mode_covariances` after each sample
+    Field("kept_probabilities", "float64", (2, KEPT, MODES)),  # `mode_probabilities` after each retained sample
+    Field("kept_past", "float64", (2, KEPT, 3, 3)),  # `past_samples` after each retained sample
     Field("kept_noise", "float64", (2, KEPT, 4)),  # noise_variance, noise_samples, even_samples, sample_interval_s
     Field("jumped_to", "float64", (2, 3)),  # position of the newest sample that jumped [m]
     Field("other_offset", "float64", (2, 3)),  # from the expected position to that of the newest sample that jumped [m]

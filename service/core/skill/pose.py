@@ -1,5 +1,5 @@
-"""Orientation of the tool and state of the gripper: what a skill predicts besides the position,
-from the same input.
+"""Orientation of the tool and state of the gripper: a skill's predictions in addition to the
+position.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientati
 from service.core.skill.staged import StagedKMP
 from service.core.skill.tuning import MAX_TARGET_M
 
-NEVER = -(2**60)  # a tick so long ago that filters have forgotten it
+NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
 
 
 def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach) -> Target:

@@ -36,6 +36,7 @@ class SkillStage:
         self._take(skill)
 
     def _take(self, skill: Skill) -> None:
+        """Put a skill into force, with the time constant of the hands' memory that it needs."""
         self.skill = skill
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER

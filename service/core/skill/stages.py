@@ -87,11 +87,11 @@ SEEN = np.dtype(
 @compiled
 def on_way(hand: Vector, stage: Record, side: int) -> tuple[float, float]:
     """Share λ, 0 to 1, of its segment that a hand h (3,) has covered, and its distance d [m] from
-    it:
+    the segment:
 
         λ = clip((h - b)·w / |w|², 0, 1),   d = |h - b - λ w|
 
-    A hand that rests in this stage (w = 0) has covered the whole segment: λ = 1.
+    A hand that rests in this stage (w = 0) has covered the whole segment: the share is 1.
     """
     begins, way, square = stage["begins"][side], stage["way"][side], stage["square"][side]
     along = 0.0

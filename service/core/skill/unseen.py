@@ -38,7 +38,7 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
 
 
 def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
-    """Distance [m] by which the target may be wrong because one hand is not seen.
+    """Possible error [m] of the target because one hand is not seen.
 
     With d = sqrt(REGION_95) * `deviation_m`, the prediction is repeated with that hand moved by d
     along each axis; the result is the norm of the three differences (3, 3). The skill's delay is
@@ -48,6 +48,7 @@ def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
     known = state["covariance"], state["orientation_covariance"], float(state["closure"])
 
     def tool(hands: Vector) -> Vector:
+        """Predicted position (3,) [m] of the tool for hands (2, 3) [m] at rest."""
         return skill.predict(
             hands,
             STANDS,

@@ -33,8 +33,8 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
 
 
 def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector]:
-    """Kernels by which the mean f of a model, (T, 6) to (T, 3) [m], is made to pass through
-    via-points, and to stay as it is at the hands `kept` (K, 6).
+    """Kernels that make the mean f of a model, (T, 6) to (T, 3) [m], pass through via-points, and
+    leave it as it is at the hands `kept` (K, 6).
 
     Returns centres c (X, 6) [m] and weights W (X, 3) [m] of
 
